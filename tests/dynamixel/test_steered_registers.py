@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 from tests.kit.rigs import make_x, start_rig
 
@@ -92,49 +91,30 @@ def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):
     assert (gain_of(started, 0), gain_of(started, 1)) == (700, 700)
 
 
-def until_back(rig, most=200):
-    for _ in range(most):
-        rig.cycle()
-        if rig.states.valid.all() and rig.states.mode.all():
-            return
-    raise AssertionError("a servo did not come back")
-
-
 def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
-    servo, answers = started.servo(12), []
+    answers = []
     started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
     started.cycles(3)
-    servo.silence()
-    started.cycles(5)
-    servo.reset()
-    servo.silence(False)
-    assert gain_of(started, 1) == 800
-    until_back(started)
+    with started.away(12, 5) as servo:
+        servo.reset()
+        assert gain_of(started, 1) == 800
     assert gain_of(started, 1) == 900
     assert started.events.texts(EventCode.REGISTER_WRITTEN) == ["Position P Gain (84) was 800 and is 900"] * 2
 
 
-def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
-    started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
-    until_back(started)
-    assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
+@pytest.mark.parametrize("requested", ["before it was away", "while it was away"])
+def test_a_servo_comes_back_into_the_mode_that_was_requested_last(started, requested):
+    if requested.startswith("before"):
+        started.set_modes(Mode.VELOCITY, Mode.UNKNOWN)
+        started.cycles(20)
+        assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
     before = len(started.into_bus())
-    started.servo(11).silence()
-    started.cycles(5)
-    started.servo(11).silence(False)
-    until_back(started)
-    assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
-    assert started.servo(11).registers["operating_mode"] == 1
-    assert [write for write in started.writes(before) if write[1] == 11] == []
-
-
-def test_a_mode_that_was_requested_while_a_servo_was_away_is_entered_when_it_is_back(started):
-    started.servo(11).silence()
-    started.cycles(5)
-    started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
-    started.cycles(20)
-    started.servo(11).silence(False)
-    until_back(started)
+    with started.away(11, 5, 20):
+        if requested.startswith("while"):
+            started.set_modes(Mode.VELOCITY, Mode.UNKNOWN)
+            started.cycles(20)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
     assert started.servo(11).registers["operating_mode"] == 1
     assert started.torque() == [True, True]
+    modes = [write for write in started.writes(before) if write[1] == 11]
+    assert len(modes) == requested.startswith("while")

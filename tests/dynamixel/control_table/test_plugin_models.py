@@ -74,18 +74,16 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     sys.modules.pop("my_servos", None)
 
 
-def test_a_table_is_taken_as_a_path_or_as_a_text(install: Callable[[str], None], table: Path) -> None:
-    install(f"[Path({str(table)!r})]")
+@pytest.mark.parametrize("as_text", [False, True])
+def test_a_table_is_taken_as_a_path_or_as_a_text(
+    install: Callable[[str], None], table: Path, as_text: bool
+) -> None:
+    install(f"[{table.read_text()!r}]" if as_text else f"[Path({str(table)!r})]")
     assert load_plugins().broken == {}
-    assert control_table("Mine-1").model_number == 60001
+    found = control_table("Mine-1", 1.0)
+    assert (found.model_number, found.max_tick) == (60001, 1023)
     assert added_control_tables(["AX-12A", "Mine-1", "Mine-1"]) == (table.read_text(),)
     assert load_plugins().broken == {}, "a process may load its plug-ins twice"
-
-
-def test_a_text_is_a_table_too(install: Callable[[str], None], table: Path) -> None:
-    install(f"[{table.read_text()!r}]")
-    assert load_plugins().broken == {}
-    assert control_table("Mine-1", 1.0).max_tick == 1023
 
 
 @pytest.mark.parametrize(
@@ -110,35 +108,39 @@ def test_a_servo_model_that_cannot_be_used_is_told_in_one_sentence(
     assert "\n" not in sentence
 
 
+@pytest.fixture
+def dxlrun_here(tmp_path: Path) -> Callable[..., str]:
+    """Return a function that runs the program where the plug-in is installed; it returns its output."""
+
+    def run(*words: str) -> str:
+        ran = subprocess.run(
+            [sys.executable, "-c", MAIN, *words],
+            env=os.environ | {"PYTHONPATH": str(tmp_path)},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ran.returncode == 0, ran.stdout + ran.stderr
+        return ran.stdout
+
+    return run
+
+
 @pytest.mark.parametrize("words", [[], ["--virtual"]], ids=["processes", "virtual"])
-def test_a_robot_of_foreign_servos_runs_in_simulation(
-    install: Callable[[str], None], table: Path, tmp_path: Path, words: list[str]
+def test_a_robot_of_foreign_servos_runs_in_simulation_and_its_model_is_listed(
+    install: Callable[[str], None],
+    table: Path,
+    tmp_path: Path,
+    dxlrun_here: Callable[..., str],
+    words: list[str],
 ) -> None:
     install(f"[Path({str(table)!r})]")
-    robot = tmp_path / "robot.yaml"
-    robot.write_text(ROBOT)
-    run = subprocess.run(
-        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.2", "--no-record", "--no-gateway", *words],
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 0, run.stdout + run.stderr
-
-
-def test_models_lists_it(install: Callable[[str], None], table: Path, tmp_path: Path) -> None:
-    install(f"[Path({str(table)!r})]")
-    run = subprocess.run(
-        [sys.executable, "-c", MAIN, "models", "Mine-1", "--json"],
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    (told,) = json.loads(run.stdout)
-    assert told["model_number"] == 60001
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    dxlrun_here("robot.yaml", "--duration", "0.2", "--no-record", "--no-gateway", *words)
+    if words:
+        (told,) = json.loads(dxlrun_here("models", "Mine-1", "--json"))
+        assert told["model_number"] == 60001
 
 
 BOARD = """
@@ -152,21 +154,12 @@ items.heat = {address = 30, size = 1, tick = "1 degC", state = "temperature"}
 
 
 def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(
-    install: Callable[[str], None], tmp_path: Path
+    install: Callable[[str], None], tmp_path: Path, dxlrun_here: Callable[..., str]
 ) -> None:
     install(f"[{BOARD!r}]")
-    robot = tmp_path / "robot.yaml"
     device = "devices: {oven: {bus: main, id: 7, model: theirs-1}}\n"
-    robot.write_text(ROBOT.replace("Mine-1", "AX-12A") + device)
-    run = subprocess.run(
-        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.3", "--no-gateway"],
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 0, run.stdout + run.stderr
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("Mine-1", "AX-12A") + device)
+    dxlrun_here("robot.yaml", "--duration", "0.3", "--no-gateway")
     (log,) = (tmp_path / "logs").glob("*.mcap")
     last = read_log(log).cycles["source_state"][-1]
     assert last.tolist() == [25.0]
