@@ -1,11 +1,11 @@
 """Servos of which something is not as it was, unnoticed: they get no goal that could hurt."""
 
 import math
+from functools import partial
 
-import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.rigs import make_plan, make_rig, start_rig
+from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -22,9 +22,7 @@ def make_wheel(model="XM430-W350", protocol=2.0, **change):
 
 
 def change(rig, mode, cycles=30):
-    wanted = np.zeros(len(rig.states.mode), dtype=np.uint8)
-    wanted[0] = mode
-    rig.hardware.set_modes(wanted)
+    rig.set_modes(mode, 0)
     rig.cycles(cycles)
 
 
@@ -66,7 +64,7 @@ def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes():
 
 @pytest.mark.parametrize("left", [10, -1])
 def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(left):
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    plan = make_x((1, 2), name="main")
     servos = tuple(replace(servo, start_mode=Mode.EFFORT_POSITION) for servo in plan.servos)
     rig = make_rig(replace(plan, servos=servos, watchdog_ticks=20), take_over=True)
     for servo in rig.buses[0].servos:
@@ -78,7 +76,7 @@ def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(le
 
 
 def test_a_watchdog_that_is_still_armed_is_off_where_the_robot_file_wants_none():
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    plan = make_x((1, 2), name="main")
     rig = make_rig(plan)
     rig.servo(1).poke("bus_watchdog", 10)
     rig.hardware.start()
@@ -109,7 +107,7 @@ def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_b
 
 
 def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once():
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    plan = make_x((1, 2), name="main")
     rig = start_rig(replace(plan, watchdog_ticks=10))
     events = len(rig.events.of(EventCode.WATCHDOG))
     for _ in range(20):
@@ -192,18 +190,13 @@ def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died():
 
 
 def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch_it_off():
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    plan = make_x((1, 2), name="main")
     rig = start_rig(plan)
     rig.cycle()
     bus = rig.buses[0]
     write = rig.ports.ports[0].write
-
-    def lose_torque_off(data):
-        if data[4] == 1 and data[7] == 3 and data[8] == 64 and data[10] == 0:
-            bus.alter_next_instruction("lost", lambda _: b"")
-        write(data)
-
-    rig.ports.ports[0].write = lose_torque_off
+    lose = partial(bus.alter_next_instruction, "lost", lambda _: b"")
+    rig.when(lambda data: data[4:9] == b"\x01\x06\x00\x03\x40" and not data[10], lose)
     rig.hardware.switch_torque(0, False)
     rig.cycles(10)
     assert rig.torque() == [True, True]

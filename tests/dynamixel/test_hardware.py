@@ -1,5 +1,7 @@
 """Hardware on one bus, however its servos are read, and on two, judged by the ledger and the servos."""
 
+import math
+
 import numpy as np
 import pytest
 from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick, start_rig
@@ -147,6 +149,26 @@ class OneBus:
             assert rig.clock.now_ns() - start < most_ms * 1_000_000
         assert not rig.states.valid.any()
 
+    def states_of_others(self, rig):
+        """Return how many valid states all but the first get in a second of cycles without a gap."""
+        end_ns, count = rig.clock.now_ns() + 1_000_000_000, 0
+        while rig.clock.now_ns() < end_ns:
+            rig.goals.position[:] += 1e-3 * math.sin(rig.clock.now_ns() * 1e-9)
+            rig.hardware.read()
+            count += int(rig.states.valid[1:].sum())
+            rig.hardware.write()
+            # what the goals take on the wire, and a little for controllers
+            deadline = rig.clock.now_ns() + self.plan.budget.goals_ns + 100_000
+            rig.hardware.idle(deadline)
+            rig.clock.wait_until(max(deadline, rig.clock.now_ns()))
+        return count
+
+    def test_a_dead_servo_costs_the_others_less_than_a_twentieth(self, rig):
+        """The first one is the worst to lose: a chain ends there."""
+        before = self.states_of_others(rig)
+        rig.servo(self.ids[0]).silence()
+        assert self.states_of_others(rig) > 0.95 * before
+
     def test_the_heart_beats_while_the_robot_is_set_up_and_read(self, rig):
         rig.cycle()
         assert np.diff(rig.beats).max() <= 21_000_000  # the pause between two groups
@@ -167,6 +189,8 @@ class OneBus:
         assert all(one.confirmed for one in outcomes)
         assert not any(rig.torque())
         assert rig.packets.sent()[recorded] == self.plan.limp[0].packet
+        assert rig.packets.sent() == rig.into_bus()
+        assert rig.packets.received() == rig.out_of_bus()
 
     def test_extra_servos_on_the_line_are_left_alone(self):
         servo = self.plan.servos[0]

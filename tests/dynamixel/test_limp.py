@@ -7,43 +7,20 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp
 
 
-def test_a_robot_whose_loop_died_becomes_limp():
-    rig = start_rig()
-    rig.hardware.read()
-    recorded = len(rig.packets.sent())
-    outcomes = limp(rig.lines)
-    assert [one.confirmed for one in outcomes] == [True] * 8
-    assert rig.torque() == [False] * 8
-    assert rig.packets.sent()[recorded:][0] == rig.plans[0].limp[0].packet
-    assert rig.packets.sent() == rig.into_bus()
-    assert rig.packets.received() == rig.out_of_bus()
-
-
-def keep_torque(servo):
-    """Let a servo acknowledge torque off and keep its torque, as when another program writes it again."""
-    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
-
-
-def lose_readbacks(rig, servo_id):
+def lose_readbacks(rig):
     """Let a servo acknowledge every write and answer no read."""
-    write = rig.ports.ports[0].write
-
-    def through(data):
-        if (data[2], data[4]) == (servo_id, 2):
-            rig.buses[0].truncate_next(servo_id, 0)
-        write(data)
-
-    rig.ports.ports[0].write = through
+    rig.when(lambda data: (data[2], data[4]) == (6, 2), lambda: rig.buses[0].truncate_next(6, 0))
 
 
 @pytest.mark.parametrize(
     ("trick", "detail"),
     [
+        # as when another program writes it again
         (
-            lambda rig: keep_torque(rig.servo(6)),
+            lambda rig: rig.stick(6, "torque_enable", 1),
             "torque enable reads 1 after torque off was written",
         ),
-        (lambda rig: lose_readbacks(rig, 6), "torque off was acknowledged, but the read-back got no answer"),
+        (lose_readbacks, "torque off was acknowledged, but the read-back got no answer"),
     ],
 )
 def test_torque_off_counts_only_when_it_was_read_back(trick, detail):
@@ -58,15 +35,14 @@ def test_torque_off_counts_only_when_it_was_read_back(trick, detail):
 
 def test_what_answers_late_is_heard_before_the_ports_are_closed():
     rig = start_rig(make_plan((1,)))
-    write, asked = rig.ports.ports[0].write, []
+    asked = []
 
-    def late(data):
-        if data[4] == 2 and not asked:  # the first read-back: given up before its answer comes
+    def late():
+        if not asked:  # the first read-back: given up before its answer comes
             asked.append(rig.clock.now_ns())
             rig.buses[0].delay_next(1, LATE_NS)
-        write(data)
 
-    rig.ports.ports[0].write = late
+    rig.when(lambda data: data[4] == 2, late)
     (outcome,) = limp(rig.lines)
     assert outcome.confirmed
     assert rig.packets.received() == rig.out_of_bus()
