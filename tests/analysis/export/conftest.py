@@ -9,10 +9,10 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.commands import Dxlrun
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.ring import RecordKind
-from dxlrun.cli import main
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -77,12 +77,11 @@ def made(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def export(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, list[str]]]:
+def export(dxlrun: Dxlrun) -> Callable[..., tuple[int, str, list[str]]]:
     """Run `dxlrun export` in this process; gives exit code, output and errors."""
 
     def export(*words: object) -> tuple[int, str, list[str]]:
-        code = main(["export", *map(str, words)])
-        said = capsys.readouterr()
-        return code, said.out, said.err.splitlines()
+        said = dxlrun("export", *words)
+        return said.code, said.out, said.errors
 
     return export

@@ -7,17 +7,17 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.commands import Dxlrun, Said
 
-from dxlrun.cli import main
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
@@ -34,30 +34,10 @@ Here = list[str]
 """Names of the logs that were read."""
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    errors: list[str]
-
-    @property
-    def rows(self) -> dict[str, dict[str, Any]]:
-        assert self.code == 0, self.errors
-        return {row["log"]: row for row in json.loads(self.out)["rows"]}
-
-
-Dxlrun = Callable[..., Said]
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
-    """Run a command line in this process."""
-
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        said = capsys.readouterr()
-        return Said(code, said.out, said.err.splitlines())
-
-    return dxlrun
+def rows(said: Said) -> dict[str, dict[str, Any]]:
+    """Return the rows that a command printed as JSON, by the names of their logs."""
+    assert said.code == 0, said.err
+    return {row["log"]: row for row in json.loads(said.out)["rows"]}
 
 
 @pytest.fixture(scope="session")
@@ -124,7 +104,7 @@ def known(season: Path, here: Here, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dxlrun: Dxlrun) -> None:
-    found = dxlrun("logs", season, "--json").rows
+    found = rows(dxlrun("logs", season, "--json"))
 
     assert list(found) == NAMES
     broken = found.pop("may/broken.mcap")
@@ -147,10 +127,10 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dx
 
 
 def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: Here, dxlrun: Dxlrun) -> None:
-    first = dxlrun("logs", season, "--json").rows
+    first = rows(dxlrun("logs", season, "--json"))
     assert sorted(here) == NAMES
     here.clear()
-    assert dxlrun("logs", season, "--json").rows == first
+    assert rows(dxlrun("logs", season, "--json")) == first
     assert here == []
 
     shutil.copy(season / "may/third.mcap", season / "first.mcap")  # it may change again within a tick
@@ -158,7 +138,7 @@ def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: H
     (season / "may/copy.mcap").unlink()
     for expected in (["first.mcap", "may/second.mcap"], ["first.mcap"]):
         here.clear()
-        changed = dxlrun("logs", season, "--json").rows
+        changed = rows(dxlrun("logs", season, "--json"))
         assert changed["first.mcap"]["robot"] == "single_joint"
         assert "may/copy.mcap" not in changed
         assert here == expected
@@ -168,7 +148,7 @@ def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: H
 def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
     known: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
-    first = dxlrun("logs", known, "--json").rows
+    first = rows(dxlrun("logs", known, "--json"))
     here.clear()
     (file,) = runs.cache_directory().rglob("*.parquet")
     data = file.read_bytes()
@@ -179,7 +159,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
     else:
         flipped = data[:-20] + bytes([data[-20] ^ 0xFF]) + data[-19:]
         file.write_bytes(data[: len(data) // 2] if damage == "cut" else flipped)
-    assert dxlrun("logs", known, "--json").rows == first
+    assert rows(dxlrun("logs", known, "--json")) == first
     assert here == NAMES
 
 
@@ -200,7 +180,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
 def test_conditions_choose_logs(
     known: Path, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str]
 ) -> None:
-    assert list(dxlrun("logs", known, "--json", *words).rows) == expected
+    assert list(rows(dxlrun("logs", known, "--json", *words))) == expected
 
 
 def test_a_whole_statement_groups_and_gives_every_column_its_name(known: Path, dxlrun: Dxlrun) -> None:
@@ -220,7 +200,7 @@ def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here
     os.mkfifo(season / "pipe.mcap")
     (season / "gone.mcap").symlink_to("nowhere")
     for _ in range(2):
-        found = dxlrun("logs", season, "--json").rows
+        found = rows(dxlrun("logs", season, "--json"))
         assert sorted(set(found) - set(NAMES)) == ["\\udcff.mcap", "gone.mcap"]
         assert found["\\udcff.mcap"]["robot"] == "bioloid_torso"
         assert "No such file" in found["gone.mcap"]["unreadable"]
@@ -314,18 +294,18 @@ def test_a_log_in_parts_is_one_log(known: Path, dxlrun: Dxlrun) -> None:
     VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=path).run()
     (path / "notes.txt").touch()
     said = dxlrun("logs", known, "--json")
-    row = said.rows["torso_1"]
+    row = rows(said)["torso_1"]
     assert row["cycles"] == analyze_log(path).periods.records == 100
     assert row["bytes"] == sum(part.stat().st_size for part in path.glob("*.mcap"))
     assert json.loads(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
-    assert list(said.rows) == [*NAMES, "torso_1"]
-    assert list(dxlrun("logs", path, "--json").rows) == ["torso_1"]
+    assert list(rows(said)) == [*NAMES, "torso_1"]
+    assert list(rows(dxlrun("logs", path, "--json"))) == ["torso_1"]
 
 
 def test_a_measurement_is_no_run_that_failed(known: Path, dxlrun: Dxlrun) -> None:
     record = {latency_log.METADATA_NAME: {"settings": "{}"}}
     LogWriter(known / "latency.mcap", LogHeader("latency", (), (), (), 10**6, 0, metadata=record)).close()
-    row = dxlrun("logs", known, "--json").rows["latency.mcap"]
+    row = rows(dxlrun("logs", known, "--json"))["latency.mcap"]
     assert row["unreadable"] == "a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it"
     assert row["good"] is None
 
@@ -340,7 +320,7 @@ def test_a_fault_of_the_analysis_hides_no_other_log(
 
     opened = runs.open_log
     monkeypatch.setattr(runs, "open_log", strange)
-    found = dxlrun("logs", season, "--json").rows
+    found = rows(dxlrun("logs", season, "--json"))
     assert found["may/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"
     assert found["first.mcap"]["robot"] == "bioloid_torso"
 
@@ -364,7 +344,7 @@ def test_a_process_that_ends_costs_its_own_log_only(
     monkeypatch.setattr(runs, "row_of", deadly.row_of)
     for name in NAMES[1:]:
         (season / name).unlink()
-    found = dxlrun("logs", season, "--json").rows
+    found = rows(dxlrun("logs", season, "--json"))
     reason = "the process that read it ended: it crashed, or had too little memory"
     assert {name: row["unreadable"] for name, row in found.items()} == {
         "dies.mcap": reason,
