@@ -27,19 +27,42 @@ RAMP_S = 0.3
 
 
 class Rows(msgspec.Struct, frozen=True, eq=False):
-    """What is played."""
+    """What is played: a motion at a speed, which grows from 0 at its beginning, and goes back to 0."""
 
     motion: RecordedMotion
-    joints: tuple[str, ...]
+    speed: float
     period_s: float
+    at_s: Floats
+    """Shape (rows,)"""
+    recorded_s: Floats
+    """The time of the motion in each row."""
     positions: Floats
     """Shape (rows, joints), rad."""
-    speed: float
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """In the order of columns."""
+        return self.motion.joints
 
     @property
     def duration_s(self) -> float:
         """How long it takes to be played."""
         return len(self.positions) * self.period_s
+
+    @classmethod
+    def of(cls, motion: RecordedMotion, path: SplinePath, speed: float, period_s: float) -> Self:
+        """Return the rows of a motion's path, wherever limits are."""
+        duration_s = path.duration_s
+        ramp_s = min(RAMP_S, duration_s / speed)
+        seconds = duration_s / speed + ramp_s
+        most = MOST_NUMBERS // len(motion.joints)
+        row_s = period_s * max(1, math.ceil(seconds / period_s / most))
+        at_s = np.append(np.arange(0.0, seconds, row_s), seconds)
+        left_s = seconds - at_s
+        begin, end = speed * at_s**2 / (2 * ramp_s), duration_s - speed * left_s**2 / (2 * ramp_s)
+        even = speed * (at_s - ramp_s / 2)
+        recorded_s = np.where(at_s < ramp_s, begin, np.where(left_s < ramp_s, end, even))
+        return cls(motion, speed, row_s, at_s, recorded_s, path.at(recorded_s))
 
 
 def rows_of(
@@ -62,10 +85,10 @@ def rows_of(
     plans = [joints[name] for name in motion.joints]
     allowed = tolerances(motion, tolerance)
     path = fit(motion, allowed)
-    played = _Played.of(path, speed, period_s)
-    wrong = _all_beyond(plans, played, allowed, motion.begin_s)
+    played = Rows.of(motion, path, speed, period_s)
+    wrong = _all_beyond(plans, played, allowed)
     if wrong:
-        enough = _slow_enough(plans, path, speed, period_s, allowed)
+        enough = _slow_enough(plans, played, path, period_s, allowed)
         wrong += [f"at --speed {enough:g} it is within all of them"] if enough else []
         raise InputError("\n".join(f"{motion.path}: {sentence}" for sentence in wrong))
     if played.period_s > max(LONGEST_PERIOD_S, period_s):
@@ -78,33 +101,7 @@ def rows_of(
         if plan.bounded:
             held = played.positions[:, column]
             np.clip(held, plan.lower, plan.upper, out=held)
-    return Rows(motion, motion.joints, played.period_s, played.positions, speed)
-
-
-class _Played(msgspec.Struct, frozen=True, eq=False):
-    """A path at a speed."""
-
-    at_s: Floats
-    """Shape (rows,)"""
-    recorded_s: Floats
-    """The time of the path in each row; its speed grows from 0, and goes back to 0."""
-    positions: Floats
-    """Shape (rows, joints), rad"""
-    period_s: float
-
-    @classmethod
-    def of(cls, path: SplinePath, speed: float, period_s: float) -> Self:
-        duration_s = path.duration_s
-        ramp_s = min(RAMP_S, duration_s / speed)
-        seconds = duration_s / speed + ramp_s
-        most = MOST_NUMBERS // len(path.joints)
-        row_s = period_s * max(1, math.ceil(seconds / period_s / most))
-        at_s = np.append(np.arange(0.0, seconds, row_s), seconds)
-        left_s = seconds - at_s
-        begin, end = speed * at_s**2 / (2 * ramp_s), duration_s - speed * left_s**2 / (2 * ramp_s)
-        even = speed * (at_s - ramp_s / 2)
-        recorded_s = np.where(at_s < ramp_s, begin, np.where(left_s < ramp_s, end, even))
-        return cls(at_s, recorded_s, path.at(recorded_s), row_s)
+    return played
 
 
 def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> None:
@@ -120,10 +117,10 @@ def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> No
         )
 
 
-def _all_beyond(plans: Sequence[JointPlan], played: _Played, allowed: Floats, begin_s: float) -> list[str]:
+def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> list[str]:
     """Return a sentence for each joint and quantity that is beyond a limit, where it is farthest so."""
     return [
-        f"at {begin_s + played.recorded_s[row]:.3f} s {plan.name} {text}"
+        f"at {played.motion.begin_s + played.recorded_s[row]:.3f} s {plan.name} {text}"
         for column, plan in enumerate(plans)
         for row, text in _beyond(plan, played.positions[:, column], played.period_s, allowed[column])
     ]
@@ -163,13 +160,13 @@ def _beyond(
 
 
 def _slow_enough(
-    plans: Sequence[JointPlan], path: SplinePath, speed: float, period_s: float, allowed: Floats
+    plans: Sequence[JointPlan], played: Rows, path: SplinePath, period_s: float, allowed: Floats
 ) -> float | None:
     """Return a lower speed at which nothing is beyond a limit, in hundredths; None: none is."""
-    low, high = 0, math.ceil(speed * 100)
+    low, high = 0, math.ceil(played.speed * 100)
     while high - low > 1:
         middle = (low + high) // 2
-        if _all_beyond(plans, _Played.of(path, middle / 100, period_s), allowed, 0.0):
+        if _all_beyond(plans, Rows.of(played.motion, path, middle / 100, period_s), allowed):
             high = middle
         else:
             low = middle

@@ -30,7 +30,6 @@ this slope, times the tolerance, by half of that."""
 class SplinePath(msgspec.Struct, frozen=True, eq=False):
     """A motion by knots; between them it is cubic."""
 
-    joints: tuple[str, ...]
     time_s: Floats
     """Shape (knots,), growing, from 0."""
     position: Floats
@@ -45,7 +44,16 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
 
     def at(self, time_s: Floats) -> Floats:
         """Return the positions at times, shape (times, joints)."""
-        return _at(self.time_s, self.position, self.velocity, time_s)
+        knots, position = self.time_s, self.position
+        piece = np.clip(np.searchsorted(knots, time_s, side="right") - 1, 0, len(knots) - 2)
+        width = (knots[piece + 1] - knots[piece])[:, None]
+        part = np.clip((time_s - knots[piece])[:, None] / width, 0.0, 1.0)
+        begin, way = position[piece], position[piece + 1] - position[piece]
+        first, last = self.velocity[piece] * width, self.velocity[piece + 1] * width
+        found: Floats = begin + part * (
+            first + part * (3 * way - 2 * first - last + part * (first + last - 2 * way))
+        )
+        return found
 
 
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
@@ -65,9 +73,7 @@ def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
     chosen[[0, -1]] = True
     while True:
         knots = np.flatnonzero(chosen)
-        path = SplinePath(
-            motion.joints, times[knots], positions[knots], _velocities(times, positions, knots, tolerance)
-        )
+        path = SplinePath(times[knots], positions[knots], _velocities(times, positions, knots, tolerance))
         off = (np.abs(path.at(times) - positions) / tolerance).max(axis=1)
         off[knots] = 0.0
         if off.max() <= 1.0:
@@ -92,17 +98,4 @@ def _velocities(times: Floats, positions: Floats, knots: NDArray[np.intp], toler
     for end, near in ((0, 1), (-1, -2)):
         most = 3 * np.abs(slope[end]) + _OVERSHOOT * tolerance / width[end]
         found[end] = np.clip((3 * slope[end] - found[near]) / 2, -most, most) if len(knots) > 2 else slope[0]
-    return found
-
-
-def _at(knots: Floats, position: Floats, velocity: Floats, time_s: Floats) -> Floats:
-    piece = np.clip(np.searchsorted(knots, time_s, side="right") - 1, 0, len(knots) - 2)
-    width = (knots[piece + 1] - knots[piece])[:, None]
-    part = np.clip((time_s - knots[piece])[:, None] / width, 0.0, 1.0)
-    begin, end = position[piece], position[piece + 1]
-    way = end - begin
-    first, last = velocity[piece] * width, velocity[piece + 1] * width
-    found: Floats = begin + part * (
-        first + part * (3 * way - 2 * first - last + part * (first + last - 2 * way))
-    )
     return found
