@@ -37,6 +37,8 @@ FAILS = (
     (2.0, {"startup_configuration": 1}, "so it switches torque on by itself at power-up: clear bit 0"),
     (2.0, {"hardware_error_status": 32}, "reports in Hardware Error Status (70): overload error"),
     (2.0, {"torque_enable": 1}, "holds torque already"),
+    (1.0, {"cw_angle_limit": 100}, "has angle limits 100..1023, narrower than the joint's 0..1023"),
+    (2.0, {"drive_mode": 4}, "so it takes profiles for times: write 0 there"),
 )
 DIFFERS = (
     (

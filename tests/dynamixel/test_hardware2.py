@@ -142,32 +142,6 @@ def test_an_overload_behind_a_standing_alert_is_reported(started):
     assert started.events.sources(EventCode.SERVO_LIMP) == ["arm_14_joint"]
 
 
-def test_a_ramp_of_another_program_is_reported():
-    rig = make_rig(make_x((11, 12)))
-    rig.servo(12).poke("profile_acceleration", 5)
-    rig.hardware.start()
-    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
-    assert joint == "arm_12_joint"
-    assert "Profile Acceleration (108) is 5" in text
-
-
-@pytest.mark.parametrize(
-    ("register", "value", "said"),
-    [
-        ("startup_configuration", 2, "RAM comes from the backup at power-up"),
-        ("bus_watchdog", 10, "it would stop after 200 ms without an instruction; it is cleared"),
-        ("bus_watchdog", -1, "it has stopped the servo; it is cleared"),
-    ],
-)
-def test_what_an_earlier_run_left_is_reported(register, value, said):
-    rig = make_rig(make_x((11, 12), model="XL330-M288"))
-    rig.servo(12).poke(register, value)
-    rig.hardware.start()
-    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
-    assert joint == "arm_12_joint"
-    assert said in text
-
-
 def test_joint_position_of_an_x():
     servo = make_x((11,)).servos[0]
     assert servo.joint_position(2048) == pytest.approx(0.0, abs=0.002)

@@ -125,56 +125,8 @@ fast_sync = pytest.mark.parametrize("line", ["fast sync read"], indirect=True)
 @plain
 @pytest.mark.parametrize("victim", [0, 1, 3])
 def test_a_reply_with_a_flipped_bit_is_not_taken(line, victim):
-    size = len(line.replies()[0][1][0])
-    for at in range(size):
+    for at in range(len(line.replies()[0][1][0])):
         line.spoil(victim, lambda packet, at=at: flipped(packet, at))
-
-
-@plain
-def test_each_bit_of_a_checksum_counts(line):
-    for number in range(2):  # so that each is 0 once, and 1
-        for place in range(1, 1 + line.dialect.CHECKSUM):
-            for bit in range(8):
-
-                def alter(packet, place=place, bit=bit, number=number):
-                    right = resealed(
-                        line.dialect,
-                        packet[: line.head + 2] + bytes((number * 255,)) + packet[line.head + 3 :],
-                    )
-                    wrong = bytearray(right)
-                    wrong[-place] ^= 1 << bit
-                    return bytes(wrong)
-
-                line.spoil(1, alter)
-
-
-@every
-def test_a_reply_whose_last_byte_comes_alone_is_taken_with_its_time(line):
-    replies = line.replies()
-    read, packets = replies[0]
-    early_ns = (len(read.packet) + len(packets[0])) * line.side.hardware._buses[0].byte_ns
-
-    def pieces(mine):
-        data = b"".join(mine)
-        if mine is packets:  # its first byte comes sooner than the whole could, the whole does not
-            return [
-                (1, data[:1]),
-                (early_ns, data[1 : len(mine[0])]),
-                (AT_NS, data[len(mine[0]) : -1]),
-                (AT_NS + 7, data[-1:]),
-            ]
-        return [(AT_NS, data[:-1]), (AT_NS + 7, data[-1:])]
-
-    if len(packets) == 1:
-        assert line.cycle(
-            replies, lambda mine: [(1, mine[0][:1]), (AT_NS, mine[0][1:-1]), (AT_NS + 7, mine[0][-1:])]
-        ) == (True, GOOD)
-    else:
-        assert line.cycle(replies, pieces) == (True, GOOD)
-    log = line.side.log
-    statuses = [one for one in log if one.kind is PacketKind.STATUS]
-    asked = [one for one in log if one.kind is PacketKind.INSTRUCTION]
-    assert statuses[-1].last_ns == asked[-1].last_ns + AT_NS + 7
 
 
 @plain
@@ -183,6 +135,43 @@ def test_each_byte_in_front_of_the_data_is_checked_beside_the_checksum(line, vic
     """With the right checksum: header, ID, length and, in Protocol 2.0, the instruction byte."""
     for at in range(line.head - 1):
         line.spoil(victim, lambda packet, at=at: resealed(line.dialect, flipped(packet, at)))
+
+
+@plain
+@pytest.mark.parametrize("bit", range(8))
+@pytest.mark.parametrize("data", [0, 255])  # so that each bit is 0 once, and 1
+def test_each_bit_of_a_checksum_counts(line, bit, data):
+    for place in range(1, 1 + line.dialect.CHECKSUM):
+
+        def alter(packet, place=place):
+            at = line.head + 2
+            wrong = bytearray(resealed(line.dialect, packet[:at] + bytes((data,)) + packet[at + 1 :]))
+            wrong[-place] ^= 1 << bit
+            return bytes(wrong)
+
+        line.spoil(1, alter)
+
+
+@every
+def test_a_reply_whose_last_byte_comes_alone_is_taken_with_its_time(line):
+    replies = line.replies()
+    read, packets = replies[0]
+    first = len(packets[0]) if len(packets) > 1 else 2
+    early_ns = (len(read.packet) + first) * line.side.hardware._buses[0].byte_ns
+
+    def pieces(mine):
+        """The first byte comes sooner than the whole reply could, the whole does not."""
+        data = b"".join(mine)
+        cuts = [(1, 1), (early_ns, first)] if mine is packets and len(packets) > 1 else [(1, 1)]
+        ends = [0, *(end for _, end in cuts), len(data) - 1, len(data)]
+        times = [*(at for at, _ in cuts), AT_NS, AT_NS + 7]
+        return [(at, data[start:end]) for at, (start, end) in zip(times, pairwise(ends), strict=True)]
+
+    assert line.cycle(replies, pieces) == (True, GOOD)
+    log = line.side.log
+    statuses = [one for one in log if one.kind is PacketKind.STATUS]
+    asked = [one for one in log if one.kind is PacketKind.INSTRUCTION]
+    assert statuses[-1].last_ns == asked[-1].last_ns + AT_NS + 7
 
 
 @plain
