@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
@@ -50,7 +51,8 @@ CODES = {
 }
 _FIXES = {
     EventCode.SERVO_REBOOTED: "Check its plugs, and whether the supply can give the current.",
-    EventCode.SERVO_LOST: "Check its cable, plugs and supply; `dxlrun scan PORT` shows which servos answer.",
+    EventCode.SERVO_LOST: "Check its cable, plugs and supply, at that angle, too; `dxlrun scan PORT` shows "
+    "which servos answer.",
     EventCode.SERVO_LIMP: "Look for overload, heat, low voltage: `dxlrun servo PORT ID get` has its errors.",
 }
 _REFUSED = (
@@ -81,9 +83,11 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
-    alone = len(by_source) == 1  # of several that answer garbled it is the line
-    for source, (*_, why) in list(totals.returns.items())[:_MOST_NAMED]:
-        sentence += f" {source} {why}." if alone or "garbled" not in why else ""
+    lost_at = {one.name: one.lost_at for one in totals.tracking if one.unit == "rad"}
+    if len(by_source) == 1 and (at := lost_at.get(ordered[0][0])) is not None:
+        sentence = f"{sentence[:-1]}, at {math.degrees(at):.0f} deg."
+    if len(by_source) <= _FEWEST_OF_BUS:  # of more it is what they share
+        sentence += "".join(f" {source} {why}." for source, (*_, why) in totals.returns.items())
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
     rebooted = first == EventCode.SERVO_REBOOTED

@@ -437,6 +437,13 @@ def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: 
     assert bool(lost.remedy) is not alone
 
 
+def test_a_servo_that_is_lost_alone_is_told_with_its_angle() -> None:
+    joint = JointTracking("elbow", 0, 0.0, 0, None, None, None, None, None, None, lost_at=0.5)
+    for events, told in (((LOST,), "elbow was lost, at 29 deg."), ((LOST, lost("wrist")), "wrist was lost.")):
+        sentences = [one.sentence for one in judge(totals(events=events, tracking=(joint,))).findings]
+        assert any(sentence.endswith(told) for sentence in sentences)
+
+
 def test_why_the_start_was_refused_is_said_first() -> None:
     refused = EventGroup(EventCode.SETUP, Severity.ERROR, "loop", 1, MS, "elbow has angle limits 1850..2246")
     found = judge(

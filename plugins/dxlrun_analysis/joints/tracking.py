@@ -66,6 +66,8 @@ class JointTracking:
     """The delay with which the joint follows the goals as they were sent; None where none explains it."""
     unit: str = "rad"
     """In which its errors are; m of a linear joint, whatever their names say"""
+    lost_at: float | None = None
+    """Where it was when its servo was lost for the first time; None: it was not, or it is not known."""
 
 
 def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -322,6 +324,7 @@ class _Row:
     invalid: int = 0
     oldest_ns: int = 0
     clamped: int = 0
+    lost_at: float | None = None
     errors: int = 0
     squares: float = 0.0
     worst: float = 0.0
@@ -343,6 +346,9 @@ class _Row:
         self.invalid += int(np.count_nonzero(missing_states(new)[:, self.row]))
         self.oldest_ns = max(self.oldest_ns, int(new["age_ns"][:, self.row].max(initial=0)))
         self.clamped += int(np.count_nonzero(new["clamped"][:, self.row]))
+        lost = np.flatnonzero(new["torque"][:, self.row] == Torque.LOST)
+        if self.lost_at is None and len(lost) and math.isfinite(at := new["position"][lost[0], self.row]):
+            self.lost_at = float(at)
         sent = _sent(cycles, self.row, self.limits)
         way = _reachable(sent, self.limits.acceleration, self.way)
         times = cycles["read_ns"] * 1e-9
@@ -395,4 +401,5 @@ class _Row:
             rest_rad=self.rest_rad,
             delay_ms=None if delay_s is None else delay_s * 1e3,
             unit=self.limits.logged.unit,
+            lost_at=self.lost_at,
         )

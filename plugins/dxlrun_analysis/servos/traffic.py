@@ -95,7 +95,8 @@ class BusTraffic:
     """Of the exchanges, those that took 2 ms longer than the plan expects, or that were given up too soon:
     a reply came behind the next instruction."""
     late_us: float = 0.0
-    """How much longer than wire and return delay 90 % of these took at most."""
+    """How much longer than wire and return delay three quarters of these took at most: those behind a reply
+    that was given up may have waited for several."""
 
 
 class Traffic:
@@ -211,8 +212,8 @@ class Traffic:
             yield Finding(
                 "late_now_and_then",
                 plan.name,
-                f"Replies on bus {plan.name} come late now and then, of whichever servo: {moments} times, by "
-                f"up to {bus.late_us / 1e3:.0f} ms.",
+                f"Replies on bus {plan.name} come late now and then: {moments} times, by up to "
+                f"{bus.late_us / 1e3:.0f} ms; the log does not show whether it is one servo or the adapter.",
                 "Check adapter and USB hub, and what else runs on the machine (`dxlrun doctor`).",
                 Rank.CAUSE,
                 bus.late_share,
@@ -323,7 +324,7 @@ class Traffic:
             planned_latency_us=plan.latency_ns / 1e3 if plan.baud_rate else None,
             port=plan.port,
             late_share=share if known else 0.0,
-            late_us=quantile(values[late][order], counts[late][order], 0.9) if known else 0.0,
+            late_us=quantile(values[late][order], counts[late][order], 0.75) if known else 0.0,
         )
 
 

@@ -18,8 +18,6 @@ from tests.conftest import SEED as COMMIT
 
 _FIRST = "the first reply of a read is missing: by its servo, or by the instruction; too few of single servos"
 UNNAMED = {
-    ("loose_plug_at_an_angle", "ax_single"): "cut for good as soon as it is there: lost once, at one angle",
-    ("loose_plug_at_an_angle", "x_fast"): "the same",
     ("head_of_the_chain_is_silent", "x_three"): _FIRST,
     ("gain_lost", "ax_single"): "it is 4.5 deg away at most, on a side where it was not before",
 }
