@@ -13,14 +13,12 @@ from rich.console import Console
 
 from dxlrun.channels.events import EventCode
 from dxlrun.control.realtime import Grant, highest_priority
-from dxlrun.run.run_summary import ProcessGrant, granted_text, refusals, show_grants
+from dxlrun.run.run_summary import granted_text, refusals, show_grants
 
 GRANTS = (
-    ProcessGrant("loop", Grant("timer slack", True, "timer slack 1 ns")),
-    ProcessGrant(
-        "loop", Grant("scheduler", False, "it was refused, so that", "allow it with `a long command`")
-    ),
-    ProcessGrant("guardian", Grant("scheduler", False, "it was refused", "allow it with `a long command`")),
+    Grant("timer slack", True, "timer slack 1 ns"),
+    Grant("scheduler", False, "it was refused, so that", "allow it with `a long command`"),
+    Grant("scheduler", False, "it was refused", "allow it with `a long command`", "guardian"),
 )
 
 

@@ -9,7 +9,7 @@ from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.sensors.offer import links_breach, states_breach
+from dxlrun.control.sensors.offer import names_breach
 from dxlrun.description import Description
 from dxlrun.description.bus import SIMULATED
 from dxlrun.errors import Mark, suggestion
@@ -52,7 +52,7 @@ def _compiled(
     except Exception as error:  # foreign code
         at_fault(file, "sensor", name, offer.distribution, raised("name its states and links", error))
         return None
-    if breach := states_breach(states) or links_breach(links):
+    if breach := names_breach(states, links):
         what, fix = breach
         at_fault(file, "sensor", name, offer.distribution, (what, f"report it to its author: {fix}"))
         return None

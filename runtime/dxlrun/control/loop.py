@@ -25,7 +25,6 @@ from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, schedule_of
-from dxlrun.control.sensors.readings import NoSensors
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan
@@ -106,7 +105,8 @@ class Loop:
     """Gives the clock another period, ns, so that its polling stays a small share of it."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """Plug-ins that decide what becomes of a late cycle."""
-    sensors: Sensors = field(default_factory=NoSensors)
+    sensors: Sensors | None = None
+    """None: the robot has none, or a replay's record has them already."""
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
     _overruns: Overruns = field(init=False)
@@ -192,7 +192,8 @@ class Loop:
         period_ms = self.plan.period_ns / 1e6
         text = f"loop started, period {period_ms:g} ms"
         self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
-        self.sensors.read()
+        if self.sensors is not None:
+            self.sensors.read()
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()
@@ -206,24 +207,24 @@ class Loop:
         end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.switching.fault is None:
             cycle = self._cycle
-            if end_ns is not None and schedule.time_ns(cycle, schedule.deadline_ns(cycle)) >= end_ns:
+            deadline_ns = schedule.deadline_ns(cycle)
+            if end_ns is not None and schedule.time_ns(cycle, deadline_ns) >= end_ns:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
             if self._given_up:
                 return "fault", self._given_up[1]
-            self._one(self._cycle)
+            self._one(cycle, deadline_ns)
             if self._next():
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
         return "fault", self.manager.switching.fault
 
-    def _one(self, cycle: int) -> None:
+    def _one(self, cycle: int, deadline_ns: int) -> None:
         """Wait for a deadline, then read, take commands, update, gate and write."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
-        deadline_ns = schedule.deadline_ns(cycle)
         self.hardware.idle(deadline_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
-        schedule.begin(cycle, woken_ns)
+        time_ns = schedule.begin(cycle, woken_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
@@ -233,7 +234,8 @@ class Loop:
         if self._motion:
             self._motion.begin()
         self.hardware.read()
-        self.sensors.read()
+        if self.sensors is not None:
+            self.sensors.read()
         read_ns = now_ns()
         self.gate.enter_modes()
         valid = record.states.valid
@@ -244,7 +246,6 @@ class Loop:
         else:
             if not (all_valid and self._lost.none) and self._lost.look(record.states):
                 self._miss()
-            time_ns = schedule.time_ns(cycle, woken_ns)
             # it never goes back: a cycle that was late when a pause began catches up
             schedule.paused_ns -= max(0, self._time_ns - time_ns)
             self._time_ns = max(self._time_ns, time_ns)
@@ -307,7 +308,7 @@ class Loop:
             self._motion = motion
             try:
                 while not motion.over:
-                    self._one(self._cycle)
+                    self._one(self._cycle, self.schedule.deadline_ns(self._cycle))
                     self._next()
             except PortError as error:
                 motion.give_up(str(error))

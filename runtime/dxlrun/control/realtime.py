@@ -45,11 +45,18 @@ class Grant(msgspec.Struct, frozen=True):
     """For a person; names the consequence where something was refused."""
     fix: str = ""
     """What to do where something was refused; empty where nothing helps."""
+    process: str = "loop"
 
     @property
     def text(self) -> str:
-        """Sentence and fix."""
-        return f"{self.sentence}: {self.fix}" if self.fix else self.sentence
+        """Sentence and fix, with the process where that is not the loop."""
+        text = f"{self.sentence}: {self.fix}" if self.fix else self.sentence
+        return text if self.process == "loop" else f"{self.process}: {text}"
+
+    @property
+    def name(self) -> str:
+        """What was asked for; with the process where that is not the loop."""
+        return self.request if self.process == "loop" else f"{self.process}: {self.request}"
 
 
 def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:

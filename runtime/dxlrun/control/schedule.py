@@ -41,8 +41,9 @@ class Schedule:
         """Return when a cycle is due."""
         return self._origin_ns + (cycle - self._first) * self.period_ns
 
-    def begin(self, cycle: int, woken_ns: int) -> None:
-        """Take no notice: a late cycle moves no deadline."""
+    def begin(self, cycle: int, woken_ns: int) -> int:
+        """Begin a cycle; return the controllers' time in it. A late one moves no deadline."""
+        return woken_ns - self.start_ns - self.paused_ns
 
     def time_ns(self, cycle: int, now_ns: int) -> int:
         """Return the controllers' time: since the first deadline, pauses left out."""
@@ -92,9 +93,10 @@ class SequentialSchedule(Schedule):
         """Return when a cycle is due, if all between begin on time."""
         return self._begun_ns + (cycle - self._begun) * self.period_ns
 
-    def begin(self, cycle: int, woken_ns: int) -> None:
-        """Count the next deadline from here."""
+    def begin(self, cycle: int, woken_ns: int) -> int:
+        """Count the next deadline from here; return the controllers' time."""
         self._begun, self._begun_ns = cycle, woken_ns
+        return self.time_ns(cycle, woken_ns)
 
     def time_ns(self, cycle: int, now_ns: int) -> int:
         """Return the controllers' time: as many periods as cycles, pauses left out."""

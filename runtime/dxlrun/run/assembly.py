@@ -22,7 +22,7 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
-from dxlrun.control.sensors.readings import NoSensors, Readings
+from dxlrun.control.sensors.readings import Readings
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
@@ -175,7 +175,7 @@ def assemble(
         cycle_limit=cycle_limit,
         pace=pace,
         overrun_hooks=plugins.overrun_hooks,
-        sensors=Readings(plan.loop, slots, record, clock.now_ns, sinks.events) if slots else NoSensors(),
+        sensors=Readings(plan.loop, slots, record, clock.now_ns, sinks.events) if slots else None,
     )
     manager.configure()
     return AssembledRobot(hardware, manager, loop, record)

@@ -208,49 +208,32 @@ class Progress:
             self._status.console.file.flush()
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessGrant:
-    """What the operating system granted to one process of the run, or refused."""
-
-    process: str
-    """loop, guardian"""
-    grant: Grant
-
-    @property
-    def name(self) -> str:
-        """What was asked for; with the process where that is not the loop."""
-        return self.grant.request if self.process == "loop" else f"{self.process}: {self.grant.request}"
-
-
-def show_grants(grants: Sequence[ProcessGrant], out: Console, *, verbose: bool = False) -> None:
+def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False) -> None:
     """Print one line where all was granted, else a table, and the commands that fix what was refused.
 
     Only on a terminal. `verbose`: the table in any case.
     """
     if not out.is_terminal:
         return
-    if not verbose and all(one.grant.granted for one in grants):
+    if not verbose and all(one.granted for one in grants):
         show("real time: all granted", console=out)
         return
     columns = [Column("real time", "name"), Column("granted", "name"), Column("", "text")]
     rows = [
-        (one.name, Cell("yes", "good") if one.grant.granted else Cell("no", "warning"), one.grant.sentence)
+        (one.name, Cell("yes", "good") if one.granted else Cell("no", "warning"), one.sentence)
         for one in grants
     ]
-    fixes = dict.fromkeys(one.grant.fix for one in grants if one.grant.fix)
+    fixes = dict.fromkeys(one.fix for one in grants if one.fix)
     show(Table.of("", columns, rows), *(Sentence(f"  {fix}", "warning") for fix in fixes), console=out)
 
 
-def refusals(grants: Sequence[ProcessGrant], out: Console) -> tuple[str, ...]:
+def refusals(grants: Sequence[Grant], out: Console) -> tuple[str, ...]:
     """Return what was not granted, one sentence each, where no table has shown it."""
     if out.is_terminal:
         return ()
-    refused = (one for one in grants if not one.grant.granted)
-    return tuple(
-        one.grant.text if one.process == "loop" else f"{one.process}: {one.grant.text}" for one in refused
-    )
+    return tuple(one.text for one in grants if not one.granted)
 
 
-def granted_text(grants: Sequence[ProcessGrant]) -> dict[str, str]:
+def granted_text(grants: Sequence[Grant]) -> dict[str, str]:
     """Return the table as the log's metadata carries it."""
-    return {one.name: f"{'yes' if one.grant.granted else 'no'}: {one.grant.sentence}" for one in grants}
+    return {one.name: f"{'yes' if one.granted else 'no'}: {one.sentence}" for one in grants}

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from msgspec.structs import replace
 from rich.console import Console
 
 from dxlrun.channels import process, slot
@@ -62,7 +63,6 @@ from dxlrun.run.run_processes import (
     start_simulated_buses,
 )
 from dxlrun.run.run_summary import (
-    ProcessGrant,
     Progress,
     RunOptions,
     RunSummary,
@@ -152,7 +152,7 @@ class _Run:
     """The guardian's last message."""
     messages: int = 0
     guardian_grants: tuple[Grant, ...] = ()
-    grants: tuple[ProcessGrant, ...] = ()
+    grants: tuple[Grant, ...] = ()
     """What the operating system granted, once the loop runs."""
     signals: int = 0
     """How many SIGINT and SIGTERM came: the first asks the robot to stop in order, the second cuts torque."""
@@ -271,10 +271,7 @@ class _Run:
         """Show what the operating system granted, and record it, once the loop has reported it."""
         loop = () if self.grants else loop_grants(self.memory)
         if loop:
-            self.grants = (
-                *(ProcessGrant("loop", grant) for grant in loop),
-                *(ProcessGrant("guardian", grant) for grant in self.guardian_grants),
-            )
+            self.grants = (*loop, *(replace(one, process="guardian") for one in self.guardian_grants))
             show_grants(self.grants, self.out, verbose=self.options.verbose)
             if self.recorder:
                 self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum, unique
 from functools import partial
 from types import MappingProxyType
@@ -37,7 +36,7 @@ from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Inputs, Provided, claims
+from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
@@ -212,31 +211,28 @@ class Managed:
         """
         name = self.plan.name
         self._activity.name_controller(self.place, name)
-        with self._shown(ControllerMethod.INIT):
+        self._activity.begin(self.place, ControllerMethod.INIT)
+        try:
             self.controller = plugins.built(self.plan)
+        finally:
+            self._activity.end()
         topics = self.controller.topics(self.controller.parameters)
         self._topics.open(topics, self.plan.distribution, self.plan.joints)
         if type(self.controller).keeps:
             kept, keep = keeping.open(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
-        with self._shown(ControllerMethod.ON_CONFIGURE):
-            try:
-                self.controller.on_configure(self._context)
-            except BaseException as error:  # foreign code: one sentence instead of its traceback
-                if is_interrupt(error):
-                    raise
-                raise ControllerFault(
-                    f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
-                ) from error
-        plugins.after_each(f"of controller {name}")
-
-    @contextmanager
-    def _shown(self, method: ControllerMethod) -> Iterator[None]:
-        self._activity.begin(self.place, method)
+        self._activity.begin(self.place, ControllerMethod.ON_CONFIGURE)
         try:
-            yield
+            self.controller.on_configure(self._context)
+        except BaseException as error:  # foreign code: one sentence instead of its traceback
+            if is_interrupt(error):
+                raise
+            raise ControllerFault(
+                f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
+            ) from error
         finally:
             self._activity.end()
+        plugins.after_each(f"of controller {name}")
 
     def on(self, event: Event) -> None:
         """Change the state by an event; raises KeyError for one that the state does not have."""
@@ -378,7 +374,7 @@ class Managed:
             self._inputs.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
         self._call(ControllerMethod.UPDATE, "", self.controller.update, time_ns, capped_ns)
-        for claim in [claim for claim in self._claims if claim.check()]:  # all are checked before one counts
+        for claim in [*filter(Claim.check, self._claims)]:  # all are checked before one counts
             claim.merge()
         if self.provided is not None:
             self.provided.take()

@@ -5,8 +5,7 @@ A message is checked and encoded where it is published, in the loop's process; n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, NoMessages, Topic
@@ -61,15 +60,9 @@ class TopicLog:
         self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
     ) -> Publisher:
         """Announce a topic of messages of a dataclass; allocates. Raises WrongMessage when it is none."""
-        return self.declared(name, message, package, joints)()
-
-    def declared(
-        self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
-    ) -> Callable[[], Publisher]:
-        """Return what announces a topic when it is called; as `open`, which allocates at once."""
         declared = declared_message(message, package)
         topic = Topic(name, declared.type, joints)
-        return partial(Publisher, topic, declared, self._sink, self._record, self._epoch_offset_ns)
+        return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
 
     def of_controller(self, name: str, bit: int) -> ControllerTopics:
         """Return what a controller publishes with; its topics are opened later."""

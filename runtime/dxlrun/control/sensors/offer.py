@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -59,24 +59,21 @@ def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | 
     return None
 
 
-def states_breach(states: object) -> Breach | None:
-    """Check what a sensor's `states` returned."""
-    if not isinstance(states, tuple) or not states or not all(isinstance(one, str) for one in states):
-        return f"returns {states!r} from states", "return a tuple of names, such as angular_velocity.x"
-    if wrong := [one for one in states if not one or "/" in one or one == "age"]:
+def names_breach(states: object, links: object) -> Breach | None:
+    """Check what a sensor's `states` and `links` returned."""
+    for what, names in (("states", states), ("links", links)):
+        if not isinstance(names, tuple) or not all(isinstance(one, str) for one in names):
+            return f"returns {names!r} from {what}", "return a tuple of names, such as angular_velocity.x"
+    found = cast("tuple[str, ...]", states)
+    if not found:
+        return "returns () from states", "return a tuple of names, such as angular_velocity.x"
+    if wrong := [one for one in found if not one or "/" in one or one == "age"]:
         return (
             f"has a state {wrong[0]!r}",
             "name a state as angular_velocity.x; each source has an age already",
         )
-    if len(set(states)) < len(states):
-        return f"has a state twice: {', '.join(states)}", "name each once"
-    return None
-
-
-def links_breach(links: object) -> Breach | None:
-    """Check what a sensor's `links` returned."""
-    if not isinstance(links, tuple) or not all(isinstance(one, str) for one in links):
-        return f"returns {links!r} from links", "return a tuple of names"
+    if len(set(found)) < len(found):
+        return f"has a state twice: {', '.join(found)}", "name each once"
     return None
 
 

@@ -20,13 +20,6 @@ QUIET_NS = 100_000_000
 """Between two sentences of a sensor that is there: one that says something in each cycle fills no log."""
 
 
-class NoSensors:
-    """Sensors of a robot that has none, or of a replay, whose record has them already."""
-
-    def read(self) -> None:
-        """Do nothing."""
-
-
 class Readings:
     """The loop's end of all slots.
 
