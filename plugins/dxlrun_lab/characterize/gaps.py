@@ -8,7 +8,7 @@ until the sample, and brakes before it.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -99,26 +99,22 @@ def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
     return False
 
 
-def search(
-    shortest: float, longest: float, step: float, tolerance: float
-) -> Generator[float, Gap, list[Gap]]:
-    """Yield gaps to try, multiples of `step`, and get them judged; return all, in the order of their gaps.
+def following(
+    tried: Sequence[Gap], shortest: float, longest: float, step: float, tolerance: float
+) -> float | None:
+    """Return the gap to try next, a multiple of `step`; None: those that were tried tell enough.
 
     They grow by half until the joint leaves its path, then halve what is left between.
     """
-    tried: dict[int, Gap] = {}
-    good, bad = max(1, round(shortest / step)), 0
-    most = max(good + 1, round(longest / step))
-    at = good + 1
-    while not bad and at <= most:
-        tried[at] = yield at * step
-        good, bad = (at, bad) if tried[at].kept(tolerance) else (good, at)
-        at = min(max(at + 1, math.ceil(at * 1.5)), most) if at < most else most + 1
-    while bad and bad - good > max(1, round(_BETWEEN * good)):
-        at = (good + bad) // 2
-        tried[at] = yield at * step
-        good, bad = (at, bad) if tried[at].kept(tolerance) else (good, at)
-    return [tried[number] for number in sorted(tried)]
+    kept = [round(gap.gap_s / step) for gap in tried if gap.kept(tolerance)]
+    bad = min((round(gap.gap_s / step) for gap in tried if not gap.kept(tolerance)), default=0)
+    least = max(1, round(shortest / step))
+    good, most = max(kept, default=least), max(least + 1, round(longest / step))
+    if bad:
+        return (good + bad) // 2 * step if bad - good > max(1, round(_BETWEEN * good)) else None
+    if good >= most:
+        return None
+    return min(max(good + 1, math.ceil(good * 1.5) if kept else 0), most) * step
 
 
 def longest_gap(

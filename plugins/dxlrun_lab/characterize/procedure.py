@@ -166,10 +166,8 @@ class Characterize:
         """Let the goal go to and fro by a tick in each cycle, at rising rates."""
         column, label = situation.names.index(joint.name), joint.plan.label
         step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
-        highest = rates.highest_by_bus(situation.plan)
-        trying = rates.search(situation.rate, min(highest, rates.MOST_HZ), step)
-        rate = next(trying)
-        while True:
+        highest = min(rates.highest_by_bus(situation.plan), rates.MOST_HZ)
+        while (rate := rates.following(found.rates, situation.rate, highest, step)) is not None:
             burst = max(_BURST_CYCLES, round(rates.BURST_S * rate))
             whole = max(burst, min(_MOST_RATE_CYCLES, round(_RATE_S * rate)))
             parts: list[Recorded] = []
@@ -185,10 +183,6 @@ class Characterize:
             except Refused as refusal:
                 tried = rates.refused(rate, str(refusal))
             found.rates = sorted([*found.rates, tried], key=lambda one: one.rate)
-            try:
-                rate = trying.send(tried)
-            except StopIteration:
-                break
         found.figures.append(rates.highest_rate(found.rates, situation.plan, label))
 
     def _response(self, situation: Situation, joint: Joint, found: Found) -> Part:
@@ -303,17 +297,12 @@ class Characterize:
         for interface in interfaces:
             recorded = yield self._motion(joint, interface, 1 / rate, rate, size)
             reference = self._since_motion(situation, joint, recorded, 1 / rate)
-            trying = gaps.search(1 / rate, _LONGEST_GAP_S, 1 / rate, self._tolerance)
             tried: list[gaps.Gap] = []
-            gap = next(trying)
-            while True:
+            least = 1 / rate
+            while gap := gaps.following(tried, least, _LONGEST_GAP_S, least, self._tolerance):
                 recorded = yield self._motion(joint, interface, gap, rate, size)
                 trace = self._since_motion(situation, joint, recorded, gap)
                 tried.append(gaps.judge(gap, trace, reference, size))
-                try:
-                    gap = trying.send(tried[-1])
-                except StopIteration:
-                    break
             found.gaps[interface] = sorted(tried, key=lambda one: one.gap_s)
             found.figures.append(
                 gaps.longest_gap(

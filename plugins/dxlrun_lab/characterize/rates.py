@@ -8,7 +8,7 @@ count.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Literal
 
@@ -111,27 +111,19 @@ def highest_by_bus(plan: Plan) -> float:
     return 1e9 / plan.loop.least_period_ns if plan.loop.least_period_ns else math.inf
 
 
-def search(begin: float, highest: float, step: Fraction) -> Generator[float, Rate, list[Rate]]:
-    """Yield rates to try, Hz, up to a highest, and get them judged; return all, in their order."""
-    tried: dict[float, Rate] = {}
-    good, bad = 0.0, math.inf
-    rate = fitting(min(begin, highest), step)
-    while True:
-        tried[rate] = yield rate
-        if tried[rate].fault:
-            bad = rate
-        else:
-            good = rate
-        if math.isinf(bad):
-            # where controllers allow few rates, the next one, however far it is
-            following = fitting(min(max(GROWS * rate, rate + float(step)), highest), step)
-        elif good:
-            following = fitting((good + bad) / 2, step)
-        else:
-            following = fitting(bad / GROWS, step)
-        if following in tried or following <= good or bad - good < NEAR * good:
-            return [tried[key] for key in sorted(tried)]
-        rate = following
+def following(tried: Sequence[Rate], begin: float, highest: float, step: Fraction) -> float | None:
+    """Return the rate to try next, Hz, up to a highest; None: those that were tried tell enough."""
+    if not tried:
+        return fitting(min(begin, highest), step)
+    good = max((one.rate for one in tried if not one.fault), default=0.0)
+    bad = min((one.rate for one in tried if one.fault), default=math.inf)
+    if math.isinf(bad):
+        # where controllers allow few rates, the next one, however far it is
+        rate = fitting(min(max(GROWS * good, good + float(step)), highest), step)
+    else:
+        rate = fitting((good + bad) / 2 if good else bad / GROWS, step)
+    known = rate <= good or any(one.rate == rate for one in tried)
+    return None if known or bad - good < NEAR * good else rate
 
 
 def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:

@@ -123,14 +123,10 @@ def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(
     begin: float, step: int, keeps: float, expected: list[int] | None
 ) -> None:
     """A controller of 50 Hz, as most robots have one, leaves multiples of it: less than GROWS allows."""
-    trying = rates.search(begin, 410.0, Fraction(step))
-    rate = next(trying)
-    while True:
-        try:
-            rate = trying.send(rates.Rate(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
-        except StopIteration as end:
-            tried = [one.rate for one in end.value]
-            break
+    judged: list[rates.Rate] = []
+    while (rate := rates.following(judged, begin, 410.0, Fraction(step))) is not None:
+        judged.append(rates.Rate(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
+    tried = sorted(one.rate for one in judged)
     if expected is not None:
         assert tried == expected
     else:
