@@ -23,7 +23,7 @@ from tests.kit.anew import written_anew
 
 from dxlrun.control.schedule import Schedule
 from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import LogReader, open_log, read_log
+from dxlrun.log.reader import open_log, read_log
 from dxlrun_analysis.latency import latency_log, tables
 from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
 from dxlrun_analysis.latency.page import page
@@ -73,22 +73,22 @@ def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int]
     return times - (5_000 + PERIOD)
 
 
-def test_each_wake_up_has_its_deadline_on_the_grid() -> None:
+def test_each_wake_up_has_its_deadline_on_the_grid():
     times = measured([100, 0, 2_500])
     assert times.tolist() == [[0, 100], [PERIOD, PERIOD], [2 * PERIOD, 2 * PERIOD + 2_500]]
 
 
-def test_deadlines_that_passed_are_skipped_and_the_phase_stays() -> None:
+def test_deadlines_that_passed_are_skipped_and_the_phase_stays():
     times = measured([PERIOD + 1, 0, 3 * PERIOD, 0])
     assert (times[:, 0] // PERIOD).tolist() == [0, 2, 3, 6]
     assert ((times[:, 1] - times[:, 0]).tolist()) == [PERIOD + 1, 0, 3 * PERIOD, 0]
 
 
-def test_the_measurement_ends_after_a_whole_wake_up_when_it_is_asked_to() -> None:
+def test_the_measurement_ends_after_a_whole_wake_up_when_it_is_asked_to():
     assert len(measured([7, 7, 7], stop_after=1)) == 1
 
 
-def test_the_buffer_can_be_read_while_it_is_filled() -> None:
+def test_the_buffer_can_be_read_while_it_is_filled():
     buffer = Buffer.create(3)
     assert (buffer.wake_ups().shape, buffer.worst_ns(0, 0)) == ((0, 2), 0)
     for number, (due, woken) in enumerate(((10, 12), (20, 29), (30, 31))):
@@ -101,7 +101,7 @@ def test_the_buffer_can_be_read_while_it_is_filled() -> None:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase() -> None:
+def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase():
     period_ns = 100  # shorter than any wait
     buffer = Buffer.create(50)
     with compiled_yardstick(settings(C)) as program:
@@ -118,7 +118,7 @@ def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase() -> No
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_nothing_of_the_yardstick_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_the_yardstick_is_on_the_disk(tmp_path, monkeypatch):
     """So that nothing stays of it when the front process is killed."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with compiled_yardstick(settings(C)) as program:
@@ -143,10 +143,8 @@ def test_nothing_of_the_yardstick_is_on_the_disk(tmp_path: Path, monkeypatch: py
         ("c", "other", [("other", "other"), ("c", "other")]),
     ],
 )
-def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(
-    compare: str | None, policy: str | None, expected: list[tuple[str, str]]
-) -> None:
-    found = conditions(compare, policy)  # type: ignore[arg-type]  # one of them
+def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(compare, policy, expected):
+    found = conditions(compare, policy)
     assert [(one.name, one.policy) for one in found] == expected
 
 
@@ -160,11 +158,9 @@ def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(
         ("other,fifo", "fifo", "--policy is for c where conditions are compared, and c is not among them"),
     ],
 )
-def test_a_comparison_that_makes_no_sense_is_one_sentence(
-    compare: str, policy: str | None, sentence: str
-) -> None:
+def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sentence):
     with pytest.raises(InputError) as refused:
-        conditions(compare, policy)  # type: ignore[arg-type]  # one of them
+        conditions(compare, policy)
     assert str(refused.value).startswith(sentence)
     assert "\n" not in str(refused.value)
 
@@ -185,19 +181,17 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(
         ({"iterations": 10**6, "period_ns": 10**9}, "this would take 277.8 h, and 24 h are the most"),
     ],
 )
-def test_values_with_which_nothing_can_be_measured_are_one_sentence(
-    change: dict[str, int], sentence: str
-) -> None:
+def test_values_with_which_nothing_can_be_measured_are_one_sentence(change, sentence):
     right = settings(OTHER)
     right.check(frozenset({0, 1}))
     with pytest.raises(InputError) as refused:
-        replace(right, **change).check(frozenset({0, 1}))  # type: ignore[arg-type]  # by name
+        replace(right, **change).check(frozenset({0, 1}))
     assert str(refused.value).startswith(sentence)
     assert "\n" not in str(refused.value)
 
 
 @given(st.integers(1, 40), st.integers(0, 200))
-def test_the_blocks_have_all_iterations(blocks: int, more: int) -> None:
+def test_the_blocks_have_all_iterations(blocks, more):
     whole = settings(OTHER, iterations=blocks + more, blocks=blocks)
     shares = [whole.share(number) for number in range(blocks)]
     assert sum(shares) == whole.iterations
@@ -205,7 +199,7 @@ def test_the_blocks_have_all_iterations(blocks: int, more: int) -> None:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
-def test_the_order_of_the_blocks_is_counterbalanced(number: int) -> None:
+def test_the_order_of_the_blocks_is_counterbalanced(number):
     all_of_them = (OTHER, ROUND_ROBIN, FIFO, C)[:number]
     rounds = [order(all_of_them, block) for block in range(2 * number)]
     assert all(set(one) == set(all_of_them) for one in rounds)
@@ -221,13 +215,13 @@ def test_the_order_of_the_blocks_is_counterbalanced(number: int) -> None:
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 99, 100])
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
-def test_the_quantiles_of_t_are_those_of_scipy(freedom: int, confidence: float) -> None:
+def test_the_quantiles_of_t_are_those_of_scipy(freedom, confidence):
     from scipy import stats
 
     assert t_quantile(freedom, confidence) == pytest.approx(stats.t.ppf((1 + confidence) / 2, freedom))
 
 
-def test_an_interval_is_that_of_student() -> None:
+def test_an_interval_is_that_of_student():
     from scipy import stats
 
     values = [3.0, 4.5, 2.0, 3.5, 9.0]
@@ -237,7 +231,7 @@ def test_an_interval_is_that_of_student() -> None:
     assert (interval([4.0]).mean, interval([4.0]).low) == (4.0, None)
 
 
-def test_the_mode_is_the_fullest_microsecond_and_the_smallest_of_several() -> None:
+def test_the_mode_is_the_fullest_microsecond_and_the_smallest_of_several():
     assert mode_us(np.array([4_999, 4_000, 7_100, 7_900, 60_000])) == 4
     assert mode_us(np.array([300, 999, 1_000])) == 0
 
@@ -249,7 +243,7 @@ def block(condition: Condition, number: int, late_us: list[float], skip: int = 0
     return Block(condition.name, number, times, cpu_ns=25_000, wall_ns=100_000, margin_ns=70_000)
 
 
-def test_the_thesis_table_of_known_wake_ups() -> None:
+def test_the_thesis_table_of_known_wake_ups():
     late = [1.0, 2.0, 2.5, 150.0, 151.0, 1000.0, 1001.0, 2.9]
     result = figures(settings(OTHER), [block(OTHER, 0, late[:4]), block(OTHER, 1, late[4:], skip=3)])
     (one,) = result.conditions
@@ -265,7 +259,7 @@ def test_the_thesis_table_of_known_wake_ups() -> None:
     assert (result.reference, one.ratios) == ("", {})
 
 
-def test_conditions_are_divided_by_the_yardstick_block_by_block() -> None:
+def test_conditions_are_divided_by_the_yardstick_block_by_block():
     found = settings(ROUND_ROBIN, C, iterations=6, blocks=3)
     own = [[1.0, 3.0], [2.0, 2.0], [6.0, 0.0]]
     other = [[10.0, 10.0], [40.0, 40.0], [5.0, 7.0]]
@@ -279,7 +273,7 @@ def test_conditions_are_divided_by_the_yardstick_block_by_block() -> None:
     assert result.remarks == ("over 3 blocks the intervals are wide: give --blocks 5 or more to compare",)
 
 
-def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes() -> None:
+def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes():
     found = settings(ROUND_ROBIN, C, blocks=5)
     broken = replace(block(C, 0, [5.0, 6.0]), cpu_ns=0, wall_ns=0)
     blocks = [block(ROUND_ROBIN, 0, [1.0]), broken, block(C, 1, [])]
@@ -291,7 +285,7 @@ def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes() -> None:
     assert only.remarks == ("over 1 block there is no interval: give --blocks 5 or more to compare",)
 
 
-def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one() -> None:
+def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one():
     found = settings(ROUND_ROBIN, C, iterations=6, blocks=3)
     blocks = [block(ROUND_ROBIN, number, [1.0, 3.0]) for number in (0, 1)]
     blocks += [block(C, number, [4.0, 4.0]) for number in (0, 1)]
@@ -307,7 +301,7 @@ def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one() -> 
     assert figures(found, [block(C, 0, [7.0])]).conditions[0].over_blocks["mean_us"].mean == 7.0
 
 
-def test_the_tables_have_a_column_for_each_condition() -> None:
+def test_the_tables_have_a_column_for_each_condition():
     found = settings(ROUND_ROBIN, C)
     blocks = [block(one, number, [1.0, 20_000.0]) for one in (ROUND_ROBIN, C) for number in (0, 1)]
     result = figures(found, blocks, "2 busy processes")
@@ -328,7 +322,7 @@ def test_the_tables_have_a_column_for_each_condition() -> None:
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> tuple[Path, Settings, list[Block]]:
+def log(tmp_path):
     found = settings(ROUND_ROBIN, C)
     blocks = [block(one, number, [1.5 + number, 300.0]) for number in (0, 1) for one in (ROUND_ROBIN, C)]
     path = tmp_path / "latency.mcap"
@@ -337,7 +331,7 @@ def log(tmp_path: Path) -> tuple[Path, Settings, list[Block]]:
     return path, found, blocks
 
 
-def test_the_log_gives_the_same_result_again(log: tuple[Path, Settings, list[Block]]) -> None:
+def test_the_log_gives_the_same_result_again(log):
     path, found, blocks = log
     read = open_log(path)
     assert latency_log.is_measurement(read)
@@ -348,7 +342,7 @@ def test_the_log_gives_the_same_result_again(log: tuple[Path, Settings, list[Blo
     assert latency_log.machine_of(read) == latency_log.machine()
 
 
-def test_other_tools_read_the_wake_ups(log: tuple[Path, Settings, list[Block]]) -> None:
+def test_other_tools_read_the_wake_ups(log):
     path, _, blocks = log
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -362,10 +356,8 @@ def test_other_tools_read_the_wake_ups(log: tuple[Path, Settings, list[Block]]) 
     assert sorted(found) == sorted(expected)
 
 
-def test_a_log_whose_description_is_damaged_is_one_sentence(
-    log: tuple[Path, Settings, list[Block]], tmp_path: Path
-) -> None:
-    def read(**other: object) -> LogReader:
+def test_a_log_whose_description_is_damaged_is_one_sentence(log, tmp_path):
+    def read(**other):
         return open_log(written_anew(log[0], tmp_path / "other.mcap", lambda read: replace(read, **other)))
 
     with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
@@ -377,7 +369,7 @@ def test_a_log_whose_description_is_damaged_is_one_sentence(
     assert [one.name for one in result.conditions] == ["round_robin"]
 
 
-def test_the_page_has_the_tables_and_three_figures(log: tuple[Path, Settings, list[Block]]) -> None:
+def test_the_page_has_the_tables_and_three_figures(log):
     _, found, blocks = log
     result = figures(found, blocks, "a load")
     text = page(result, blocks, "Linux <6>")

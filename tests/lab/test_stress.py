@@ -20,7 +20,7 @@ SMALL = 16 << 20
 
 
 @pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def small(monkeypatch, tmp_path):
     monkeypatch.setattr(stress, "MOST_MEMORY", SMALL)
     monkeypatch.setattr(stress, "_DISK", str(tmp_path))
     monkeypatch.setenv("PATH", str(tmp_path))  # no stress-ng
@@ -57,7 +57,7 @@ def most_resident(process: int) -> int:
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
 
 
-def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path: Path) -> None:
+def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path):
     before = children(os.getpid())
     with Stress() as load:
         assert load.text == f"1 busy process, 1 that allocates 0.016 GB and writes to {tmp_path}"
@@ -70,7 +70,7 @@ def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path: Path) -
     assert load.ended() == ()
 
 
-def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path: Path) -> None:
+def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path):
     program = tmp_path / "stress-ng"
     program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\nwhile :; do :; done\n')
     program.chmod(0o755)
@@ -85,13 +85,13 @@ def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path: Path)
         ]  # fmt: skip
 
 
-def test_a_load_that_is_not_wanted_is_none() -> None:
+def test_a_load_that_is_not_wanted_is_none():
     before = children(os.getpid())
     with Stress(wanted=False) as load:
         assert (load.text, load.ended(), children(os.getpid())) == ("", (), before)
 
 
-def test_it_ends_when_the_process_that_entered_the_block_is_killed() -> None:
+def test_it_ends_when_the_process_that_entered_the_block_is_killed():
     source = (
         "import time\nfrom dxlrun_lab import stress\n"
         f"stress.MOST_MEMORY = {SMALL}\n"
@@ -106,16 +106,14 @@ def test_it_ends_when_the_process_that_entered_the_block_is_killed() -> None:
         assert soon(lambda: not any(map(alive, started)))
 
 
-def test_a_part_that_is_killed_is_reported() -> None:
+def test_a_part_that_is_killed_is_reported():
     before = children(os.getpid())
     with Stress() as load:
         os.kill(min(children(os.getpid()) - before), signal.SIGKILL)
         assert soon(lambda: load.ended() == ("the load ended before the measurement did",))
 
 
-def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(tmp_path, monkeypatch):
     before = children(os.getpid())
     monkeypatch.setattr(stress, "_DISK", str(tmp_path / "missing"))
     monkeypatch.setattr(stress, "_START_S", 5.0)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dxlrun.testing import plan_of
 from dxlrun_lab.characterize.measured import Measured
-from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize, Measurement
+from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize
 from dxlrun_lab.guided.choice import situation_of
-from dxlrun_lab.guided.experiment import Experiment, perform
+from dxlrun_lab.guided.experiment import perform
 from dxlrun_lab.guided.rig import Rig
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
@@ -55,21 +54,21 @@ def robot_text(  # the keys of a robot file, each with what most tests leave as 
 
 
 @pytest.fixture
-def measures(tmp_path: Path) -> Iterator[Measures]:
+def measures(tmp_path):
     """Characterize a joint, or perform another experiment; the rig is closed in the end."""
-    made: list[Rig] = []
+    made = []
 
     def measure(
-        measurements: Sequence[Measurement] | Experiment[Any],
-        model: str = "MX-64",
+        measurements,
+        model="MX-64",
         *,
-        reach: float = 1.0,
-        tolerance: float = TOLERANCE,
-        each_cycle: Callable[[Rig, int], None] = lambda rig, cycle: None,
-        **keys: object,
-    ) -> Done:
+        reach=1.0,
+        tolerance=TOLERANCE,
+        each_cycle=lambda rig, cycle: None,
+        **keys,
+    ):
         file = tmp_path / f"{len(made)}.yaml"
-        file.write_text(robot_text(model, **keys))  # type: ignore[arg-type]  # the test's keys of robot_text
+        file.write_text(robot_text(model, **keys))
         rig = virtual_rig(
             plan_of(file),
             log=tmp_path / f"{len(made)}.mcap",

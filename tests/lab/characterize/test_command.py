@@ -8,7 +8,6 @@ import shlex
 from pathlib import Path
 
 import pytest
-from tests.kit.commands import Dxlrun
 
 from dxlrun_lab.characterize import procedure
 
@@ -17,7 +16,7 @@ FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figure
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "robots").symlink_to(ROOT / "robots")
@@ -34,7 +33,7 @@ def slow_bus(tmp_path: Path) -> Path:
     return file
 
 
-def test_the_commands_of_the_page_measure(dxlrun: Dxlrun, tmp_path: Path) -> None:
+def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
     text = (ROOT / "docs" / "experiments.md").read_text()
     own = text.partition("\n## characterize")[2]
     virtual, real, running = re.findall(r"^    dxlrun (characterize .+)$", own, re.MULTILINE)
@@ -49,9 +48,7 @@ def test_the_commands_of_the_page_measure(dxlrun: Dxlrun, tmp_path: Path) -> Non
     assert "no robot arm runs" in dxlrun(*shlex.split(running)).err
 
 
-def test_a_run_of_its_own_gives_the_same_table(
-    dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
     """In real time, so the figures depend on the machine: only what is there, and that it is consistent."""
     monkeypatch.setattr(procedure, "_RATE_S", 0.2)
     done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--measure", "rate", "--json")
@@ -79,14 +76,12 @@ def test_a_run_of_its_own_gives_the_same_table(
         (("--measure", "torque"), "torque"),
     ],
 )
-def test_wrong_words_are_refused_before_anything_moves(
-    dxlrun: Dxlrun, tmp_path: Path, words: tuple[str, ...], why: str
-) -> None:
+def test_wrong_words_are_refused_before_anything_moves(dxlrun, tmp_path, words, why):
     done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--virtual", *words)
     assert (done.code, why in done.err + done.out) == (2, True), done
 
 
-def test_every_figure_of_a_result_is_on_the_page(dxlrun: Dxlrun) -> None:
+def test_every_figure_of_a_result_is_on_the_page(dxlrun):
     text = (
         (ROOT / "docs" / "experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]
     )

@@ -75,17 +75,12 @@ class OneSegment:
 
 
 @pytest.mark.parametrize(("model", "instruction_at"), [("MX-64", 4), ("XM430-W350", 7)])
-def test_a_trace_has_the_times_at_which_the_servo_had_goals_and_positions(
-    measures: Measures, model: str, instruction_at: int
-) -> None:
+def test_a_trace_has_the_times_at_which_the_servo_had_goals_and_positions(measures, model, instruction_at):
     """On a slow bus, by its ledger: when the last bytes of reads and goals had passed the wire."""
     done = measures(OneSegment(), model, protocol=PROTOCOLS[model], baud_rate=57_600, rate=40)
     trace, origin_ns = done.result
     sent = [entry for entry in done.rig.robot.simulated.ledger.entries if entry.direction == "in"]
-    for instruction, times in (
-        (READ, trace.time),
-        (SYNC_WRITE, trace.sent[1:][np.diff(trace.goal) != 0]),
-    ):
+    for instruction, times in ((READ, trace.time), (SYNC_WRITE, trace.sent[1:][np.diff(trace.goal) != 0])):
         ends = np.array(
             [
                 one.t_ns + len(one.data) * 1e10 / 57_600
@@ -126,9 +121,7 @@ def least_period_ns(done: Any, write_time_ns: int) -> float:
         pytest.param("XL430-W250", 1, marks=campaign),
     ],
 )
-def test_the_rate_is_that_at_which_the_servo_can_just_answer(
-    measures: Measures, model: str, write_ms: int
-) -> None:
+def test_the_rate_is_that_at_which_the_servo_can_just_answer(measures, model, write_ms):
     simulation = f"{{write_time: {write_ms} ms}}"
     done = measures(["rate"], model, protocol=PROTOCOLS[model], simulation=simulation)
     truth = 1e9 / least_period_ns(done, write_ms * MS)
@@ -138,7 +131,7 @@ def test_the_rate_is_that_at_which_the_servo_can_just_answer(
     assert "joint (ID 1 on bus main) are lost at" in figure.limit
 
 
-def test_a_slow_bus_is_named_as_what_limits_the_rate(measures: Measures) -> None:
+def test_a_slow_bus_is_named_as_what_limits_the_rate(measures):
     done = measures(["rate"], "MX-64", baud_rate=57_600, rate=100)
     bus = done.rig.plan.buses[0]
     figure = done.figure(rates.NAME)
@@ -173,9 +166,7 @@ def risen_s(model: str, delay_ns: int, step: float) -> float:
         pytest.param("XM430-W350", 40, marks=campaign),
     ],
 )
-def test_the_response_is_the_delay_and_what_the_motor_needs(
-    measures: Measures, model: str, delay_ms: int
-) -> None:
+def test_the_response_is_the_delay_and_what_the_motor_needs(measures, model, delay_ms):
     simulation = f"{{response_delay: {delay_ms} ms}}"
     done = measures(["response"], model, protocol=PROTOCOLS[model], simulation=simulation)
     first, most = done.figure(response.ONSET), done.figure(response.RISE)
@@ -199,9 +190,7 @@ BROADCASTER = "controllers: {states: {type: joint_state_broadcaster, rate: 50}}\
         pytest.param("MX-64", 0, marks=campaign),
     ],
 )
-def test_a_response_that_few_loop_rates_show_is_within_its_interval(
-    measures: Measures, model: str, delay_ms: int
-) -> None:
+def test_a_response_that_few_loop_rates_show_is_within_its_interval(measures, model, delay_ms):
     """A controller of 50 Hz leaves multiples of it: samples that are 7 ms apart, of few ticks."""
     done = measures(
         ["response"],
@@ -230,9 +219,7 @@ def test_a_response_that_few_loop_rates_show_is_within_its_interval(
         pytest.param("XL430-W250", "profile_acceleration", 40, marks=campaign),
     ],
 )
-def test_acceleration_and_braking_are_those_of_the_profile(
-    measures: Measures, model: str, register: str, ticks: int
-) -> None:
+def test_acceleration_and_braking_are_those_of_the_profile(measures, model, register, ticks):
     registers = f"{{{register}: {ticks}}}"
     done = measures(["speed"], model, protocol=PROTOCOLS[model], registers=registers, reach=1.2)
     truth = ticks * done.rig.robot.simulated.buses[0].servo(1).registers.table.items[register].scale
@@ -241,7 +228,7 @@ def test_acceleration_and_braking_are_those_of_the_profile(
 
 
 @pytest.mark.parametrize("model", [pytest.param(model, marks=campaign) for model in PROTOCOLS])
-def test_the_top_speed_without_a_profile_is_the_motors(measures: Measures, model: str) -> None:
+def test_the_top_speed_without_a_profile_is_the_motors(measures, model):
     done = measures(["speed"], model, protocol=PROTOCOLS[model])
     motor = motor_of(done.rig.robot.simulated.buses[0].servo(1).registers.table)
     figure = done.figure(speeds.TOP)
@@ -277,9 +264,7 @@ def resting_error(bus: SimulatedBus, friction: float) -> float:
         pytest.param("XM430-W350", 0.2, {"position_p_gain": 400}, marks=campaign),
     ],
 )
-def test_the_dead_band_is_margin_and_friction_over_the_gain(
-    measures: Measures, model: str, friction: float, registers: dict[str, int]
-) -> None:
+def test_the_dead_band_is_margin_and_friction_over_the_gain(measures, model, friction, registers):
     truth = resting_error(on_a_bench(model, **registers), friction)
     text = ", ".join(f"{name}: {value}" for name, value in registers.items())
     done = measures(
@@ -356,9 +341,7 @@ def true_gap(  # noqa: PLR0917  the measured one, and what deviation() takes
         pytest.param("XM430-W350", 4, marks=campaign),
     ],
 )
-def test_the_longest_gap_is_that_of_the_simulated_shaft(
-    measures: Measures, model: str, degrees: float
-) -> None:
+def test_the_longest_gap_is_that_of_the_simulated_shaft(measures, model, degrees):
     tolerance = math.radians(degrees)
     done = measures(["gap"], model, protocol=PROTOCOLS[model], tolerance=tolerance, reach=0.6)
     joint = done.result.joints[0]

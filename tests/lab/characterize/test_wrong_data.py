@@ -35,13 +35,17 @@ def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> lis
     return found
 
 
-def test_the_response_of_clean_steps_is_found_by_the_estimator_alone() -> None:
+def step_of(way: float, height: float) -> response.Step:
+    return response.Step(np.arange(50) * 0.01, np.full(50, way), np.full(50, height), height, way, 0.0, TICK)
+
+
+def test_the_response_of_clean_steps_is_found_by_the_estimator_alone():
     first, rise = response.response(stepping(0.0))
     assert first.value == pytest.approx(0.020, abs=0.002)
     assert rise.value == pytest.approx(0.020 + 0.03, rel=0.05)
 
 
-def test_noise_widens_the_interval_until_nothing_is_told() -> None:
+def test_noise_widens_the_interval_until_nothing_is_told():
     quiet, noisy = (response.response(stepping(noise)) for noise in (0.0, 1.5 * TICK))
     assert noisy[1].uncertainty > quiet[1].uncertainty
     first, rise = response.response(stepping(0.05))
@@ -57,19 +61,14 @@ def test_noise_widens_the_interval_until_nothing_is_told() -> None:
         (-0.001, 0.001, ("below 2 ms", "")),
     ],
 )
-def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(
-    value: float, uncertainty: float, words: tuple[str, str]
-) -> None:
+def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(value, uncertainty, words):
     one = Measured("response", "s", value, uncertainty)
     assert (tables.shown(one), tables.shown_uncertainty(one)) == words
 
 
-def test_estimators_refuse_nothing_and_motions_without_motion() -> None:
+def test_estimators_refuse_nothing_and_motions_without_motion():
     assert response.response([])[0].why.startswith("0 steps were recorded")
-    still = [
-        response.Step(np.arange(50) * 0.01, np.zeros(50), np.full(50, 0.1), 0.1, 0.0, 0.0, TICK)
-        for _ in range(8)
-    ]
+    still = [step_of(0.0, 0.1)] * 8
     assert "the joint moved by 0 deg at most in steps of 5.7 deg" in response.response(still)[0].why
     for figure in speeds.speeds(still, 1.0, 5.0):
         assert (figure.value, figure.why) == (None, "the joint hardly moved")
@@ -81,7 +80,7 @@ def test_estimators_refuse_nothing_and_motions_without_motion() -> None:
     )
 
 
-def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band() -> None:
+def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band():
     """Its goal moves within the dead band: the errors at its rests are those of the goal, and say nothing."""
     rows, _ = dead_band.table(dead_band.stops([-0.01, 0.0, 0.01], 0.05), 1 / 60)
     time = np.arange(len(rows)) / 60
@@ -95,14 +94,16 @@ def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band() -> None:
     assert dead_band.dead_band(moved, TICK, {}, TICK)[0].value == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_joint_that_comes_to_rest_between_commands_has_left_its_path() -> None:
-    tried = [gaps.Gap(0.01, 0.001, False), gaps.Gap(0.02, 0.002, True)]
-    figure = gaps.longest_gap(tried, "posvel", 0.02, 0.004, 1.0)
-    assert figure.value == pytest.approx(0.015)
-    assert figure.limit == "it comes to rest between commands"
+def test_a_longest_gap_is_one_that_left_the_path_or_in_which_the_joint_rested():
+    kept = gaps.Gap(0.01, 0.001, False)
+    rested = gaps.longest_gap([kept, gaps.Gap(0.02, 0.002, True)], "posvel", 0.02, 0.004, 1.0)
+    assert (rested.value, rested.limit) == (pytest.approx(0.015), "it comes to rest between commands")
+    left = gaps.longest_gap([kept, gaps.Gap(0.02, 0.021, False)], "position", 0.0191, 0.004, 1.0)
+    assert left.value == pytest.approx(0.01905)
+    assert left.value - left.uncertainty <= 0.01 + 1e-12, "all that lies between the gaps that were tried"
 
 
-def test_the_machines_lateness_does_not_count_against_a_rate() -> None:
+def test_the_machines_lateness_does_not_count_against_a_rate():
     late = rates.Rate(500.0, 1000, lost=0, too_long=20, late=400, exchange_s=0.0008)
     assert late.fault == ""
     slow = rates.Rate(500.0, 1000, lost=0, too_long=990, late=0, exchange_s=0.0021)
@@ -119,11 +120,9 @@ def test_the_machines_lateness_does_not_count_against_a_rate() -> None:
         (125.0, 0, 200.0, None),
     ],
 )
-def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(
-    begin: float, step: int, keeps: float, expected: list[int] | None
-) -> None:
+def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(begin, step, keeps, expected):
     """A controller of 50 Hz, as most robots have one, leaves multiples of it: less than GROWS allows."""
-    judged: list[rates.Rate] = []
+    judged = []
     while (rate := rates.following(judged, begin, 410.0, Fraction(step))) is not None:
         judged.append(rates.Rate(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
     tried = sorted(one.rate for one in judged)
@@ -133,24 +132,13 @@ def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(
         assert 0.98 * keeps < max(rate for rate in tried if rate <= keeps) <= keeps
 
 
-def test_a_step_of_few_ticks_names_a_range_that_would_do() -> None:
-    steps = [
-        response.Step(np.arange(50) * 0.01, np.full(50, 0.01), np.full(50, 0.01), 0.01, 0.01, 0.0, TICK)
-        for _ in range(8)
-    ]
+def test_a_step_of_few_ticks_names_a_range_that_would_do():
     assert "too small for positions in ticks of 0.088 deg; a range of about 2 deg would do" in (
-        response.response(steps)[0].why
+        response.response([step_of(0.01, 0.01)] * 8)[0].why
     )
 
 
-def test_a_gap_is_uncertain_by_all_that_lies_between_the_gaps_that_were_tried() -> None:
-    tried = [gaps.Gap(0.01, 0.001, False), gaps.Gap(0.02, 0.021, False)]
-    figure = gaps.longest_gap(tried, "position", 0.0191, 0.004, 1.0)
-    assert figure.value == pytest.approx(0.01905)
-    assert figure.value - figure.uncertainty <= 0.01 + 1e-12
-
-
-def test_a_joint_that_is_stuck_has_no_figures(measures: Measures) -> None:
+def test_a_joint_that_is_stuck_has_no_figures(measures):
     done = measures(["response"], "MX-64", simulation="{friction: 5.5 Nm}")
     for figure in done.result.joints[0].figures:
         assert figure.value is None, figure
@@ -158,7 +146,7 @@ def test_a_joint_that_is_stuck_has_no_figures(measures: Measures) -> None:
     assert done.result.why == ""
 
 
-def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures: Measures) -> None:
+def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures):
     done = measures(["speed"], "AX-12A", reach=0.2)
     top = done.figure(speeds.TOP)
     assert top.value is None
@@ -171,34 +159,28 @@ def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures: Mea
     "DXLRUN_CHARACTERIZE_SERVOS" not in os.environ, reason="the campaign: DXLRUN_CHARACTERIZE_SERVOS=1"
 )
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
-def test_the_range_that_is_named_does(measures: Measures, model: str) -> None:
+def test_the_range_that_is_named_does(measures, model):
     why = measures(["speed"], model, reach=0.2).figure(speeds.TOP).why
     needed = math.radians(float(why.rpartition("about ")[2].removesuffix(" deg would do")))
     assert measures(["speed"], model, reach=needed / 2).figure(speeds.TOP).value is not None
 
 
-def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures: Measures) -> None:
-    def lose(rig: Any, cycle: int) -> None:
-        bus = rig.robot.simulated.buses[0]
-        if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
-            bus.servo(1).silence()
+def lose(rig: Any, cycle: int) -> None:
+    bus = rig.robot.simulated.buses[0]
+    if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
+        bus.servo(1).silence()
 
+
+def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures):
     done = measures(["speed", "dead_band"], "AX-12A", each_cycle=lose)
     assert "was lost" in done.result.why or "has not answered" in done.result.why
     assert done.figure(speeds.TOP).value is not None
     band = done.figure(dead_band.NAME)
-    assert band.value is None
-    assert band.why == f"the experiment ended before: {done.result.why}"
+    assert (band.value, band.why) == (None, f"the experiment ended before: {done.result.why}")
 
 
-def test_steps_before_an_early_end_give_a_response(measures: Measures) -> None:
-    def lose(rig: Any, cycle: int) -> None:
-        bus = rig.robot.simulated.buses[0]
-        if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
-            bus.servo(1).silence()
-
+def test_steps_before_an_early_end_give_a_response(measures):
     done = measures(["response"], each_cycle=lose)
     assert done.result.why
-    rise = done.figure(response.RISE)
-    assert rise.value is not None
-    assert 6 <= rise.count < 60
+    assert 6 <= done.figure(response.RISE).count < 60
+    assert done.figure(response.RISE).value is not None

@@ -44,7 +44,7 @@ class Plays:
 
 def sine(joint: Joint, rate: float = 320, seconds: float = 1.0, **more: object) -> Segment:
     wave = joint.middle + 0.2 * np.sin(2 * np.pi * np.arange(round(rate * seconds)) / rate)
-    return Segment("sine", 1 / rate, {joint.name: wave}, **more)  # type: ignore[arg-type]  # test's options
+    return Segment("sine", 1 / rate, {joint.name: wave}, **more)
 
 
 class Stage:
@@ -79,7 +79,7 @@ class Stage:
 
 
 @pytest.fixture
-def stage(tmp_path: Path) -> Iterator[Stage]:
+def stage(tmp_path):
     stage = Stage(tmp_path)
     yield stage
     for rig in stage.rigs:

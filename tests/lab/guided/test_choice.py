@@ -31,7 +31,7 @@ controllers:
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def rig(tmp_path_factory):
     file = tmp_path_factory.mktemp("choice") / "mixed.yaml"
     file.write_text(ROBOT)
     rig = virtual_rig(plan_of(file))
@@ -46,7 +46,7 @@ def refused(rig: Any, *names: str, **ranges: tuple[float, float]) -> list[str]:
     return list(caught.value.sentences)
 
 
-def test_the_default_range_is_around_the_joint_and_within_its_limits(rig: Any) -> None:
+def test_the_default_range_is_around_the_joint_and_within_its_limits(rig):
     (joint,) = situation_of(rig, ["narrow"], {}).joints
     assert math.degrees(joint.lower) == pytest.approx(-20, abs=0.1), "its limit is nearer than 30 deg"
     assert math.degrees(joint.upper) == pytest.approx(30, abs=0.1)
@@ -55,7 +55,7 @@ def test_the_default_range_is_around_the_joint_and_within_its_limits(rig: Any) -
     assert joint.lower < low < joint.middle < high < joint.upper
 
 
-def test_a_range_is_taken_as_it_is_given(rig: Any) -> None:
+def test_a_range_is_taken_as_it_is_given(rig):
     ranges = parse_ranges(["narrow=-10deg..0.5 rad", "wheel=-720 deg..720deg"])
     joints = situation_of(rig, ["wheel", "narrow"], ranges).joints
     assert [joint.name for joint in joints] == ["wheel", "narrow"], "in the order of the command line"
@@ -63,7 +63,7 @@ def test_a_range_is_taken_as_it_is_given(rig: Any) -> None:
     assert joints[0].upper == pytest.approx(4 * math.pi)
 
 
-def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig: Any) -> None:
+def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig):
     assert refused(rig, "narrow", "wheel", "limp", narrow=(-30, 20)) == [
         "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
         "joint wheel has no position limits, so its range must be given: --range wheel=-30deg..30deg",
@@ -85,7 +85,7 @@ def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig: Any) -> No
         ("elbow=nan deg..3deg", "--range elbow=nan deg..3deg: "),
     ],
 )
-def test_wrong_words_are_refused(word: str, sentence: str) -> None:
+def test_wrong_words_are_refused(word, sentence):
     with pytest.raises(InputError) as caught:
         parse_ranges([word, "wrist"])
     first, second = caught.value.sentences
@@ -95,7 +95,7 @@ def test_wrong_words_are_refused(word: str, sentence: str) -> None:
         parse_ranges(["a=1deg..9deg", "a=1deg..9deg"])
 
 
-def test_wrong_names_are_refused(rig: Any) -> None:
+def test_wrong_names_are_refused(rig):
     joints = rig.plan.loop.joints
     with pytest.raises(InputError) as caught:
         check_joints(["narow", "limp", "limp"], {"limp": (0, 1), "narrow": (0, 1)}, joints)
@@ -108,7 +108,7 @@ def test_wrong_names_are_refused(rig: Any) -> None:
         check_joints([], {}, joints)
 
 
-def test_words_are_a_robot_file_its_arguments_and_joints() -> None:
+def test_words_are_a_robot_file_its_arguments_and_joints():
     assert Chosen.of(["a.yaml", "port:=sim", "x", "y"]) == Chosen(Path("a.yaml"), ("port:=sim",), ("x", "y"))
     assert Chosen.of(["x", "y"]) == Chosen(None, (), ("x", "y"))
     with pytest.raises(InputError, match="port:=sim is an argument of a robot file, and there is none"):

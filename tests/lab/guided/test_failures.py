@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -31,11 +31,11 @@ def happen(rig: Any, fault: str) -> None:
     script.add(parse_fault(fault), rig.robot.simulated.clock.now_ns())
 
 
-def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) -> None:
+def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage):
     """The runtime holds controllers of lost joints, so the player itself cannot end its goal."""
     rig = stage.rig(stage.arm)
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         yield stage.sine(joint, 400)
         rig.robot.simulated.buses[0].at(
             rig.robot.simulated.clock.now_ns() + 500_000_000, lambda: happen(rig, "silence servo=2 for=3s")
@@ -54,10 +54,10 @@ def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) 
     assert not last.valid[-1, 0]
 
 
-def test_a_servo_that_gets_hot_ends_it(stage: Any) -> None:
+def test_a_servo_that_gets_hot_ends_it(stage):
     rig = stage.rig(stage.arm)
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         happen(rig, "overheat servo=2 celsius=75")
         yield stage.sine(joint, 400, 5.0)
 
@@ -67,14 +67,14 @@ def test_a_servo_that_gets_hot_ends_it(stage: Any) -> None:
     assert len(done.recorded[0]) < 5 * 400
 
 
-def test_a_joint_whose_torque_is_switched_off_ends_it(stage: Any) -> None:
+def test_a_joint_whose_torque_is_switched_off_ends_it(stage):
     rig = stage.rig(stage.arm)
 
-    def off() -> None:
+    def off():
         data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
         rig.robot.simulated.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         rig.robot.simulated.buses[0].at(rig.robot.simulated.clock.now_ns() + 500_000_000, off)
         yield stage.sine(joint, 400, 3.0)
 
@@ -88,31 +88,31 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage: Any) -> None:
     assert not [one for one in rig.controllers() if one.name.startswith("experiment")]
 
 
-def test_what_cannot_be_put_back_keeps_nothing_else_from_it() -> None:
+def test_what_cannot_be_put_back_keeps_nothing_else_from_it():
     """One joint has no torque any more: the other's controller is activated, and all players are unloaded."""
-    calls: list[tuple[str, ...]] = []
+    calls = []
 
     class Rig:
         rate = 50.0
 
-        def controllers(self) -> tuple[RunningController, ...]:
+        def controllers(self):
             players = [RunningController("experiment_position", True, ("a", "b"))]
             players += [RunningController("experiment_pwm", False, ("a", "b"))]
             mine = [RunningController(f"arm_{joint}", not calls, (joint,)) for joint in "ab"]
             return (*players, *mine)
 
-        def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
+        def switch(self, activate, deactivate):
             calls.append(("switch", *activate, *(f"-{name}" for name in deactivate)))
             if "arm_a" in activate:
                 raise Refused("joint a has no torque", code="no_torque")
 
-        def unload(self, name: str) -> None:
+        def unload(self, name):
             calls.append(("unload", name))
             if name == "experiment_position":
                 raise Refused("the robot is busy", code="busy")
 
-    situation: Any = type("Situation", (), {"names": ("a", "b")})()
-    rig: Any = Rig()
+    situation = type("Situation", (), {"names": ("a", "b")})()
+    rig = Rig()
     stage = experiment._Stage(rig, situation, lambda: None)
     stage._players |= {("position", Guard()): "experiment_position", ("pwm", Guard()): "experiment_pwm"}
     calls.append(("the experiment",))
@@ -127,10 +127,10 @@ def test_what_cannot_be_put_back_keeps_nothing_else_from_it() -> None:
     ]
 
 
-def test_a_run_that_ends_in_the_middle_ends_it(stage: Any) -> None:
+def test_a_run_that_ends_in_the_middle_ends_it(stage):
     rig = stage.rig(stage.arm)
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         yield stage.sine(joint, 400)
         rig.robot.simulated.buses[0].at(
             rig.robot.simulated.clock.now_ns() + 500_000_000, rig.robot.simulated.stop.request
@@ -146,17 +146,17 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage: Any) -> None:
         rig.change_rate(100)
 
 
-def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage: Any) -> None:
+def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage):
     rig = stage.rig(stage.arm)
 
-    def gives_up(joint: Joint) -> Iterator[Segment]:
+    def gives_up(joint):
         yield stage.sine(joint, 200, loop_rate=200, interface="position")
         raise DxlrunError("no two responses are alike")
 
     _, done = stage.perform(rig, "elbow", gives_up)
     assert (done.why, len(done.recorded)) == ("no two responses are alike", 1)
 
-    def breaks(joint: Joint) -> Iterator[Segment]:
+    def breaks(joint):
         yield stage.sine(joint, 200, loop_rate=200)
         raise ZeroDivisionError
 
@@ -166,24 +166,24 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage: Any) -> None:
     assert stage.state(rig) == before
 
 
-def test_an_abort_before_the_first_segment_moves_nothing(stage: Any) -> None:
-    places: list[float] = []
+def test_an_abort_before_the_first_segment_moves_nothing(stage):
+    places = []
     rig = stage.rig(stage.arm)
     rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[1]))
 
-    def far(joint: Joint) -> Iterator[Segment]:
+    def far(joint):
         yield Segment("far", 0.01, {joint.name: np.full(10, joint.upper)})
 
     _, done = stage.perform(rig, "elbow", far, lambda: "aborted by a key")
     assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
 
 
-def test_an_abort_in_a_motion_cancels_its_goal(stage: Any) -> None:
+def test_an_abort_in_a_motion_cancels_its_goal(stage):
     """So that the joints come to rest before the player leaves."""
     rig = stage.rig(stage.arm)
     at_s = rig.now_s + 1.5
 
-    def abort() -> str | None:
+    def abort():
         return "aborted by a key" if rig.now_s >= at_s else None
 
     _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint, 400, 10.0)]), abort)
@@ -215,7 +215,7 @@ def many(stage: Any, rng: random.Random) -> Any:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(ABORTS))
-def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage: Any, seed: int) -> None:
+def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     """However far it came: on the way to a start, in a segment, while modes change or a player is loaded."""
     rng = random.Random(seed)
     rig = stage.rig(stage.arm)
@@ -224,7 +224,7 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage: Any, seed: int) ->
     if seed % 3 == 2:  # and a servo that is lost, and back before all is restored
         rig.robot.simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
 
-    def abort() -> str | None:
+    def abort():
         return "aborted by a key" if rig.now_s >= at_s else None
 
     _, done = stage.perform(rig, "elbow", many(stage, rng), abort)

@@ -30,7 +30,7 @@ from dxlrun_lab.commands.on_robot import Aborting, OnRobot, run_on_robot
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Joint, perform
 from dxlrun_lab.guided.own_run import OwnRun
-from dxlrun_lab.guided.rig import Rig, live_rig
+from dxlrun_lab.guided.rig import live_rig
 from dxlrun_lab.guided.segment import Segment
 
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
@@ -51,7 +51,7 @@ controllers:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def place(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         directory = tmp_path_factory.mktemp("live")
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
@@ -61,7 +61,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def robot(place: Path) -> Iterator[dxlrun.RemoteRobot]:
+def robot(place):
     """A run that does not belong to an experiment."""
     words = [sys.executable, "-P", "-c", CODE, "pair.yaml", "--duration", "300"]
     with (place / "said").open("wb") as said:
@@ -78,7 +78,7 @@ def robot(place: Path) -> Iterator[dxlrun.RemoteRobot]:
 
 
 @pytest.fixture
-def rig(robot: dxlrun.RemoteRobot) -> Iterator[Rig]:
+def rig(robot):
     rig = live_rig(dxlrun.connect("pair", "experiment"))
     yield rig
     assert rig.close() == ()
@@ -92,7 +92,7 @@ def two(stage: Any) -> Callable[[Joint], Iterator[Segment]]:
     return segments
 
 
-def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: Rig, stage: Any) -> None:
+def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig, stage):
     before = stage.state(rig)
     plays, done = stage.perform(rig, "tilt", two(stage))
     assert stage.state(rig) == before
@@ -117,7 +117,7 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: Rig, sta
         ]
 
 
-def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: Rig) -> None:
+def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig):
     with pytest.raises(InputError) as caught:
         situation_of(rig, ["pan", "tilt"], {})
     assert caught.value.sentences == (
@@ -125,7 +125,7 @@ def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: R
     )
 
 
-def test_a_paused_robot_and_a_second_experiment_are_refused(rig: Rig, robot: dxlrun.RemoteRobot) -> None:
+def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     robot.pause()
     try:
         with pytest.raises(InputError, match="pair is paused; let it go on first: dxlrun resume"):
@@ -141,9 +141,7 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig: Rig, robot: dxl
     assert not rig.paused
 
 
-def test_of_two_experiments_that_begin_at_once_one_is_refused(
-    rig: Rig, robot: dxlrun.RemoteRobot, stage: Any
-) -> None:
+def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot, stage):
     situation = situation_of(rig, ["tilt"], {})
     rig.load("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
     before = stage.state(rig)
@@ -153,20 +151,18 @@ def test_of_two_experiments_that_begin_at_once_one_is_refused(
     rig.unload("experiment_position")
 
 
-def test_a_robot_without_a_log_is_refused() -> None:
+def test_a_robot_without_a_log_is_refused():
     class Silent:
         name = "pair"
 
-        def info(self) -> dict[str, object]:
+        def info(self):
             return {"log": None}
 
     with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
-        live_rig(Silent())  # type: ignore[arg-type]  # no more of it is used
+        live_rig(Silent())
 
 
-def test_a_robot_that_deletes_parts_of_its_log_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_that_deletes_parts_of_its_log_is_refused(tmp_path, monkeypatch, capsys):
     """One that runs, and one that would have to be started."""
     file = tmp_path / "robot.yaml"
     file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")
@@ -175,19 +171,17 @@ def test_a_robot_that_deletes_parts_of_its_log_is_refused(
     class Running:
         name = "pair"
 
-        def info(self) -> dict[str, object]:
+        def info(self):
             return {"log": str(tmp_path / "log")}
 
     with pytest.raises(InputError, match="pair deletes the oldest parts of its log"):
-        live_rig(Running())  # type: ignore[arg-type]  # no more of it is used
+        live_rig(Running())
     monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
     assert main(["identify", str(file), "pan", "--yes"]) == 2
     assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err
 
 
-def test_a_key_is_an_abort_with_the_rest_kept(
-    robot: dxlrun.RemoteRobot, stage: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys):
     """Of the whole command; any key on a terminal, which is as it was afterwards."""
     import pty
     import termios
@@ -197,7 +191,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(
     with open(theirs, closefd=False) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
 
-        def segments(joint: Joint) -> Iterator[Segment]:
+        def segments(joint):
             yield stage.sine(joint, 100, 0.1)
             threading.Timer(1.2, os.write, (ours, b"x")).start()
             yield stage.sine(joint, 100, 30.0)
@@ -216,13 +210,11 @@ def test_a_key_is_an_abort_with_the_rest_kept(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(
-    place: Path, stage: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, stage, capsys):
     """With the robot of the other tests beside it: two runs of the same robot."""
     others = set(sockets())
 
-    def signalled(joint: Joint) -> Iterator[Segment]:
+    def signalled(joint):
         yield stage.sine(joint, 50, 0.2, loop_rate=50)
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGHUP)).start()
         yield stage.sine(joint, 50, 30.0, loop_rate=50)
@@ -236,7 +228,7 @@ def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
-def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
+def test_a_run_that_cannot_begin_says_why(place, stage):
     (place / "gone.yaml").write_text(
         ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
     )
@@ -249,14 +241,12 @@ def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
     assert {problem.mark.line for problem in caught.value.problems} == {4, 7}
 
 
-def test_a_part_without_a_result_is_one_more_sentence(
-    place: Path, stage: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    class Asks(stage.Plays):  # type: ignore[misc]  # the stage's class
-        def finish(self, *_: object) -> int:
+def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
+    class Asks(stage.Plays):
+        def finish(self, *_):
             raise InputError("too short")
 
-    def gives_up(joint: Joint) -> Iterator[Segment]:
+    def gives_up(joint):
         yield stage.sine(joint, 100, 0.1)
         raise DxlrunError("no two responses are alike")
 
@@ -288,9 +278,7 @@ def test_a_part_without_a_result_is_one_more_sentence(
         (["none.yaml", "pan"], OnRobot(), "there is no robot file none.yaml"),
     ],
 )
-def test_wrong_words_start_nothing(
-    place: Path, stage: Any, words: list[str], options: OnRobot, sentence: str
-) -> None:
+def test_wrong_words_start_nothing(place, stage, words, options, sentence):
     logs = set(place.glob("logs/*"))
     with pytest.raises(InputError) as caught:
         run_on_robot(stage.Plays(lambda joint: iter([])), words, options)
@@ -298,9 +286,7 @@ def test_wrong_words_start_nothing(
     assert caught.value.sentences[0].startswith(sentence)
 
 
-def test_real_servos_are_asked_for_and_counted_down(
-    place: Path, stage: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_real_servos_are_asked_for_and_counted_down(place, stage, monkeypatch, capsys):
     """A simulated robot whose ports are taken for real ones."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     monkeypatch.setattr(on_robot, "COUNTDOWN_S", (3, 0.1))
@@ -315,13 +301,7 @@ def test_real_servos_are_asked_for_and_counted_down(
 
 
 @pytest.mark.parametrize("answer", [b"n\n", b"\n", b"", None])
-def test_without_a_yes_no_run_is_started(
-    place: Path,
-    stage: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    answer: bytes | None,
-) -> None:
+def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answer):
     """A run switches torque on, so the question comes before it; b"": Ctrl-C at it, None: no terminal."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     logs, ran = set(place.glob("logs/*")), None
@@ -370,7 +350,7 @@ sys.exit(ran.exit_code)
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(INTERRUPTS))
-def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place: Path, seed: int) -> None:
+def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place, seed):
     """In the start, in the middle, in the end, and when it is killed: nothing is left of the run."""
     rng, before = random.Random(seed + 1), set(place.glob("logs/*.mcap"))
     script = SCRIPT.format(tests=str(Path(__file__).parent))
@@ -402,7 +382,7 @@ def whole(log: Path) -> bool:
     return found.complete and bool((rates % 10_000_000 == 0).all())
 
 
-def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch):
     """It comes wherever the program is, and the modules of a run are imported while signals are taken."""
     with Aborting() as aborting:
         monkeypatch.setitem(sys.modules, "dxlrun_lab.guided.own_run", ModuleType("half"))
@@ -410,12 +390,10 @@ def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch: pytest.Monkey
         assert aborting() == "aborted by Ctrl-C"
 
 
-def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(
-    robot: dxlrun.RemoteRobot, stage: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(robot, stage, capsys):
     """The last test of the robot of the others, which goes on without one."""
 
-    def kill_gateway(joint: Joint) -> Iterator[Segment]:
+    def kill_gateway(joint):
         yield stage.sine(joint, 100, 0.2)
         with socket.socket(socket.AF_UNIX) as probe:
             probe.connect(str(sockets()["pair"]))

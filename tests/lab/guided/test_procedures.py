@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from dxlrun.log.reader import read_log
-from dxlrun_lab.guided.experiment import Joint
 from dxlrun_lab.guided.segment import Guard, Segment
 
 
-def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage: Any) -> None:
+def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage):
     rig = stage.rig(stage.single)
     plays, done = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint, settle_s=0.1)]))
     (got,) = plays.got
@@ -29,7 +24,7 @@ def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stag
     assert 0.2 - 0.05 < got.position.max() < 0.2 + 0.01
 
 
-def test_the_columns_are_those_of_the_log(stage: Any, tmp_path: Path) -> None:
+def test_the_columns_are_those_of_the_log(stage, tmp_path):
     rig = stage.rig(stage.single)
     plays, _ = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint)]))
     rig.close()
@@ -45,12 +40,12 @@ def test_the_columns_are_those_of_the_log(stage: Any, tmp_path: Path) -> None:
     assert got.of_cycles("woken_ns")[-1] <= ended.t_ns <= got.of_cycles("written_ns")[-1]
 
 
-def test_a_long_table_at_another_rate_goes_in_pieces(stage: Any) -> None:
+def test_a_long_table_at_another_rate_goes_in_pieces(stage):
     """As many rows as 60 s at 320 Hz, as an identification needs; the loop runs at a fifth of its rate."""
     rig = stage.rig(stage.single)
     rows = 0.2 * np.sin(np.arange(19_200) / 1000.0)
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         yield Segment("long", 1 / 3200, {joint.name: joint.middle + rows}, loop_rate=64)
 
     plays, _ = stage.perform(rig, "joint", segments)
@@ -59,7 +54,7 @@ def test_a_long_table_at_another_rate_goes_in_pieces(stage: Any) -> None:
     assert np.abs(got.goal[:384, 0] - rows[::50]).max() < 1e-9
 
 
-def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage: Any) -> None:
+def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage):
     rows = {"joint": np.zeros(3)}
     plays, done = stage.perform(
         stage.rig(stage.single), "joint", lambda joint: iter([Segment("v", 0.01, rows, interface="pwm")])
@@ -68,7 +63,7 @@ def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage: An
     assert (done.why, done.recorded) == ("", ())
 
 
-def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage: Any) -> None:
+def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage):
     plays, done = stage.perform(
         stage.rig(stage.arm),
         "elbow",
@@ -78,8 +73,8 @@ def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage: Any) -> 
     assert (done.why, len(plays.got)) == ("", 1)
 
 
-def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage: Any) -> None:
-    def segments(joint: Joint) -> Iterator[Segment]:
+def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage):
+    def segments(joint):
         yield stage.sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(100, 0.05)}, interface="effort")
         yield Segment("turn", 1 / 400, {joint.name: np.full(100, -0.5)}, interface="velocity")
@@ -96,12 +91,12 @@ def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage: Any) 
     assert (voltage.goal[:40, 0] > 0.09).all()
 
 
-def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage: Any) -> None:
+def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage):
     rig = stage.rig(stage.single)
-    places: list[float] = []
+    places = []
     rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[0]))
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint):
         yield Segment("far", 1 / 320, {joint.name: np.full(10, joint.upper)})
 
     plays, _ = stage.perform(rig, "joint", segments)
@@ -110,8 +105,8 @@ def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage: Any) 
     assert places[-1] == pytest.approx(0.0, abs=0.006)
 
 
-def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(stage: Any) -> None:
-    def segments(joint: Joint) -> Iterator[Segment]:
+def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(stage):
+    def segments(joint):
         yield stage.sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(4000, 0.9)}, interface="effort")
         raise AssertionError("nothing follows")
@@ -131,7 +126,7 @@ def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(
         (Guard(effort=0.01), "joint elbow exerts"),
     ],
 )
-def test_the_guard_of_a_segment_ends_it(stage: Any, guard: Guard, sentence: str) -> None:
+def test_the_guard_of_a_segment_ends_it(stage, guard, sentence):
     _, done = stage.perform(
         stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint, 400, guard=guard)])
     )
@@ -139,7 +134,7 @@ def test_the_guard_of_a_segment_ends_it(stage: Any, guard: Guard, sentence: str)
     assert not done.recorded[0].whole
 
 
-def test_two_performances_are_the_same(stage: Any) -> None:
+def test_two_performances_are_the_same(stage):
     first, second = (
         stage.perform(stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint)]))[0]
         for _ in range(2)
@@ -152,6 +147,6 @@ def test_two_performances_are_the_same(stage: Any) -> None:
     [{"a": np.zeros(2), "b": np.zeros(3)}, {"a": np.zeros(0)}, {}, {"a": np.array([np.nan])}],
     ids=["lengths", "no row", "no joint", "nan"],
 )
-def test_wrong_tables_are_no_segments(wrong: dict[str, np.ndarray]) -> None:
+def test_wrong_tables_are_no_segments(wrong):
     with pytest.raises(ValueError, match="t: "):
         Segment("t", 0.01, wrong)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +16,8 @@ from dxlrun.plan.loop_plan import ScheduledCommand
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_lab.identify.excitation import Room, excitation
-from dxlrun_lab.identify.fit import Fit, fit_run
-from dxlrun_lab.identify.measured import Measured, measured
+from dxlrun_lab.identify.fit import fit_run
+from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.servo import Servo, servos_in
 
 GRAVITY, INERTIA, ANGLE_DEG = 0.3, 0.005, 20.0
@@ -67,11 +66,11 @@ Record = Callable[..., Run]
 
 
 @pytest.fixture(scope="session")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+def record(tmp_path_factory):
     """Return what records a run of a model's simulated servo, each once."""
 
     @functools.cache
-    def record(model: str, protocol: float, *, seconds: float = 14.0, rate: int = 200, **more: Any) -> Run:
+    def record(model, protocol, *, seconds=14.0, rate=200, **more):
         folder = tmp_path_factory.mktemp("run")
         values = {"direction": 1, "motor": "", "gravity": GRAVITY} | more
         (folder / "one.yaml").write_text(ROBOT.format(model=model, protocol=protocol, rate=rate, **values))
@@ -97,17 +96,17 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
 
 
 @pytest.fixture(scope="session")
-def mx64(record: Record) -> Run:
+def mx64(record):
     return record("MX-64", 1.0)
 
 
 @pytest.fixture(scope="session")
-def xl330(record: Record) -> Run:
+def xl330(record):
     return record("XL330-M288", 2.0)
 
 
 @pytest.fixture(scope="session")
-def fitted_xl330(xl330: Run) -> tuple[Measured, tuple[Fit, ...]]:
+def fitted_xl330(xl330):
     """Return the noisy run of an XL330, and its fits."""
     run = measured(xl330.noisy(2), 0, xl330.servo)
     return run, fit_run(run)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,63 +25,53 @@ CAMPAIGN = (
 )
 
 
-def refusal(cycles: Any, servo: Servo, **more: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        fit_run(measured(cycles, 0, servo, **more))
-    (sentence,) = caught.value.sentences
-    assert sentence.startswith(f"{servo.joint}: ")
-    return sentence
+def set_to(**columns: Any) -> Callable[[Any], None]:
+    def spoil(cycles: Any) -> None:
+        for name, value in columns.items():
+            cycles[name][:, 0] = value(cycles) if callable(value) else value
+
+    return spoil
 
 
-def test_a_run_without_torque(xl330: Any) -> None:
+def to_and_fro(cycles: Any) -> Any:
+    return 0.5 * np.abs((cycles["read_ns"] * 1e-9 % 2.0) - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "rows", "sentence"),
+    [
+        (set_to(torque=Torque.RELEASED), None, "never under torque with a goal"),
+        (set_to(mode=Mode.VELOCITY), None, "never under torque with a goal"),
+        (set_to(voltage=np.nan), None, "no voltage"),
+        (set_to(position=0.1), None, "never moved"),
+        (set_to(position=lambda cycles: np.linspace(0.0, 0.5, len(cycles))), None, "hardly moved"),
+        (set_to(position=to_and_fro, goal_position=to_and_fro), None, "one speed only"),
+        (set_to(), 800, r"only \d\.\d s of this log"),
+        (set_to(goal_position=lambda cycles: -cycles["goal_position"][:, 0]), None, "no model of a servo"),
+        pytest.param(
+            set_to(goal_position=lambda cycles: np.roll(cycles["goal_position"][:, 0], len(cycles) // 3)),
+            None,
+            "no model of a servo follows",
+            marks=CAMPAIGN,
+        ),
+    ],
+)
+def test_a_run_that_does_not_determine_a_servo(xl330, spoil, rows, sentence):
     cycles = xl330.cycles
-    cycles["torque"] = Torque.RELEASED
-    assert "never under torque with a goal" in refusal(cycles, xl330.servo)
-    cycles = xl330.cycles
-    cycles["mode"] = Mode.VELOCITY
-    assert "never under torque with a goal" in refusal(cycles, xl330.servo)
+    spoil(cycles)
+    with pytest.raises(InputError, match=sentence) as caught:
+        fit_run(measured(cycles[:rows], 0, xl330.servo))
+    (said,) = caught.value.sentences
+    assert said.startswith(f"{xl330.servo.joint}: ")
 
 
-def test_a_run_without_voltage_needs_one(xl330: Any) -> None:
+def test_a_run_without_voltage_takes_the_given_one(xl330):
     cycles = xl330.cycles
     cycles["voltage"] = np.nan
-    assert "no voltage" in refusal(cycles, xl330.servo)
     assert measured(cycles, 0, xl330.servo, voltage=5.0).voltage[0] == 5.0
 
 
-def test_a_joint_that_never_moved(xl330: Any) -> None:
-    cycles = xl330.cycles
-    cycles["position"][:, 0] = 0.1
-    assert "never moved" in refusal(cycles, xl330.servo)
-
-
-def test_a_joint_that_hardly_moved(xl330: Any) -> None:
-    cycles = xl330.cycles
-    cycles["position"][:, 0] = np.linspace(0.0, 0.5, len(cycles))
-    assert "hardly moved" in refusal(cycles, xl330.servo)
-
-
-def test_one_speed_only(xl330: Any) -> None:
-    cycles = xl330.cycles
-    t = cycles["read_ns"] * 1e-9
-    cycles["position"][:, 0] = 0.5 * np.abs((t % 2.0) - 1.0)
-    cycles["goal_position"][:, 0] = cycles["position"][:, 0]
-    assert "one speed only" in refusal(cycles, xl330.servo)
-
-
-def test_a_run_that_is_too_short(xl330: Any) -> None:
-    assert re.search(r"only \d\.\d s of this log", refusal(xl330.cycles[:800], xl330.servo))
-
-
-@pytest.mark.parametrize("spoil", ["direction", pytest.param("other joint", marks=CAMPAIGN)])
-def test_goals_that_are_not_those_of_the_joint(xl330: Any, spoil: str) -> None:
-    cycles = xl330.cycles
-    goal = cycles["goal_position"][:, 0]
-    cycles["goal_position"][:, 0] = -goal if spoil == "direction" else np.roll(goal, len(goal) // 3)
-    assert "no model of a servo follows" in refusal(cycles, xl330.servo)
-
-
-def test_a_servo_that_is_lost_in_the_middle(xl330: Any) -> None:
+def test_a_servo_that_is_lost_in_the_middle(xl330):
     cycles = xl330.cycles
     lost = slice(len(cycles) // 3, len(cycles) // 3 + 400)  # 2 s
     cycles["torque"][lost] = Torque.LOST
@@ -101,7 +91,7 @@ def test_a_servo_that_is_lost_in_the_middle(xl330: Any) -> None:
         assert any("left out" in note for note in found.notes)
 
 
-def test_a_servo_with_an_integral_part(xl330: Any) -> None:
+def test_a_servo_with_an_integral_part(xl330):
     servo = xl330.servo
     declared = Servo(servo.joint, servo.table, servo.reference, servo.direction, {"position_i_gain": 100})
     with pytest.raises(InputError, match="position_i_gain 100, and an integral part is not modelled"):
@@ -110,7 +100,7 @@ def test_a_servo_with_an_integral_part(xl330: Any) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
-def test_an_ax_12_without_a_current_has_the_manuals_scale(record: Any) -> None:
+def test_an_ax_12_without_a_current_has_the_manuals_scale(record):
     run = record("AX-12A", 1.0, seconds=12.0)
     data = measured(run.cycles, 0, run.servo)
     found = identified(data, fit_run(data), KnownLoad(), "test")
@@ -133,7 +123,7 @@ def test_an_ax_12_without_a_current_has_the_manuals_scale(record: Any) -> None:
     assert found.motor.position_gain == pytest.approx(run.servo.manual_gain(), rel=0.05)
 
 
-def test_a_load_that_cannot_be(fitted_xl330: Any) -> None:
+def test_a_load_that_cannot_be(fitted_xl330):
     run, fits = fitted_xl330
     with pytest.raises(InputError, match=r"less than --load-inertia 0\.1 alone"):
         identified(run, fits, KnownLoad(0.1, 0.3), "test")
@@ -142,6 +132,6 @@ def test_a_load_that_cannot_be(fitted_xl330: Any) -> None:
     assert unknown.motor.inertia == pytest.approx(0.0069, rel=0.05)  # with the load's
 
 
-def test_a_log_without_the_joint(xl330: Any) -> None:
+def test_a_log_without_the_joint(xl330):
     with pytest.raises(InputError, match=r"no joint elbw; did you mean elbow"):
         servos_in(xl330.log, ["elbw"])

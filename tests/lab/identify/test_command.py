@@ -6,12 +6,9 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from tests.kit.commands import Said
 
 from dxlrun.description.joints.motor_file import read_motor
 
@@ -29,13 +26,7 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])
-def test_the_other_commands_of_the_page(
-    number: int,
-    sentence: str,
-    dxlrun: Callable[..., Said],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_other_commands_of_the_page(number, sentence, dxlrun, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robots").symlink_to(ROBOT.parent)
     words = [word.replace("/dev/ttyUSB0", "sim") for word in commands()[number]]
@@ -44,9 +35,7 @@ def test_the_other_commands_of_the_page(
     assert sentence in said.err
 
 
-def test_a_virtual_robot_is_moved_and_its_motor_file_written(
-    dxlrun: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, tmp_path, monkeypatch):
     """The first command of the page, for 10 s."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robots").symlink_to(ROBOT.parent)
@@ -71,7 +60,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(
 
 @pytest.mark.campaign
 @pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
-def test_a_log_as_json(xl330: Any, dxlrun: Callable[..., Said]) -> None:
+def test_a_log_as_json(xl330, dxlrun):
     said = dxlrun("identify", "--log", xl330.log.path, "--load-inertia", 0.005, "--json")
     assert said.code == 0, said.err
     (found,) = json.loads(said.out)
@@ -94,20 +83,14 @@ def test_a_log_as_json(xl330: Any, dxlrun: Callable[..., Said]) -> None:
         ((ROBOT, "joit", "--virtual"), "joit is not one of the robot's joints"),
     ],
 )
-def test_refusals(
-    words: tuple[object, ...],
-    sentence: str,
-    dxlrun: Callable[..., Said],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_refusals(words, sentence, dxlrun, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = dxlrun("identify", *words)
     assert said.code == 2
     assert sentence in said.err
 
 
-def test_a_log_takes_joints_only(xl330: Any, dxlrun: Callable[..., Said]) -> None:
+def test_a_log_takes_joints_only(xl330, dxlrun):
     said = dxlrun("identify", ROBOT, "elbow", "--log", xl330.log.path)
     assert said.code == 2
     assert "--log takes an earlier run" in said.err

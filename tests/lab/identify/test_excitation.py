@@ -16,8 +16,8 @@ from dxlrun_lab.identify.excitation import Room, excitation
 @pytest.mark.parametrize("velocity", [math.inf, 4.0, 0.5])
 @pytest.mark.parametrize(("middle", "half", "at"), [(0.0, 0.5, 0.0), (-1.5, 2.0, 0.9), (0.3, 0.1, -1.0)])
 def test_goals_stay_within_range_and_limits(  # noqa: PLR0917  of pytest
-    middle: float, half: float, at: float, velocity: float, acceleration: float, rate: int
-) -> None:
+    middle, half, at, velocity, acceleration, rate
+):
     room = Room(middle - half, middle + half, velocity, acceleration)
     parts = excitation(room, 20.0, 1 / rate, start=middle + at * half, seed=3)
     for part in parts:
@@ -35,7 +35,7 @@ def test_goals_stay_within_range_and_limits(  # noqa: PLR0917  of pytest
     assert abs(parts[0].goals[0] - (middle + at * half)) < 1e-9
 
 
-def test_what_is_too_small() -> None:
+def test_what_is_too_small():
     with pytest.raises(InputError, match=r"5 s are too short .* --seconds 10"):
         excitation(Room(-1, 1), 5.0, 0.01, start=0.0)
     with pytest.raises(InputError, match="too small a range"):

@@ -90,7 +90,7 @@ def result_of(cycles: NDArray[np.void], servo: Servo) -> Identified:
     return identified(run, fit_run(run), KnownLoad(MASS * LENGTH**2, MASS * G * LENGTH), "test")
 
 
-def test_an_mx_64_with_published_parameters() -> None:
+def test_an_mx_64_with_published_parameters():
     """M1, whose friction does not grow with the load: the simulated servos of other tests have M3."""
     motor = M1
     rate = 200
@@ -136,7 +136,7 @@ def recording(files: Sequence[Path], p_gain: int) -> NDArray[np.void]:
 @pytest.mark.campaign
 @pytest.mark.skipif(RECORDINGS == "0", reason="the recordings: DXLRUN_BAM_RECORDINGS")
 @pytest.mark.parametrize("p_gain", [100, 200, 400])
-def test_the_recordings_of_a_real_xl330(p_gain: int) -> None:
+def test_the_recordings_of_a_real_xl330(p_gain):
     table = dataclasses.replace(control_table("XL330-M288", 2.0), effort_unit="1")
     servo = Servo("elbow", table, 0.0, 1, {"position_p_gain": p_gain})
     found = result_of(recording(sorted(Path(RECORDINGS).glob("*.json")), p_gain), servo)

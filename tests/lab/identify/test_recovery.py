@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -61,7 +60,7 @@ def check_constants(found: Identified, motor: Motor, within: float) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
-def test_an_mx_64_without_a_current_by_a_known_weight(mx64: Any) -> None:
+def test_an_mx_64_without_a_current_by_a_known_weight(mx64):
     found = result_of(mx64, mx64.noisy(1))
     assert (found.scale, found.friction_model) == ("load", "m3")
     check_constants(found, mx64.servo.built_in, 0.05)
@@ -74,20 +73,18 @@ def test_an_mx_64_without_a_current_by_a_known_weight(mx64: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def of_xl330(fitted_xl330: Any) -> Identified:
+def of_xl330(fitted_xl330):
     return identified(*fitted_xl330, KnownLoad(INERTIA), "test")
 
 
-def test_an_xl330_by_its_current_alone(xl330: Any, of_xl330: Identified) -> None:
+def test_an_xl330_by_its_current_alone(xl330, of_xl330):
     found = of_xl330
     assert (found.scale, found.friction_model) == ("current", "m3")
     check_constants(found, xl330.servo.built_in, 0.05)
     assert found.motor.load.gravity == pytest.approx(GRAVITY, rel=0.05)
 
 
-def test_a_servo_simulated_from_the_motor_file_repeats_the_run(
-    xl330: Any, of_xl330: Identified, record: Record, tmp_path: Path
-) -> None:
+def test_a_servo_simulated_from_the_motor_file_repeats_the_run(xl330, of_xl330, record, tmp_path):
     found = of_xl330
     path = tmp_path / "elbow.motor.yaml"
     path.write_text(motor_text(found.motor, found.uncertainty))
@@ -112,7 +109,7 @@ def test_a_servo_simulated_from_the_motor_file_repeats_the_run(
     ("model", "protocol", "rate"),
     [("MX-64", 1.0, 200), ("MX-106", 1.0, 320), ("XL330-M288", 2.0, 100), ("XM430-W350", 2.0, 250)],
 )
-def test_sixty_noisy_seconds_of_each_model(record: Record, model: str, protocol: float, rate: int) -> None:
+def test_sixty_noisy_seconds_of_each_model(record, model, protocol, rate):
     run = record(model, protocol, seconds=60.0, rate=rate)
     check_constants(result_of(run, run.noisy(3)), run.servo.built_in, 0.05)
 
@@ -120,8 +117,8 @@ def test_sixty_noisy_seconds_of_each_model(record: Record, model: str, protocol:
 @pytest.mark.campaign
 @pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
 @pytest.mark.timeout(3600)
-def test_intervals_have_the_true_value_as_often_as_they_say(mx64: Any, xl330: Any) -> None:
-    inside: dict[str, list[bool]] = {}
+def test_intervals_have_the_true_value_as_often_as_they_say(mx64, xl330):
+    inside = {}
     for seed in range(RUNS):
         for run in (mx64, xl330):
             found = result_of(run, run.noisy(100 + seed, position_ticks=3.0, effort=0.05))

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from tests.kit.commands import Dxlrun
 
 ROBOT = """name: arm
 arguments:
@@ -49,13 +48,13 @@ class Files(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def texts() -> tuple[str, str]:
+def texts():
     """A robot file and a motion."""
     return ROBOT, MOTION
 
 
 @pytest.fixture
-def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
+def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = Files(Path("robot.yaml"), Path("motion.yaml"))
     found.robot.write_text(ROBOT)
@@ -64,7 +63,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
 
 
 @pytest.fixture
-def sweep(files: Files, dxlrun: Dxlrun) -> Dxlrun:
+def sweep(files, dxlrun):
     """Run `dxlrun sweep` on the robot and its motion in this process."""
     return partial(dxlrun, "sweep", files.robot, "--play", files.motion)
 
@@ -109,7 +108,7 @@ def dxlrun_controllers():
 
 
 @pytest.fixture(scope="session")
-def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def plugin(tmp_path_factory):
     """A directory with a controller that makes trouble, as pip would install it."""
     directory = tmp_path_factory.mktemp("plugin")
     (directory / "troubled.py").write_text(PLUGIN)

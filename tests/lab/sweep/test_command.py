@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -35,14 +35,14 @@ def pretended(task: Task) -> Measured:
 
 
 @pytest.fixture
-def no_workers(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+def no_workers(monkeypatch):
     """Pretend all runs; gives the counts of workers that were asked for."""
-    asked: list[object] = []
+    asked = []
 
-    def here(workers: object, tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+    def here(workers, tasks):
         return ((task.run, pretended(task)) for task in tasks)
 
-    def local(count: int) -> nullcontext[None]:
+    def local(count):
         asked.append(count)
         return nullcontext()
 
@@ -74,14 +74,14 @@ COMMAND_LINE = [
 
 
 @pytest.mark.parametrize(("over", "sentence"), COMMAND_LINE)
-def test_a_mistake_of_a_range_is_reported(sweep: Sweep, over: list[str], sentence: str) -> None:
+def test_a_mistake_of_a_range_is_reported(sweep, over, sentence):
     said = sweep(*(word for one in over for word in ("--over", one)))
     assert (said.code, said.out, len(said.errors)) == (2, "", 1)
     assert said.errors[0].startswith("command line:1:1: ")
     assert sentence in said.errors[0]
 
 
-def test_all_mistakes_are_reported_at_once(sweep: Sweep, files: Any) -> None:
+def test_all_mistakes_are_reported_at_once(sweep, files):
     files.robot.write_text(files.robot.read_text().replace("id: 1", "id: 300"))
     said = sweep("--over", "gains.q=1..2x2", "--over", "limits.position=1,2", "--workers", "0", "rate:=0")
     assert said.code == 2
@@ -95,7 +95,7 @@ def test_all_mistakes_are_reported_at_once(sweep: Sweep, files: Any) -> None:
     assert [error.split(":")[0] for error in said.errors] == ["command line"] * 3 + ["robot.yaml"] * 2
 
 
-def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) -> None:
+def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep):
     said = sweep("--over", "gains.p=-2..1x4", "--over", "elbow.limits.velocity=1,2", "--over", "id=300,1")
     assert said.code == 2
     assert said.errors == [
@@ -135,15 +135,13 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) ->
         (["--over", "gains.p=1,2", "--output", "robot.yaml/x"], "--output robot.yaml/x/arm-"),
     ],
 )
-def test_a_wrong_option_is_refused_before_anything_starts(
-    sweep: Sweep, words: list[str], sentence: str
-) -> None:
+def test_a_wrong_option_is_refused_before_anything_starts(sweep, words, sentence):
     said = sweep(*words)
     assert (said.code, said.out, len(said.errors)) == (2, "", 1)
     assert sentence in said.errors[0]
 
 
-def test_a_real_port_is_refused(sweep: Sweep, files: Any) -> None:
+def test_a_real_port_is_refused(sweep, files):
     files.robot.write_text(files.robot.read_text().replace("port: sim", "port: /dev/ttyUSB0"))
     said = sweep("--over", "gains.p=1,2")
     assert (said.code, len(said.errors)) == (2, 1)
@@ -152,7 +150,7 @@ def test_a_real_port_is_refused(sweep: Sweep, files: Any) -> None:
     )
 
 
-def test_a_file_that_is_no_sweep_stays_as_it_is(sweep: Sweep) -> None:
+def test_a_file_that_is_no_sweep_stays_as_it_is(sweep):
     other = Path("other.parquet")
     other.write_text("something else")
     said = sweep("--over", "gains.p=1,2", "--output", "other.parquet")
@@ -161,7 +159,7 @@ def test_a_file_that_is_no_sweep_stays_as_it_is(sweep: Sweep) -> None:
     assert other.read_text() == "something else"
 
 
-def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_workers: list[object]) -> None:
+def test_two_sweeps_do_not_write_one_file(sweep, no_workers):
     with only_writer(Path("mine.parquet")):
         said = sweep("--over", "gains.p=1,2", "--output", "mine.parquet")
     assert (said.code, said.errors) == (
@@ -172,7 +170,7 @@ def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_workers: list[object]
     assert [path.name for path in Path().glob(".*")] == []
 
 
-def test_the_best_runs_come_first(sweep: Sweep, no_workers: list[object]) -> None:
+def test_the_best_runs_come_first(sweep, no_workers):
     words = ("--over", "gains.p=4..13x4", "--over", "gains.d=0.1,0.2")
     said = sweep(*words, "--workers", "3")
     assert (said.code, said.errors, no_workers) == (0, [], [3])
@@ -198,7 +196,7 @@ def test_the_best_runs_come_first(sweep: Sweep, no_workers: list[object]) -> Non
         ["rate=50,100", "command_interface=effort,pwm"],
     ],
 )
-def test_the_score_is_drawn_as_a_map(sweep: Sweep, no_workers: list[object], over: list[str]) -> None:
+def test_the_score_is_drawn_as_a_map(sweep, no_workers, over):
     words = [word for one in over for word in ("--over", one)]
     said = sweep(*words, "--picture", "drawn.svg")
     assert (said.code, said.errors) == (0, [])
@@ -207,12 +205,7 @@ def test_the_score_is_drawn_as_a_map(sweep: Sweep, no_workers: list[object], ove
     assert all(one.partition("=")[0] in drawn for one in over)
 
 
-def test_the_commands_of_the_page_are_understood(
-    no_workers: list[object],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_commands_of_the_page_are_understood(no_workers, tmp_path, monkeypatch, capsys):
     text = (ROOT / "docs" / "experiments.md").read_text()
     lines = re.findall(r"^    dxlrun (sweep .+)$", text, re.MULTILINE)
     assert lines
@@ -223,9 +216,7 @@ def test_the_commands_of_the_page_are_understood(
         assert "by " in capsys.readouterr().out
 
 
-def test_without_its_library_one_sentence_has_the_command(
-    sweep: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_its_library_one_sentence_has_the_command(sweep, monkeypatch):
     monkeypatch.setattr("dxlrun_lab.commands.sweep.find_spec", lambda name: None)
     said = sweep("--over", "gains.p=1,2")
     sentence = "dxlrun: a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"

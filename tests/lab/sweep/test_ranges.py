@@ -29,13 +29,13 @@ from dxlrun_lab.sweep.ranges import parse_range
         ("active=true,false", (True, False)),
     ],
 )
-def test_a_range_is_these_values(text: str, values: tuple[object, ...]) -> None:
+def test_a_range_is_these_values(text, values):
     found = parse_range(text).values
     assert found == values
     assert [type(value) for value in found] == [type(value) for value in values]
 
 
-def test_a_range_keeps_its_unit_apart_from_its_numbers() -> None:
+def test_a_range_keeps_its_unit_apart_from_its_numbers():
     found = parse_range("limits.velocity=1 rad/s..3 rad/sx3")
     assert (found.path, found.unit, found.cells) == ("limits.velocity", "rad/s", (1, 2, 3))
     assert parse_range("active=true,false").cells == ("true", "false")
@@ -69,7 +69,7 @@ def test_a_range_keeps_its_unit_apart_from_its_numbers() -> None:
         ("a.registers.d=0..2x9", "0..2 has fewer than 9 whole numbers; give fewer points"),
     ],
 )
-def test_a_mistake_is_one_sentence_with_its_fix(text: str, sentence: str) -> None:
+def test_a_mistake_is_one_sentence_with_its_fix(text, sentence):
     with pytest.raises(ValueError, match="; ") as refused:
         parse_range(text)
     assert str(refused.value).startswith(sentence)

@@ -25,7 +25,7 @@ STEP = ROBOTS / "motions/single_joint_step_position.yaml"
 TRACKING = ROBOTS / "motions/single_joint_tracking.yaml"
 
 
-def test_a_path_is_the_spline_through_its_points() -> None:
+def test_a_path_is_the_spline_through_its_points():
     from scipy.interpolate import BPoly, CubicHermiteSpline
 
     rng = np.random.default_rng(1)
@@ -39,7 +39,7 @@ def test_a_path_is_the_spline_through_its_points() -> None:
     assert quintic == pytest.approx(BPoly.from_derivatives(times, np.stack([p, v, a], axis=1))(at))
 
 
-def test_a_path_has_a_beginning_and_an_end() -> None:
+def test_a_path_has_a_beginning_and_an_end():
     held = DesiredPath("j", True, (1.0, 2.0), (5.0, 6.0), end_s=3.0).at(
         np.array([0.9, 1.0, 1.9, 2.0, 3.0, 3.1])
     )
@@ -59,9 +59,7 @@ def test_a_path_has_a_beginning_and_an_end() -> None:
         (STEP, {"position": "true"}),
     ],
 )
-def test_the_scores_are_those_of_the_log_and_the_path_that_of_the_controller(
-    tmp_path: Path, motion: Path, arguments: dict[str, str]
-) -> None:
+def test_the_scores_are_those_of_the_log_and_the_path_that_of_the_controller(tmp_path, motion, arguments):
     given = {"position_trajectory": "false"} | {name: text for name, text in arguments.items() if text}
     short = tmp_path / "short.yaml"
     text = motion.read_text()
@@ -92,7 +90,7 @@ def test_the_scores_are_those_of_the_log_and_the_path_that_of_the_controller(
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan():
     """One MX-64 at 320 Hz."""
     return plan_of(ROBOTS / "single_joint.yaml", duration_s=1)
 
@@ -110,16 +108,16 @@ def scored(plan: Plan, path: DesiredPath, position: Any, servo: Any = None, lost
         record = SimpleNamespace(
             cycle=cycle, scheduled_ns=t_ns, read_ns=t_ns, skipped=0, states=states, clamped=np.zeros(1)
         )
-        memory.take(record, servos)  # type: ignore[arg-type]  # the fields of a cycle that are scored
+        memory.take(record, servos)
     return memory.scores(0, 0)
 
 
-def test_overshoot_and_settling_are_those_of_a_second_order_step(plan: Plan) -> None:
+def test_overshoot_and_settling_are_those_of_a_second_order_step(plan):
     """A step of 1 rad, damping ratio z: overshoot exp(-pi z / sqrt(1 - z^2)), settled at the last 2 %."""
     z, w = 0.4, 20.0
     damped = w * math.sqrt(1 - z * z)
 
-    def step(t: float) -> float:
+    def step(t):
         phase = math.cos(damped * t) + z * w / damped * math.sin(damped * t)
         return 1 - math.exp(-z * w * t) * phase if t > 0 else 0.0
 
@@ -137,7 +135,7 @@ def test_overshoot_and_settling_are_those_of_a_second_order_step(plan: Plan) -> 
     assert slow.overshoot_rad == 0.0
 
 
-def test_errors_leave_out_what_was_not_read(plan: Plan) -> None:
+def test_errors_leave_out_what_was_not_read(plan):
     path = DesiredPath("joint", True, (0.0,), (0.0,), end_s=1.0)
     found = scored(plan, path, lambda t: 0.1 if t < 0.5 else -0.3)
     assert found.rms_rad == pytest.approx(math.sqrt((0.1**2 + 0.3**2) / 2))
@@ -148,10 +146,10 @@ def test_errors_leave_out_what_was_not_read(plan: Plan) -> None:
     assert (none.rms_rad, none.worst_rad, none.worst_joint, none.settling_s) == (None, None, "", None)
 
 
-def test_energy_is_what_the_motors_draw(plan: Plan) -> None:
+def test_energy_is_what_the_motors_draw(plan):
     path = DesiredPath("joint", True, (0.0,), (0.0,), end_s=2.0)
 
-    def servo(duty: float, current: float) -> Any:
+    def servo(duty, current):
         return SimpleNamespace(
             voltage=12.0, temperature=41.5, shaft=SimpleNamespace(duty=duty, current=current)
         )

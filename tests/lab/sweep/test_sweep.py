@@ -21,7 +21,7 @@ from dxlrun.errors import InputError
 from dxlrun_lab.sweep import sweep as sweep_module
 from dxlrun_lab.sweep.grid import Grid
 from dxlrun_lab.sweep.measuring import Measured, Task, code_checksum, measure
-from dxlrun_lab.sweep.results import Row, difference, read_results
+from dxlrun_lab.sweep.results import difference, read_results
 from dxlrun_lab.sweep.sweep import Sweep, header_of
 from dxlrun_lab.sweep.workers import Worker, measured
 from dxlrun_lab.sweep.workers import workers as processes
@@ -33,7 +33,7 @@ OVER = (f"gains.p=2..10x{SIDE}", f"gains.d=0.05..0.2x{SIDE}")
 
 
 @pytest.fixture(scope="module")
-def workers(plugin: Path) -> Iterator[list[Worker]]:
+def workers(plugin):
     """Two processes, which know the plug-in."""
     sys.path.insert(0, str(plugin))
     try:
@@ -70,7 +70,7 @@ def in_one_process(monkeypatch: pytest.MonkeyPatch, output: str, over: Sequence[
 
 
 @pytest.fixture(scope="module")
-def rows(texts: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> tuple[Row, ...]:
+def rows(texts, tmp_path_factory):
     """The rows of the sweep, measured in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("one"))
@@ -80,7 +80,7 @@ def rows(texts: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> tu
         return read_results(Path("one.parquet"))[1]
 
 
-def test_each_run_has_scores_of_its_own(rows: tuple[Row, ...]) -> None:
+def test_each_run_has_scores_of_its_own(rows):
     assert len(rows) == SIDE * SIDE
     assert {row.measured.status for row in rows} == {"measured"}
     scores = [row.measured.scores for row in rows]
@@ -89,12 +89,10 @@ def test_each_run_has_scores_of_its_own(rows: tuple[Row, ...]) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kills", [0, 2] if FULL else [1])
-def test_the_rows_of_processes_are_those_of_one_also_when_some_are_killed(
-    workers: list[Worker], files: object, rows: tuple[Row, ...], kills: int
-) -> None:
-    killed: list[int] = []
+def test_the_rows_of_processes_are_those_of_one_also_when_some_are_killed(workers, files, rows, kills):
+    killed = []
 
-    def kill(text: str, share: float) -> None:
+    def kill(text, share):
         if share > 0.2 * (1 + len(killed)) and len(killed) < kills:
             process = active_children()[0]
             killed.append(process.pid or 0)
@@ -106,7 +104,7 @@ def test_the_rows_of_processes_are_those_of_one_also_when_some_are_killed(
 
 
 @pytest.mark.campaign
-def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files: object) -> None:
+def test_a_run_that_fails_is_a_row_with_its_reason(workers, files):
     robot = Path("robot.yaml")
     robot.write_text(robot.read_text() + "  bad: {type: troubled, trouble: none}\n")
     endless = ["slow"] + ["hangs"] * FULL  # one that hangs does so twice, for 4 s
@@ -114,7 +112,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files:
     over = [f"trouble={','.join(('crashes', 'raises', 'none', *endless))}"]
     sweep = prepared(files, "trouble.parquet", over)
 
-    def but_endless(workers: list[Worker], tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+    def but_endless(workers, tasks):
         return measured(workers, itertools.islice(tasks, 3))
 
     with pytest.MonkeyPatch.context() as patch:
@@ -129,9 +127,9 @@ def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files:
     assert found["crashes"] == found.get("hangs", found["crashes"]) == Measured("crashed", ended)
     # what depends on the machine is tried again, what the robot did is not
     again = prepared(files, "trouble.parquet", over)
-    tried: list[str] = []
+    tried = []
 
-    def only_slow(_: object, tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+    def only_slow(_, tasks):
         tried.extend(task.run for task in tasks)
         return iter(())
 
@@ -141,7 +139,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files:
     assert {row.values[0] for row in sweep.rows if row.run in tried} == {"crashes", *endless}
 
 
-def test_a_combination_that_the_robot_file_forbids_is_a_row(workers: list[Worker], files: object) -> None:
+def test_a_combination_that_the_robot_file_forbids_is_a_row(workers, files):
     limits = ["limits.position[0]=-2 rad,0.1 rad", "limits.position[1]=0.05 rad,1 rad"]
     sweep = prepared(files, "limits.parquet", limits)
     run_on(workers, sweep)
@@ -156,10 +154,8 @@ def test_a_combination_that_the_robot_file_forbids_is_a_row(workers: list[Worker
     assert "joints.elbow.limits.position: the lower limit is not below the upper one" in refused.reason
 
 
-def test_rows_are_kept_when_it_is_interrupted_and_continued(
-    workers: list[Worker], files: object, rows: tuple[Row, ...]
-) -> None:
-    def interrupt(text: str, share: float) -> None:
+def test_rows_are_kept_when_it_is_interrupted_and_continued(workers, files, rows):
+    def interrupt(text, share):
         if share > 0.3:
             raise KeyboardInterrupt
 
@@ -178,7 +174,7 @@ def test_rows_are_kept_when_it_is_interrupted_and_continued(
     assert len(read_results(Path("kept.parquet"))[1]) == SIDE * SIDE + SIDE
 
 
-def test_nothing_is_started_where_all_rows_are_there(files: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_started_where_all_rows_are_there(files, monkeypatch):
     in_one_process(monkeypatch, "all.parquet", ["gains.p=1,2"])
     sweep = prepared(files, "all.parquet", ["gains.p=1,2"])
     before = Path("all.parquet").stat().st_mtime_ns
@@ -187,11 +183,11 @@ def test_nothing_is_started_where_all_rows_are_there(files: object, monkeypatch:
     assert Path("all.parquet").stat().st_mtime_ns == before
 
 
-def test_another_sweep_at_the_same_file_is_refused(files: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_sweep_at_the_same_file_is_refused(files, monkeypatch):
     in_one_process(monkeypatch, "mine.parquet", ["gains.p=1,2"])
     robot, motion = Path("robot.yaml"), Path("motion.yaml")
 
-    def refused(over: str, arguments: dict[str, str] | None = None) -> str:
+    def refused(over, arguments=None):
         grid = Grid(robot, arguments or {}, [motion], [over])
         with pytest.raises(InputError) as error:
             Sweep(grid, header_of(grid, arguments or {}, ""), Path("mine.parquet"), 1.0)
@@ -210,7 +206,7 @@ def test_another_sweep_at_the_same_file_is_refused(files: object, monkeypatch: p
     assert "holds a sweep of another robot file (arm)" in refused("gains.p=1,2")
 
 
-def test_another_urdf_or_motor_file_is_another_sweep(files: object) -> None:
+def test_another_urdf_or_motor_file_is_another_sweep(files):
     grid = Grid(Path("robot.yaml"), {}, [Path("motion.yaml")], ["gains.p=1,2"])
     first, before = grid.first, header_of(grid, {}, "")
     with_urdf = structs.replace(first.plan.loop, urdf="<robot/>")
@@ -219,7 +215,7 @@ def test_another_urdf_or_motor_file_is_another_sweep(files: object) -> None:
         assert difference(before, header_of(grid, {}, "")) == "another robot file (arm)"
 
 
-def test_the_version_of_a_plug_in_has_its_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_version_of_a_plug_in_has_its_code(tmp_path, monkeypatch):
     package = tmp_path / "worked_on"
     package.mkdir()
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -273,9 +269,7 @@ def children(process: subprocess.Popen[str]) -> list[int]:
     return [os.pidfd_open(int(pid)) for pid in found]
 
 
-def test_a_command_that_is_killed_leaves_rows_and_no_process(
-    files: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_that_is_killed_leaves_rows_and_no_process(files, monkeypatch):
     process = started(files, "killed.parquet")
     workers = children(process)
     assert workers
@@ -293,9 +287,7 @@ def test_a_command_that_is_killed_leaves_rows_and_no_process(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, *[signal.SIGINT] * FULL], ids=lambda number: number.name)
-def test_a_signal_keeps_the_rows_and_nothing_ever_listened(
-    files: object, listening: Callable[[int], tuple[list[str], list[str]]], number: signal.Signals
-) -> None:
+def test_a_signal_keeps_the_rows_and_nothing_ever_listened(files, listening, number):
     process = started(files, "interrupted.parquet")
     workers = children(process)
     assert listening(process.pid) == ([], [])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -64,11 +64,11 @@ def once() -> Iterator[int]:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Ran]:
+def runs(tmp_path_factory):
     """Return what gives the run of a set-up with such delays: `none`, `random`, `once`; each is made once."""
 
     @cache
-    def ran(setup: str, delay: str) -> Ran:
+    def ran(setup, delay):
         late = {"none": lambda: itertools.repeat(0), "random": at_random, "once": once}[delay]()
         return _run(setup, late, tmp_path_factory.mktemp(setup))
 
@@ -76,16 +76,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Ran]:
 
 
 @pytest.fixture
-def stopped(tmp_path: Path) -> Callable[[str, int], Ran]:
+def stopped(tmp_path):
     """Return what runs only so many cycles in a set-up."""
     return lambda setup, cycles: _run(setup, itertools.repeat(0), tmp_path, cycles)
 
 
 @pytest.fixture
-def motion_file(tmp_path: Path) -> Callable[[str, int], Path]:
+def motion_file(tmp_path):
     """Return what writes a motion file of so long, with so many samples."""
 
-    def write(duration: str, samples: int) -> Path:
+    def write(duration, samples):
         file = tmp_path / "motion.yaml"
         file.write_text(MOTION.format(duration=duration, samples=samples))
         return file

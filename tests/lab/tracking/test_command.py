@@ -32,11 +32,11 @@ NORMAL = "sequential-normal,loop-normal"
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_two_setups_are_run_measured_and_shown(dxlrun: Make, motion_file: Make) -> None:
+def test_two_setups_are_run_measured_and_shown(dxlrun, motion_file):
     """In real time, with all processes; judged by what is there, not by how punctual this machine is."""
     motion = motion_file("300 ms", 30)
     said = dxlrun(
@@ -62,7 +62,7 @@ def test_two_setups_are_run_measured_and_shown(dxlrun: Make, motion_file: Make) 
         assert Path(one["log"]).with_suffix(".ledger.jsonl").is_file()
 
 
-def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs: Make) -> None:
+def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs):
     measured = [runs(name, "random").measured for name in NORMAL.split(",")]
     desired = runs("loop-normal", "random").desired
     result = Experiment("single_joint", 3_125_000, desired, "2 busy processes", measured)
@@ -83,7 +83,7 @@ def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs: Ma
     assert ">1.4</text>" not in ET.tostring(alone, encoding="unicode")
 
 
-def test_the_table_of_all_setups_fits_a_terminal(runs: Make) -> None:
+def test_the_table_of_all_setups_fits_a_terminal(runs):
     """One column a set-up; a table that does not fit would become paragraphs."""
     tracked = runs("loop-normal", "random").measured.tracked
     shown = fitted(table([replace(tracked, setup=one.name, late_by_bus_us=2e5) for one in SETUPS]), 80)
@@ -94,14 +94,14 @@ def test_the_table_of_all_setups_fits_a_terminal(runs: Make) -> None:
 
 
 @pytest.fixture
-def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[RunSummary]], list[Any]]:
+def pretend(monkeypatch):
     """Return what lets runs end in this way; gives the plans that are run."""
 
-    def pretend(summaries: list[RunSummary]) -> list[Any]:
-        plans: list[Any] = []
+    def pretend(summaries):
+        plans = []
         left = iter(summaries)
 
-        def run_robot(plan: Any, *_: object) -> RunSummary:
+        def run_robot(plan, *_):
             plans.append(plan)
             return next(left)
 
@@ -126,7 +126,7 @@ def run_short(dxlrun: Make, runs: Make, *words: object) -> Any:
     return dxlrun("experiment", "tracking", "--play", motion, "--no-stress", *words)
 
 
-def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pretend: Make) -> None:
+def test_every_setup_has_its_schedule_and_scheduler(dxlrun, runs, pretend):
     plans = pretend([summary(0, log_of(runs, one)) for one in SETUPS])
     said = run_short(dxlrun, runs)
     assert said.code == 0
@@ -142,9 +142,7 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pr
 
 
 @pytest.mark.parametrize("page", ["experiments.md", "results.md"])
-def test_the_commands_of_the_pages_are_understood(
-    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch, page: str
-) -> None:
+def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeypatch, page):
     monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
     monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
     text = (ROOT / "docs" / page).read_text()
@@ -159,9 +157,7 @@ def test_the_commands_of_the_pages_are_understood(
         assert {plan.buses[0].port for plan in plans} == {"/dev/ttyUSB0" if "port:=" in command else "sim"}
 
 
-def test_an_interrupt_keeps_what_was_measured(
-    dxlrun: Make, runs: Make, stopped: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, stopped, pretend, monkeypatch):
     monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
     whole, part = runs("sequential-normal", "none").log.path, stopped("loop-normal", 480).log.path
     plans = pretend([summary(0, whole), summary(130, part)])
@@ -174,14 +170,12 @@ def test_an_interrupt_keeps_what_was_measured(
     assert Path("page.html").is_file()
 
 
-def test_a_termination_between_two_runs_keeps_what_was_measured(
-    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_termination_between_two_runs_keeps_what_was_measured(dxlrun, runs, pretend, monkeypatch):
     logs = [runs(setup, "none").log.path for setup in ("sequential-normal", "loop-normal")]
     pretend([summary(0, log) for log in logs])
     read = experiment.read_log
 
-    def terminated(path: str) -> object:
+    def terminated(path):
         if path == str(logs[1]):
             os.kill(os.getpid(), signal.SIGTERM)
         return read(path)
@@ -194,9 +188,7 @@ def test_a_termination_between_two_runs_keeps_what_was_measured(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(
-    dxlrun: Make, runs: Make, stopped: Make, pretend: Make
-) -> None:
+def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(dxlrun, runs, stopped, pretend):
     plans = pretend(
         [
             summary(1, stopped("sequential-normal", 480).log.path, "the loop stood still"),
@@ -211,21 +203,19 @@ def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(
     assert "loop-normal: ended" in said.out
 
 
-def test_the_load_is_there_while_a_run_is_measured(
-    runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
     ran = runs("loop-normal", "none")
-    steps: list[str] = []
+    steps = []
 
     class Load(Stress):
-        def __enter__(self) -> Load:
+        def __enter__(self):
             steps.append("loaded")
             return self
 
-        def __exit__(self, *_: object) -> None:
+        def __exit__(self, *_):
             steps.append("free")
 
-        def ended(self) -> tuple[str, ...]:
+        def ended(self):
             return ("the load ended",)
 
     pretend([summary(0, ran.log.path)])
@@ -238,9 +228,7 @@ def test_the_load_is_there_while_a_run_is_measured(
 # Wrong words
 
 
-def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(
-    dxlrun: Make, runs: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, runs, monkeypatch):
     monkeypatch.setattr(setups, "highest_priority", lambda: 0)
     said = run_short(dxlrun, runs)
     assert (said.code, said.out) == (2, "")
@@ -251,9 +239,7 @@ def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(
     assert f"--setups {NORMAL}" in said.err
 
 
-def test_without_that_right_the_normal_setups_are_measured(
-    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_that_right_the_normal_setups_are_measured(dxlrun, runs, pretend, monkeypatch):
     pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
     monkeypatch.setattr(setups, "highest_priority", lambda: 0)
     assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0
@@ -269,9 +255,7 @@ def test_without_that_right_the_normal_setups_are_measured(
         (("port:=sim", "port:=sim"), "argument port is given twice"),
     ],
 )
-def test_wrong_words_are_refused_before_anything_runs(
-    dxlrun: Make, pretend: Make, words: tuple[str, ...], sentence: str
-) -> None:
+def test_wrong_words_are_refused_before_anything_runs(dxlrun, pretend, words, sentence):
     plans = pretend([])
     said = dxlrun("experiment", "tracking", *words)
     assert said.code == 2

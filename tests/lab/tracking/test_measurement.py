@@ -24,7 +24,7 @@ SEQUENTIAL, LOOP = "sequential-normal", "loop-normal"
 Make = Callable[..., Any]
 
 
-def test_the_sequential_sender_ends_late_by_exactly_the_sum_of_its_start_delays(runs: Make) -> None:
+def test_the_sequential_sender_ends_late_by_exactly_the_sum_of_its_start_delays(runs):
     ran = runs(SEQUENTIAL, "random")
     one = ran.measured.tracked
     # the motion's first pose is that of cycle 320, 1 s after the command, its last that of cycle 640
@@ -36,14 +36,14 @@ def test_the_sequential_sender_ends_late_by_exactly_the_sum_of_its_start_delays(
     assert one.duration_ns == 1_000_000_000 + injected
 
 
-def test_the_loop_ends_within_one_period(runs: Make) -> None:
+def test_the_loop_ends_within_one_period(runs):
     one = runs(LOOP, "random").measured.tracked
     assert one.ended
     assert 0 <= one.drift_ns < PERIOD_NS + one.last_late_ns
     assert one.start_delays_ns is None
 
 
-def test_a_cycle_that_wakes_a_moment_before_the_end_is_the_last(runs: Make) -> None:
+def test_a_cycle_that_wakes_a_moment_before_the_end_is_the_last(runs):
     """The command was taken some ns after a deadline, so the motion ends some ns after another."""
     ran = runs(LOOP, "none")
     cycles = ran.log.cycles.copy()
@@ -53,7 +53,7 @@ def test_a_cycle_that_wakes_a_moment_before_the_end_is_the_last(runs: Make) -> N
     assert (one.ended, one.cycles, one.drift_ns) == (True, 321, -70)
 
 
-def test_a_sequence_of_which_the_log_lacks_a_cycle_does_not_add_up(runs: Make) -> None:
+def test_a_sequence_of_which_the_log_lacks_a_cycle_does_not_add_up(runs):
     """The other side: it is no tautology that the delays add up."""
     ran = runs(SEQUENTIAL, "random")
     lost = next(number for number in range(400, 640) if ran.injected_ns[number])
@@ -61,7 +61,7 @@ def test_a_sequence_of_which_the_log_lacks_a_cycle_does_not_add_up(runs: Make) -
     assert not replace(ran, log=log).measured.tracked.adds_up
 
 
-def test_without_delays_both_send_the_same(runs: Make) -> None:
+def test_without_delays_both_send_the_same(runs):
     one, other = (runs(setup, "none").measured.tracked for setup in (SEQUENTIAL, LOOP))
     assert one.drift_ns == other.drift_ns == 0
     assert (one.late_cycles, one.max_late_us, one.silent_cycles) == (0, 0.0, 0)
@@ -69,7 +69,7 @@ def test_without_delays_both_send_the_same(runs: Make) -> None:
     assert 0.001 < one.rms_rad < one.worst_rad < 0.2
 
 
-def test_the_error_is_that_of_the_moment_of_the_reading(runs: Make) -> None:
+def test_the_error_is_that_of_the_moment_of_the_reading(runs):
     ran = runs(LOOP, "none")
     number = ran.log.cycles["cycle"]
     cycles = ran.log.cycles[(number >= 320) & (number <= 640)]
@@ -79,13 +79,13 @@ def test_the_error_is_that_of_the_moment_of_the_reading(runs: Make) -> None:
     assert ran.measured.tracked.rms_rad == pytest.approx(float(np.sqrt(np.mean(error**2))), abs=2e-5)
 
 
-def test_delays_cost_the_sequential_sender_more_than_the_loop(runs: Make) -> None:
+def test_delays_cost_the_sequential_sender_more_than_the_loop(runs):
     one, other = (runs(setup, "random").measured.tracked for setup in (SEQUENTIAL, LOOP))
     assert one.rms_rad > 2 * other.rms_rad
 
 
 @pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
-def test_one_late_wake_up_is_one_late_cycle(runs: Make, setup: str) -> None:
+def test_one_late_wake_up_is_one_late_cycle(runs, setup):
     """The loop skips the periods that passed meanwhile, but its next cycle is on time."""
     ran = runs(setup, "once")
     found = ran.measured
@@ -96,7 +96,7 @@ def test_one_late_wake_up_is_one_late_cycle(runs: Make, setup: str) -> None:
     assert late_s == pytest.approx(2.5 * PERIOD_NS / 1e9)
 
 
-def test_a_cycle_after_one_that_took_too_long_is_late(runs: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cycle_after_one_that_took_too_long_is_late(runs, monkeypatch):
     """As if the read of a cycle had taken 2.2 periods: the next one begins after two skipped periods."""
     ran = runs(LOOP, "none")
     kept = ~np.isin(ran.log.cycles["cycle"], (401, 402))
@@ -114,7 +114,7 @@ def test_a_cycle_after_one_that_took_too_long_is_late(runs: Make, monkeypatch: p
     assert ran.measured.tracked.late_by_bus_us == 1.2 * PERIOD_NS / 1e3
 
 
-def test_what_the_simulated_bus_was_late_is_taken_off(runs: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_simulated_bus_was_late_is_taken_off(runs, monkeypatch):
     ran = runs(SEQUENTIAL, "once")
     in_read, in_idle = np.zeros((2, len(ran.log.cycles)), np.int64)
     in_read[350], in_idle[400], in_idle[500] = 900_000, 1_500_000, 7_000_000
@@ -127,9 +127,7 @@ def test_what_the_simulated_bus_was_late_is_taken_off(runs: Make, monkeypatch: p
     assert (one.late_cycles, one.max_late_us) == (1, 6_312.5)
 
 
-def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(
-    runs: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(runs, monkeypatch):
     """The duration counts from when the first pose was sent, however late that was."""
     ran = runs(SEQUENTIAL, "random")
     cycles = ran.log.cycles.copy()
@@ -143,14 +141,14 @@ def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(
     assert one.late_by_bus_us * 1000 == pytest.approx(one.drift_ns + ran.injected_ns[320] + PERIOD_NS)
 
 
-def test_a_real_bus_has_no_ledger(runs: Make) -> None:
+def test_a_real_bus_has_no_ledger(runs):
     ran = runs(LOOP, "none")
     one = measure(ran.log, ran.setup, ran.desired, None).tracked
     assert (one.late_by_bus_us, one.drift_by_bus_ns) == (None, None)
 
 
 @pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
-def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(stopped: Make, setup: str) -> None:
+def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(stopped, setup):
     one = stopped(setup, 480).measured.tracked
     assert not one.ended
     assert one.drift_ns is one.own_drift_ns is None
@@ -159,14 +157,14 @@ def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(stopped: Make, set
 
 
 @pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
-def test_a_run_that_ended_before_the_motion_has_no_numbers(stopped: Make, setup: str) -> None:
+def test_a_run_that_ended_before_the_motion_has_no_numbers(stopped, setup):
     assert stopped(setup, 100).measured is None
 
 
 # The desired motion
 
 
-def test_between_samples_the_desired_motion_is_the_formula(motion_file: Make) -> None:
+def test_between_samples_the_desired_motion_is_the_formula(motion_file):
     motion = motion_file("3 s", 100)
     desired = desired_motion(motion, compile_files(ROBOT, ACTIVE, [motion]).plan)
     times = np.linspace(0, 3, 1001)
@@ -199,7 +197,7 @@ motions:
 @pytest.mark.parametrize(
     ("motion", "sentence"), [(TWO_PARTS, "has 2 parts"), (ONE_POINT, "has not two of them")]
 )
-def test_a_motion_that_cannot_be_compared_is_refused(tmp_path: Path, motion: str, sentence: str) -> None:
+def test_a_motion_that_cannot_be_compared_is_refused(tmp_path, motion, sentence):
     file = tmp_path / "motion.yaml"
     file.write_text(motion)
     plan = compile_files(ROBOT, ACTIVE, [file]).plan
