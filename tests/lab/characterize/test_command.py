@@ -66,21 +66,6 @@ def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
         assert figure["why"]
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (("--tolerance", "soon"), "--tolerance soon"),
-        (("--tolerance", "0deg"), "give an angle above 0 and up to 45 deg"),
-        (("--report", "page.pdf"), "its name ends in .html"),
-        (("--range", "joint=-400deg..10deg"), "beyond the joint's limits"),
-        (("--measure", "torque"), "torque"),
-    ],
-)
-def test_wrong_words_are_refused_before_anything_moves(dxlrun, tmp_path, words, why):
-    done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--virtual", *words)
-    assert (done.code, why in done.err + done.out) == (2, True), done
-
-
 def test_every_figure_of_a_result_is_on_the_page(dxlrun):
     text = (
         (ROOT / "docs" / "experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]

@@ -264,28 +264,6 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
         )
 
 
-@pytest.mark.parametrize(
-    ("words", "options", "sentence"),
-    [
-        (["pair.yaml", "pann"], OnRobot(), "pann is not one of the robot's joints; did you mean pan?"),
-        (["pair.yaml", "pan"], OnRobot(robot="pair"), "--robot names a robot that runs"),
-        (
-            ["pair.yaml", "pan"],
-            OnRobot(range=("pan=-200deg..0deg",)),
-            "--range pan=-200..0 deg is beyond the",
-        ),
-        (["pan"], OnRobot(virtual=True), "--virtual simulates the robot of a file; write ROBOT.yaml"),
-        (["none.yaml", "pan"], OnRobot(), "there is no robot file none.yaml"),
-    ],
-)
-def test_wrong_words_start_nothing(place, stage, words, options, sentence):
-    logs = set(place.glob("logs/*"))
-    with pytest.raises(InputError) as caught:
-        run_on_robot(stage.Plays(lambda joint: iter([])), words, options)
-    assert set(place.glob("logs/*")) == logs
-    assert caught.value.sentences[0].startswith(sentence)
-
-
 def test_real_servos_are_asked_for_and_counted_down(place, stage, monkeypatch, capsys):
     """A simulated robot whose ports are taken for real ones."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)

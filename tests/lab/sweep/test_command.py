@@ -51,36 +51,6 @@ def no_workers(monkeypatch):
     return asked
 
 
-COMMAND_LINE = [
-    (
-        ["gains.q=1..2x2"],
-        "--over gains.q=1..2x2: the robot file has no gains.q; did you mean gains.d or gains.i",
-    ),
-    (
-        ["position_p_gain=400,800"],
-        "the robot file declares no register position_p_gain; write it there first, at elbow for example: "
-        "`registers: {position_p_gain: VALUE}`",
-    ),
-    (["gains=1,2"], "--over gains=1,2: gains has values in it; name one of them: gains.d, gains.i, gains.p"),
-    (["gains.p=1..2"], "--over gains.p=1..2: '1..2' has no number of points; write PATH=LO..HIxN, "),
-    (["rate=50,100", "gains.p=1,2", "arm_pid.gains.p=3,4"], "gains.p is swept twice; give one range for it"),
-    (
-        ["gains.p=1..2x400", "gains.d=0..1x400"],
-        "this is 160000 runs, and 10000 are allowed; give fewer",
-    ),
-    (["x=1,2"], "the robot file has no x; write the place with dots, from the top of the file"),
-    (["joints.elbow.id.x=1,2"], "the robot file has no joints.elbow.id.x; "),
-]
-
-
-@pytest.mark.parametrize(("over", "sentence"), COMMAND_LINE)
-def test_a_mistake_of_a_range_is_reported(sweep, over, sentence):
-    said = sweep(*(word for one in over for word in ("--over", one)))
-    assert (said.code, said.out, len(said.errors)) == (2, "", 1)
-    assert said.errors[0].startswith("command line:1:1: ")
-    assert sentence in said.errors[0]
-
-
 def test_all_mistakes_are_reported_at_once(sweep, files):
     files.robot.write_text(files.robot.read_text().replace("id: 1", "id: 300"))
     said = sweep("--over", "gains.q=1..2x2", "--over", "limits.position=1,2", "--workers", "0", "rate:=0")
@@ -107,47 +77,6 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep):
         "robot.yaml:22:16: with gains.p=-2 (and 1 more of its values): controllers.arm_pid.gains.p is -2, "
         "but must be at least 0; correct it",
     ]
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (
-            ["--over", "gains.p=1,2", "port:=x"],
-            "port:=x was given, but the robot file has no argument 'port'",
-        ),
-        (["--over", "rate=50,100", "rate:=70"], "argument rate is given as 70, too; give one of them"),
-        ([], "nothing is swept; give --over PATH=LO..HIxN"),
-        (["--over", "gains.p=1,2", "--picture", "a.gif"], "--picture a.gif has no format; end it in .svg"),
-        (["--over", "gains.p=1,2", "--picture", "no/a.svg"], "there is no directory no; make it"),
-        (
-            [
-                *("--over", "gains.p=1,2", "--over", "gains.d=1,2", "--over", "rate=50,100"),
-                "--picture",
-                "a.svg",
-            ],
-            "--picture draws one or two parameters, and 3 are swept; leave it out",
-        ),
-        (
-            ["--over", "gains.p=1,2", "--time-limit", "nan"],
-            "Invalid value for --time-limit: 'nan' is not a time",
-        ),
-        (["--over", "gains.p=1,2", "--output", "robot.yaml/x"], "--output robot.yaml/x/arm-"),
-    ],
-)
-def test_a_wrong_option_is_refused_before_anything_starts(sweep, words, sentence):
-    said = sweep(*words)
-    assert (said.code, said.out, len(said.errors)) == (2, "", 1)
-    assert sentence in said.errors[0]
-
-
-def test_a_real_port_is_refused(sweep, files):
-    files.robot.write_text(files.robot.read_text().replace("port: sim", "port: /dev/ttyUSB0"))
-    said = sweep("--over", "gains.p=1,2")
-    assert (said.code, len(said.errors)) == (2, 1)
-    assert said.errors[0].startswith(
-        "dxlrun: virtual time needs simulated servos, but bus main has a real port: "
-    )
 
 
 def test_a_file_that_is_no_sweep_stays_as_it_is(sweep):

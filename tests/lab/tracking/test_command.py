@@ -243,21 +243,3 @@ def test_without_that_right_the_normal_setups_are_measured(dxlrun, runs, pretend
     pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
     monkeypatch.setattr(setups, "highest_priority", lambda: 0)
     assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("--setups", "loop-norml"), "there is no set-up 'loop-norml'; did you mean loop-normal?"),
-        (("--setups", ","), "--setups names no set-up"),
-        (("--report", "page.txt"), "a report is an HTML file"),
-        (("none.yaml",), "there is no robot file none.yaml"),
-        (("port:=sim", "port:=sim"), "argument port is given twice"),
-    ],
-)
-def test_wrong_words_are_refused_before_anything_runs(dxlrun, pretend, words, sentence):
-    plans = pretend([])
-    said = dxlrun("experiment", "tracking", *words)
-    assert said.code == 2
-    assert sentence in said.err
-    assert plans == []
