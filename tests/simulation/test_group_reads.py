@@ -78,12 +78,15 @@ def test_fast_reads_share_one_status(line2, instruction, parameters):
     assert len(received) == 7 + 17
 
 
-def test_a_fast_read_has_one_return_delay(make_line2):
+@pytest.mark.parametrize("slow", [(), (1,), (2,), (1, 2)])
+def test_a_fast_read_has_one_return_delay_and_waits_for_each_slow_servo(make_line2, slow):
     line = make_line2((1, 2), return_delay_ns=100_000)
+    for servo_id in slow:
+        line.servo(servo_id).reply_later(300_000)
     start = line.clock.now_ns()
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02")
     line.receive()
-    assert max(entry.t_ns for entry in line.ledger.entries) - start == (16 + 24) * 10_000 + 100_000
+    assert max(entry.t_ns for entry in line.ledger.entries) - start == (16 + 24) * 10_000 + 100_000 + 300_000 * len(slow)
 
 
 def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2):

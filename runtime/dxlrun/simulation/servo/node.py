@@ -126,8 +126,8 @@ class SimulatedNode(ABC):
         answer = self._answer_group_read(read, entry)
         if answer is None:
             return None
-        # of a status packet that servos share only the first one waits
-        delay_ns = 0 if read.fast and entry is not read.entries[0] else self._delay_ns
+        # of a status packet that servos share only the first one waits its Return Delay Time
+        delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
         return ServoReply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
 
     def lasts(self, entry: ReadEntry) -> bool:
