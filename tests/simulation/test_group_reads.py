@@ -86,7 +86,9 @@ def test_a_fast_read_has_one_return_delay_and_waits_for_each_slow_servo(make_lin
     start = line.clock.now_ns()
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02")
     line.receive()
-    assert max(entry.t_ns for entry in line.ledger.entries) - start == (16 + 24) * 10_000 + 100_000 + 300_000 * len(slow)
+    assert max(entry.t_ns for entry in line.ledger.entries) - start == (
+        16 + 24
+    ) * 10_000 + 100_000 + 300_000 * len(slow)
 
 
 def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2):

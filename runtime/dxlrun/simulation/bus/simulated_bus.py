@@ -60,18 +60,6 @@ class PacketFault(NamedTuple):
     copies: int = 1
 
 
-class GroupReplies(NamedTuple):
-    """What the servos reply to a group read, as long as none of them changes."""
-
-    read: GroupRead
-    version: int
-    """Of the bus, when they replied; -1: they would reply something else at another time."""
-    turns: tuple[Turn, ...]
-
-
-_NONE_YET = GroupReplies(GroupRead(0, ()), -1, ())
-
-
 class SimulatedBus:
     """One line; time comes from the caller and never goes back."""
 
@@ -102,8 +90,6 @@ class SimulatedBus:
         self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
         self._group: GroupReply | None = None  # The group read whose replies are under way
-        self._replies = _NONE_YET
-        """Of the last group read: a robot at rest is read a thousand times a second."""
         self._nodes_by_id: dict[int, tuple[SimulatedNode, ...]] = {}
         self._reply_faults: dict[int, deque[PacketFault]] = {}
         self._instruction_faults: deque[PacketFault] = deque()
@@ -434,31 +420,14 @@ class SimulatedBus:
             self._nodes_by_id[servo_id] = found
         return found
 
-    @property
-    def _version(self) -> int:
-        """Grows with whatever may change what a servo replies, but for the time."""
-        return self.mechanics.version + sum([node.registers.version for node in self.nodes])
-
     def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
         """Return what each servo of a group read replies to it, in its state at a time."""
         self.mechanics.advance(end_ns)
-        if self._replies.read is not read or self._replies.version != self._version:
-            return self._new_turns(read, slots, end_ns)
-        for turn in self._replies.turns:
-            node = self._nodes_of(turn.servo_id)[0]
-            node.receives(end_ns)
-            node.counts.received += 1
-            node.counts.reply(turn.replies[0][0].error)
-        return self._replies.turns
-
-    def _new_turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
         turns: list[Turn] = []
-        lasting = self.mechanics.still
         shared = protocol2.FastStatusPacket(read.lengths) if read.fast else None
         for entry in read.entries:
             replies = []
-            nodes = self._nodes_of(entry.servo_id)
-            for node in nodes:
+            for node in self._nodes_of(entry.servo_id):
                 if node.servo_id != entry.servo_id:
                     continue  # only by its secondary ID, to which it never replies
                 node.counts.received += 1
@@ -467,10 +436,8 @@ class SimulatedBus:
                     node.counts.reply(reply.error)
                     replies.append((reply, shared.part(reply) if shared else self._status(reply)))
             turns.append(Turn(entry.servo_id, tuple(replies), _STATUS_BYTES + entry.length))
-            lasting = lasting and len(replies) == len(nodes) == 1 and nodes[0].lasts(entry)
             if not replies and not slots:
                 break  # those after it wait for it in vain
-        self._replies = GroupReplies(read, self._version if lasting else -1, tuple(turns))
         return turns
 
     def _send_turns(self, group: GroupReply, free_ns: int) -> None:

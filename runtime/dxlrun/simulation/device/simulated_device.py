@@ -22,7 +22,7 @@ from dxlrun.simulation.device.measured import Measured, shown
 from dxlrun.simulation.servo.access import device_rules
 from dxlrun.simulation.servo.memory import IDENTITY, Memory
 from dxlrun.simulation.servo.node import Answer, SimulatedNode
-from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket, ReadEntry
+from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket
 
 CHAIN_WAIT_NS = 50_000_000
 """How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
@@ -54,7 +54,6 @@ class SimulatedDevice(SimulatedNode):
         self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
         random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
         self._shown = shown(table.items, config.shown, world, random)
-        self._still = not config.shown.noise and not config.shown.link
         self._awaited_id: int | None = None  # Whose status it waits for in a group read
         self._waits_until_ns = 0
         registers = _registers(table)
@@ -99,7 +98,6 @@ class SimulatedDevice(SimulatedNode):
         place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
         if place and self.receives(now_ns):
             self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
-            self.registers.version += 1
 
     def overhear(self, servo_id: int, now_ns: int) -> None:
         """Take notice of a status packet on the line."""
@@ -107,10 +105,6 @@ class SimulatedDevice(SimulatedNode):
             self._awaited_id = None
         elif self._awaited_id is not None and now_ns < self._waits_until_ns:
             self._waits_until_ns = now_ns + CHAIN_WAIT_NS
-
-    def lasts(self, entry: ReadEntry) -> bool:
-        """Return whether it replies the same until a servo moves or something is written."""
-        return self._still and super().lasts(entry)
 
     def can(self, capability: str) -> bool:
         """Return whether it knows an instruction, in the words of control tables."""
@@ -169,9 +163,6 @@ class SimulatedDevice(SimulatedNode):
                 live[item.name] = _put_together(bits)
         return live
 
-    def _by_time(self) -> frozenset[str]:
-        return frozenset()
-
     def _set(self, name: str, wire: int) -> None:
         """Set an item as if it had been so before; what it measured there it shows no more."""
         address, size, bit = self._bits[name]
@@ -179,8 +170,7 @@ class SimulatedDevice(SimulatedNode):
         if bit is not None:
             wire = self.registers[place] & ~(1 << bit) | wire << bit
         self.registers[place] = wire
-        self._live.pop(place, None)
-        self._windows.clear()
+        self.registers.show_no_more(place)
 
     # What faults do
 
@@ -200,16 +190,12 @@ class SimulatedDevice(SimulatedNode):
             share = (self.now_ns - begin_ns) / for_ns
             return (by, 0.0) if share >= 1.0 else (by * share, by * 1e9 / for_ns)
 
-        self._still = False
-        self._windows.clear()
-        self.registers.version += 1
         self.world.tip(axis, angle)
         self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
 
     def set_voltage(self, volts: float) -> None:
         """Supply it with another voltage, V."""
         self.world.volts = volts
-        self.registers.version += 1
         self.note(f"{self.called}: voltage {volts} V")
 
     @property

@@ -79,8 +79,6 @@ class Mechanics:
         self._busy = False
         self._commanded = False
         self.still = False  # True while all servos rest, uncommanded
-        self.version = 0
-        """Grows with whatever may change what a servo shows, but for the time while one of them moves."""
         self._before: Floats | None = None
         """Velocities before the last step, if accelerations are sensed"""
         self._build(np.zeros(0), np.zeros(0))
@@ -140,7 +138,7 @@ class Mechanics:
         """Change the goal of a servo and its profile, and nothing else; as in `ServoCommand`."""
         self.profiles.aim(index, goal, speed, acceleration)
         self.strain.calm = False
-        self._disturb()
+        self.still = False
 
     def place(self, index: int, angle: float) -> None:
         """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
@@ -149,7 +147,7 @@ class Mechanics:
         if self._commands[ROWS["limit"], index] == 0.0:
             self._commands[ROWS["goal"], index] = angle
         self.profiles.arrived = False
-        self._disturb()
+        self.still = False
 
     def recount(self, index: int, angle: float) -> None:
         """Put a shaft to rest and count its angle, rad, in another turn; its trajectory begins there."""
@@ -166,13 +164,12 @@ class Mechanics:
         """
         steps = max(1, round(duration_ns / STEP_NS))
         self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
-        self._disturb()
+        self.still = False
 
     def heat(self, index: int, celsius: float) -> None:
         """Bring a servo to a temperature, degrees C; it returns to that of its load."""
         self.strain.temperature[index] = celsius
         self.strain.calm = False
-        self.version += 1
 
     def overloaded(self, index: int) -> bool:
         """Return whether a servo has been overloaded for too long."""
@@ -295,18 +292,13 @@ class Mechanics:
             return
         most = self.law.stall * self._commands[ROWS["limit"]]
         for index in self.strain.tick(self.law.torque, most):
-            self.version += 1
             if (act := self._watchers.get(index)) is not None:
                 act()
 
     def _wake(self) -> None:
         self._commanded = True
         self.strain.calm = False
-        self._disturb()
-
-    def _disturb(self) -> None:
         self.still = False
-        self.version += 1
 
     def _build(self, angle: Floats, velocity: Floats) -> None:
         count, dt_s = len(self._motors), STEP_NS * 1e-9

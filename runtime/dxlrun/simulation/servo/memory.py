@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
@@ -29,18 +29,6 @@ class Cells(NamedTuple):
     eeprom: bool  # True when one of the items is in the EEPROM area
     single: str
     """Name of the item that they are, whole, where none of them is Indirect Data; else empty."""
-
-
-class LiveItem(NamedTuple):
-    """An item that shows something else whenever it is looked at."""
-
-    name: str
-    show: Callable[[], int]  # Returns what it shows now, in ticks
-    lowest: int
-    highest: int  # What its bytes hold; beyond that it stays there
-    start: int
-    end: int
-    mask: int
 
 
 class Run(NamedTuple):
@@ -72,14 +60,10 @@ class Memory:
             for address in range(item.address, item.address + item.size)
         }
         self._indirect = _indirect_cells(table)
-        self._bounds = {item.name: _bounds(item) for item in table.items.values()}
-        self._places = {
-            item.name: (item.address, item.address + item.size, item.size, (1 << 8 * item.size) - 1)
-            for item in table.items.values()
-        }
+        self._places = {item.name: _place(item) for item in table.items.values()}
         self._watchers: dict[str, list[Callable[[], None]]] = {}
-        self.version = 0
-        """Grows with every change, but for what the servo shows by itself (`show_all`)."""
+        self._live: dict[str, Callable[[], int]] = {}
+        self._live_at: dict[tuple[int, int], tuple[tuple[str, Callable[[], int]], ...]] = {}
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -109,13 +93,12 @@ class Memory:
         return self._values[name]
 
     def __setitem__(self, name: str, wire: int) -> None:
-        start, end, size, mask = self._places[name]
+        start, end, mask, _, _ = self._places[name]
         wire &= mask
         if self._values.get(name) == wire:
             return
-        self._memory[start:end] = wire.to_bytes(size, "little")
+        self._memory[start:end] = wire.to_bytes(end - start, "little")
         self._values[name] = wire
-        self.version += 1
         if name in self._watchers:
             self._notify((name,))
 
@@ -135,29 +118,24 @@ class Memory:
 
     def show(self, name: str, wire: int) -> None:
         """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
-        bounds = self._bounds.get(name)
-        if bounds is not None:
-            lowest, highest = bounds
+        if name in self._places:
+            *_, lowest, highest = self._places[name]
             self[name] = lowest if wire < lowest else min(wire, highest)
 
-    def live(self, name: str, show: Callable[[], int]) -> LiveItem:
-        """Return an item that shows what a function returns; raises KeyError when the model has none."""
-        start, end, _, mask = self._places[name]
-        return LiveItem(name, show, *self._bounds[name], start, end, mask)
+    def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
+        """Let items of the model show what functions return: worked out when they are read, not before."""
+        self._live = {name: show for name, show in live.items() if name in self}
+        self._live_at.clear()
 
-    def show_all(self, items: Iterable[LiveItem]) -> None:
-        """Set items of the model to what they show now, as `show` does, for what is read all the time."""
-        values = self._values
-        for name, show, lowest, highest, start, end, mask in items:
-            wire = show()
-            if not lowest <= wire <= highest:
-                wire = lowest if wire < lowest else highest
-            wire &= mask
-            if values[name] != wire:
-                self._memory[start:end] = wire.to_bytes(end - start, "little")
-                values[name] = wire
-                if name in self._watchers:
-                    self._notify((name,))
+    def show_no_more(self, name: str) -> None:
+        """Let an item keep what it has."""
+        self._live.pop(name, None)
+        self._live_at.clear()
+
+    def refresh(self) -> None:
+        """Set all live items to what they show now."""
+        for name, show in self._live.items():
+            self.show(name, show())
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
@@ -173,20 +151,31 @@ class Memory:
         return bytes(self._memory[item.address : item.address + item.size])
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
+        """Return bytes of the table as they are now, None where it has none.
+
+        Cells between items are 0, and so is what Indirect Addresses beyond the table lead to [i].
+        """
         if length < 1 or address + length > self.size:
             return None
         if self.cells(address, length).direct:
-            return self.raw(address, length)
-        data = self._memory[address : address + length]
-        for cell in self._indirect.keys() & range(address, address + length):
-            target = self[self._indirect[cell]]
-            data[cell - address] = self._memory[target] if target < len(self._memory) else 0
-        return bytes(data)
+            return self._cells_now(address, length)
+        places = self.places(address, length)
+        return b"".join(self._cells_now(target, last - first) for target, first, last in places)
 
-    def raw(self, address: int, length: int) -> bytes:
-        """Return the bytes of cells of the table."""
-        return bytes(self._memory[address : address + length])
+    def _cells_now(self, address: int, length: int) -> bytes:
+        live = self._live_at.get((address, length))
+        if live is None:
+            if len(self._live_at) >= _CELLS_KEPT:
+                self._live_at.clear()
+            cells = range(address, address + length)
+            items = {item.name: None for cell in cells if (item := self._item_at.get(cell)) is not None}
+            live = tuple((name, self._live[name]) for name in items if name in self._live)
+            self._live_at[address, length] = live
+        for name, show in live:
+            wire = show()
+            if wire != self._values[name]:
+                self.show(name, wire)
+        return bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
@@ -241,11 +230,6 @@ class Memory:
         """Return whether a write would change the EEPROM area, also through Indirect Data."""
         return any(run.cells.eeprom for run in self.runs(address, data))
 
-    def overlaps(self, name: str, address: int, length: int) -> bool:
-        """Return whether any of some cells belongs to an item."""
-        start, end, _, _ = self._places[name]
-        return start < address + length and address < end
-
     def touches(self, address: int, length: int) -> bool:
         """Return whether any of some cells belongs to an item."""
         return self.cells(address, length).touched
@@ -271,7 +255,6 @@ class Memory:
         if self._memory[start:end] != run.data:
             self._memory[start:end] = run.data
             self._values.update(run.after)
-            self.version += 1
         if not self._watchers.keys().isdisjoint(run.after):
             self._notify(run.after)
 
@@ -282,9 +265,11 @@ class Memory:
         return max(0, item.minimum) if item.access == "RW" else 0
 
 
-def _bounds(item: ControlItem) -> tuple[int, int]:
+def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
+    """Return where an item begins and ends, the mask of its bits, and the range that its bytes hold."""
     bits = 8 * item.size - item.signed
-    return (-1 << bits if item.signed else 0), (1 << bits) - 1
+    lowest = -1 << bits if item.signed else 0
+    return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1
 
 
 def _indirect_cells(table: ControlTable) -> dict[int, str]:

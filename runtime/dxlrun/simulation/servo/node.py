@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, TypeVar
 
 import msgspec
 
 from dxlrun.simulation.servo.access import Access, Rules
-from dxlrun.simulation.servo.memory import LiveItem, Memory, Run
+from dxlrun.simulation.servo.memory import Memory, Run
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import (
     BROADCAST,
@@ -25,15 +25,7 @@ from dxlrun.simulation.wire.packets import (
     ServoReply,
 )
 
-_READS_KEPT = 1024
-"""So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
-
 Answer = tuple[int, bytes]  # Error and parameters of a reply
-
-
-class _Window(NamedTuple):
-    live: tuple[LiveItem, ...]  # What changes by itself in it
-    lasts: bool  # True: nothing of it does while no servo moves
 
 
 class ServoCounts(msgspec.Struct):
@@ -79,8 +71,7 @@ class SimulatedNode(ABC):
         self._deaf_until_ns = now_ns
         """Until then it boots, or works on a write, and receives nothing."""
         self._delay_ns = 0  # Return Delay Time (5, 9)
-        self._live = {name: show for name, show in self._live_items().items() if name in memory}
-        self._windows: dict[tuple[int, int], _Window] = {}
+        memory.show_live(self._live_items())
         memory.watch(("return_delay_time",), self._set_delay)
 
     @property
@@ -130,13 +121,6 @@ class SimulatedNode(ABC):
         delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
         return ServoReply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
 
-    def lasts(self, entry: ReadEntry) -> bool:
-        """Return whether it replies the same until a servo moves or something is written."""
-        if self._contacts:
-            return False
-        places = self.registers.places(entry.address, entry.length)
-        return all(self._window(target, last - first).lasts for target, first, last in places)
-
     # What kinds of nodes do differently
 
     @abstractmethod
@@ -150,10 +134,6 @@ class SimulatedNode(ABC):
     @abstractmethod
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
         """Return the items that change by themselves: worked out when they are read, not before."""
-
-    @abstractmethod
-    def _by_time(self) -> frozenset[str]:
-        """Return the items that show something else at another time, though nothing moves."""
 
     @abstractmethod
     def _state(self) -> int: ...
@@ -250,7 +230,7 @@ class SimulatedNode(ABC):
 
     def _answer_read(self, address: int, length: int) -> Answer:
         """Return data; cells between items are 0 [i]."""
-        data = self._read(address, length)
+        data = self.registers.read(address, length)
         return (self._codec.no_cells, b"") if data is None else (0, data)
 
     def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
@@ -293,55 +273,27 @@ class SimulatedNode(ABC):
     def _refusal(self, run: Run) -> int:
         return self._access.refusal(run)
 
-    # Inside
-
-    def _read(self, address: int, length: int) -> bytes | None:
-        """Return bytes of the table, None where it has none."""
-        memory = self.registers
-        if length < 1 or address + length > memory.size:
-            return None
-        if memory.cells(address, length).direct:
-            memory.show_all(self._window(address, length).live)
-            return memory.raw(address, length)
-        for target, first, last in memory.places(address, length):
-            memory.show_all(self._window(target, last - first).live)
-        return memory.read(address, length)
-
-    def _window(self, address: int, length: int) -> _Window:
-        window = self._windows.get((address, length))
-        if window is None:
-            if len(self._windows) >= _READS_KEPT:
-                self._windows.clear()
-            names = [name for name in self._live if self.registers.overlaps(name, address, length)]
-            live = tuple(self.registers.live(name, self._live[name]) for name in names)
-            window = self._windows[address, length] = _Window(live, self._by_time().isdisjoint(names))
-        return window
-
     # What faults do
 
     def silence(self, on: bool = True) -> None:
         """Cut its data line, or restore it: it receives and sends nothing, and keeps moving."""
         self._silent = on
-        self.registers.version += 1
         self.note(f"{self.called}: data line {'cut' if on else 'restored'}")
 
     def interrupt(self, contact: Callable[[], bool]) -> None:
         """Let instructions and replies of this servo through only where `contact` says so."""
         self._contacts.append(contact)
-        self.registers.version += 1
         self.note(f"{self.called}: cable loose")
 
     def connect(self, contact: Callable[[], bool]) -> None:
         """End what `interrupt` began."""
         self._contacts.remove(contact)
-        self.registers.version += 1
         self.note(f"{self.called}: cable has contact")
 
     def reply_later(self, by_ns: int) -> None:
         """Start each reply later than Return Delay Time; 0: no longer."""
         self._later_ns = by_ns
         self._set_delay()
-        self.registers.version += 1
         self.note(f"{self.called}: replies {by_ns} ns later")
 
     def cut_power(self, until_ns: int) -> None:
@@ -351,7 +303,6 @@ class SimulatedNode(ABC):
 
     def _receive_nothing_until(self, t_ns: int) -> None:
         self._deaf_until_ns = t_ns
-        self.registers.version += 1
 
     def poke(self, name: str, wire: int) -> None:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""

@@ -64,5 +64,5 @@ class Protocol1Servo(SimulatedServo):
         if "goal_position" in names and self.wakes_on_goal and "torque_enable" not in names:
             registers["torque_enable"] = 1
         if "torque_limit" in names and registers["torque_limit"] > 0:
-            self._overload(False)
+            self.overload = False
         super()._written(names)

@@ -13,6 +13,7 @@ from enum import IntFlag, unique
 from dxlrun.dynamixel.control_table import ControlItem
 from dxlrun.simulation.servo.access import OperatingMode, torque_rules, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory, Run
+from dxlrun.simulation.servo.node import Answer
 from dxlrun.simulation.servo.shaft import Shaft
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
@@ -95,9 +96,11 @@ class Protocol2Servo(SimulatedServo):
             self._stays_out(read)
         return known
 
-    def _read(self, address: int, length: int) -> bytes | None:
-        """Return bytes of the table, None where no item is."""
-        return super()._read(address, length) if self.registers.touches(address, length) else None
+    def _answer_read(self, address: int, length: int) -> Answer:
+        """Return data, or an access error where no item is."""
+        if self.registers.touches(address, length):
+            return super()._answer_read(address, length)
+        return ErrorNumber.ACCESS, b""
 
     def _manage(self, packet: InstructionPacket) -> int:
         """Obey what is not reading or writing; an instruction error for what it does not know.

@@ -25,9 +25,6 @@ from dxlrun.simulation.wire.packets import Instruction, InstructionPacket
 BOOT_NS = 100_000_000
 """How long a servo receives nothing after a reboot; no manual names it [i]."""
 
-_BY_TIME = frozenset(("realtime_tick",))
-"""What shows something else at another time, though no servo moves and nothing is written."""
-
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
@@ -66,7 +63,7 @@ class SimulatedServo(SimulatedNode):
     def advance(self, now_ns: int) -> None:
         """Bring the shaft and the present registers to a time; going back is ignored."""
         self.shaft.advance(now_ns)
-        self._refresh()
+        self.registers.refresh()
 
     def receives(self, now_ns: int) -> bool:
         """Take an instruction on the line at a time; return whether it reaches the servo."""
@@ -141,9 +138,6 @@ class SimulatedServo(SimulatedNode):
             "realtime_tick": lambda: (self.shaft.now_ns - self._started_ns) // 1_000_000 % 32768,
         }
 
-    def _by_time(self) -> frozenset[str]:
-        return _BY_TIME
-
     def _shown_voltage(self, name: str) -> int:
         drawn = abs(self.shaft.duty * self.shaft.current)
         return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
@@ -151,27 +145,19 @@ class SimulatedServo(SimulatedNode):
     def _strained(self) -> None:
         """It became warmer or colder by a degree, or was overloaded for too long."""
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
-            self._overload(True)
+            self.overload = True
             self.note(f"servo {self.servo_id}: overload, it does not hold its load")
         self.protect()
-
-    def _overload(self, on: bool) -> None:
-        self.overload = on
-        self.registers.version += 1
-
-    def _refresh(self) -> None:
-        for name, show in self._live.items():
-            self.registers.show(name, show())
 
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, the shaft stays where it is."""
         self._registered = None
-        self._overload(False)
+        self.overload = False
         self.registers.restore_ram()
         self.shaft.power_up()
         self._start_up()
         self.protect()
-        self._refresh()
+        self.registers.refresh()
 
     # What tests see and faults do
 
@@ -224,7 +210,7 @@ class SimulatedServo(SimulatedNode):
 
         It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
         """
-        self._overload(True)
+        self.overload = True
         self.note(f"servo {self.servo_id}: overload")
         self.protect()
 
