@@ -246,10 +246,18 @@ def make_line2() -> Callable[..., Line]:
     return make
 
 
-@pytest.fixture(params=[1.0, 2.0])
-def both(request: Any, make_line: Callable[..., Line], make_line2: Callable[..., Line]) -> Line:
+@pytest.fixture
+def line_of(make_line: Callable[..., Line], make_line2: Callable[..., Line]) -> Callable[..., Line]:
+    """Return a line of Protocol 1 or 2."""
+    return lambda protocol, *ids_and_model, **settings: (make_line if protocol == 1 else make_line2)(
+        *ids_and_model, **settings
+    )
+
+
+@pytest.fixture(params=[1, 2])
+def both(request: Any, line_of: Callable[..., Line]) -> Line:
     """A line of each protocol."""
-    return (make_line if request.param == 1.0 else make_line2)()
+    return line_of(request.param)
 
 
 @pytest.fixture

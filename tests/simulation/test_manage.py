@@ -129,21 +129,21 @@ def test_clear_came_with_firmware_42(line2):
     assert line2.request(1, CLEAR, CLEAR_ERROR) == UNKNOWN  # which only the Y series knows
 
 
-def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2):
-    line = make_line2((7,))
-    line.servo(7).poke("firmware_version", 41)
-    line.instruct(BROADCAST, RESET, b"\xff")
-    assert line.bus.servos[0].servo_id == 1
-
-
-@pytest.mark.parametrize("option", [0x01, 0x02])
-def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2, option):
-    for servo_id in (1, 2):
-        line2.set("drive_mode", 1, servo_id)
-    line2.instruct(BROADCAST, RESET, bytes((option,)))
-    assert line2.statuses() == []
-    assert [each.registers["drive_mode"] for each in line2.bus.servos] == [0, 0]
-    assert [each.servo_id for each in line2.bus.servos] == [1, 2]
+@pytest.mark.parametrize(
+    ("option", "firmware", "obeyed", "ids"),
+    [(0x01, 45, True, [1, 2]), (0x02, 45, True, [1, 2]), (0xFF, 45, False, [1, 2]), (0xFF, 41, True, [1, 1])],
+)
+def test_a_reset_of_everything_is_for_all_before_firmware_42_only_and_none_is_answered(
+    make_line2, option, firmware, obeyed, ids
+):
+    line = make_line2((1, 2))
+    for servo in line.bus.servos:
+        servo.poke("firmware_version", firmware)
+        servo.poke("drive_mode", 1)
+    line.instruct(BROADCAST, RESET, bytes((option,)))
+    assert line.statuses() == []
+    assert [each.registers["drive_mode"] for each in line.bus.servos] == [not obeyed] * 2
+    assert [each.servo_id for each in line.bus.servos] == ids
 
 
 def test_a_reboot_of_all_is_not_answered(line2):
@@ -398,3 +398,23 @@ def test_indirect_addresses_of_p_are_eeprom(make_line2):
     assert line.get("indirect_address_1") == 513
     line.set("torque_enable", 1)
     assert line.set("indirect_address_1", 514) == ErrorNumber.ACCESS
+
+
+def test_indirect_data_is_read_and_written_through(line2):
+    for index, address in enumerate((132, 133, 134, 135, 65)):
+        assert line2.set(f"indirect_address_{index + 1}", address) == 0
+    position, led = line2.read_bytes(1, 132, 4), b"\x00"
+    assert line2.read_bytes(1, 224, 5) == position + led
+    assert line2.write_bytes(1, 228, b"\x01") == 0
+    assert line2.get("led") == 1
+    assert line2.write_bytes(1, 224, b"\x00") == ErrorNumber.ACCESS  # present position is read-only
+
+
+def test_a_goal_may_go_through_indirect_data(line2):
+    line2.set("torque_enable", 1)
+    for index in range(4):
+        line2.set(f"indirect_address_{index + 1}", 116 + index)
+    assert line2.write_bytes(1, 224, (3000).to_bytes(4, "little")) == 0
+    line2.wait(2)
+    assert line2.get("present_position") == pytest.approx(3000, abs=3)  # what friction leaves
+    assert line2.write_bytes(1, 224, b"\x00\x00") == ErrorNumber.DATA_LENGTH

@@ -53,51 +53,6 @@ def test_packets_of_the_manual_go_in_and_come_out(make_line2):
     assert line.receive() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
 
 
-@pytest.mark.parametrize(
-    ("instruction", "parameters", "error"),
-    [
-        (0x07, b"", ErrorNumber.INSTRUCTION),
-        (READ, b"\x84\x00\x04", ErrorNumber.INSTRUCTION),
-        (WRITE, b"\x40\x00", ErrorNumber.INSTRUCTION),
-        (ACTION, b"", ErrorNumber.INSTRUCTION),
-        (RESET, b"\x03", ErrorNumber.INSTRUCTION),
-        (CLEAR, b"\x01\x44\x58\x4c\x23", ErrorNumber.INSTRUCTION),
-        (SYNC_WRITE, b"\x41\x00\x01\x00\x01\x01", ErrorNumber.INSTRUCTION),  # not to all
-        (READ, b"\x00\x03\x01\x00", ErrorNumber.ACCESS),
-        (READ, b"\x84\x00\x00\x00", ErrorNumber.ACCESS),
-        (WRITE, b"\x0f\x00\x01", ErrorNumber.ACCESS),  # no item
-        (WRITE, b"\x84\x00\x00\x00\x00\x00", ErrorNumber.ACCESS),  # read-only
-        (WRITE, b"\x40\x00\x02", ErrorNumber.DATA_RANGE),
-        (WRITE, b"\x74\x00\x00\x10\x00\x00", ErrorNumber.DATA_RANGE),  # goal 4096
-        (WRITE, b"\x74\x00\x00\x00", ErrorNumber.DATA_LENGTH),
-        (WRITE, b"\x75\x00\x00\x00\x00", ErrorNumber.DATA_LENGTH),
-        (WRITE, b"\x41\x00\x01\x00\x00", ErrorNumber.ACCESS),  # LED, then cells of no item
-    ],
-)
-def test_errors_of_the_manual(line2, instruction, parameters, error):
-    before = line2.read_bytes(1, 0, 147 - 27)
-    assert line2.request(1, instruction, parameters) == (1, error, b"")
-    assert line2.read_bytes(1, 0, 147 - 27) == before
-    assert any("refuses" in note for note in line2.notes())
-
-
-@pytest.mark.parametrize(("answers", "replied"), [(False, []), (True, [(1, ErrorNumber.CRC, b"")])])
-def test_a_wrong_crc_is_not_obeyed(line2, answers, replied):
-    line2.servo().answers_damaged = answers
-    line2.ports.ports[0].write(bytes.fromhex("fffffd00 01 0600 03 410001 0000"))
-    assert line2.statuses() == replied
-    assert line2.get("led") == 0
-
-
-def test_goals_beyond_a_limit_are_limit_errors(line2):
-    line2.put(max_position_limit=3000, min_position_limit=1000)
-    assert [line2.set("goal_position", each) for each in (999, 1000, 3000, 3001)] == [6, 0, 0, 6]
-    assert line2.set("velocity_limit", 100) == 0
-    assert [line2.set("goal_velocity", each) for each in (-101, -100, 100, 101)] == [6, 0, 0, 6]
-    assert line2.set("pwm_limit", 500) == 0
-    assert line2.set("goal_pwm", 501) == ErrorNumber.DATA_LIMIT
-
-
 def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2):
     line2.put(operating_mode=4, goal_position=100_000)
     line2.put(goal_position=0, operating_mode=3)
@@ -107,12 +62,6 @@ def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(lin
     assert line2.set("goal_position", 1000) == 0
 
 
-def test_torque_locks_the_eeprom_and_nothing_else(line2):
-    assert line2.set("torque_enable", 1) == 0
-    assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS
-    line2.put(led=1, torque_enable=0, return_delay_time=0)
-
-
 def test_sync_write_and_bulk_write_give_each_its_own(line2):
     line2.instruct(BROADCAST, SYNC_WRITE, bytes.fromhex("74000400 01 96000000 02 aa000000"))
     assert [line2.get("goal_position", each) for each in (1, 2)] == [150, 170]
@@ -120,22 +69,6 @@ def test_sync_write_and_bulk_write_give_each_its_own(line2):
     assert line2.get("max_voltage_limit", 1) == 155
     assert line2.get("temperature_limit", 2) == 70
     assert line2.statuses() == []
-
-
-@pytest.mark.parametrize(
-    ("instruction", "parameters"),
-    [
-        (SYNC_WRITE, "41000100 01 01 02"),
-        (SYNC_WRITE, "41000000 01"),
-        (BULK_WRITE, "01 41000100 01 02 41000100"),
-        (BULK_WRITE, "01 4100"),
-    ],
-)
-def test_writes_to_many_of_a_wrong_length_change_nothing(line2, instruction, parameters):
-    line2.instruct(BROADCAST, instruction, bytes.fromhex(parameters))
-    assert line2.statuses() == []
-    assert line2.get("led") == 0
-    assert any("INSTRUCTION" in note for note in line2.notes())
 
 
 @pytest.mark.parametrize(
@@ -149,13 +82,6 @@ def test_factory_reset_keeps_what_is_asked_for(make_line2, option, servo_id, bau
     assert (servo.servo_id, servo.baud_rate) == (servo_id, baud_rate)
     assert (servo.registers["drive_mode"], servo.registers["return_delay_time"]) == (0, 250)
     assert line.request(servo_id, PING) is None  # it boots, or listens at another rate
-
-
-def test_a_reset_of_everything_is_not_for_all(line2):
-    line2.set("drive_mode", 1)
-    line2.instruct(BROADCAST, RESET, b"\xff")
-    assert line2.statuses() == []
-    assert line2.get("drive_mode") == 1
 
 
 def test_reboot_loses_ram_turns_and_the_time(line2):
@@ -182,14 +108,6 @@ def test_realtime_tick_counts_milliseconds_modulo_32768(line2):
     assert second - first == pytest.approx(1234 + 20, abs=1)  # each answer is waited for 10 ms
     line2.clock.wait_until(asked_ns + 32_768_000_000 - 10_000_000)
     assert line2.get("realtime_tick") == pytest.approx(first, abs=1)
-
-
-def test_startup_configuration_switches_the_torque_on(make_line2):
-    line2 = make_line2((1,), "XL330-M288")
-    line2.set("startup_configuration", 1)
-    line2.servo().reset()
-    assert line2.get("torque_enable") == 1
-    assert line2.servo().torque_on
 
 
 # Protection
