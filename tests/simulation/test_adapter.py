@@ -145,18 +145,6 @@ def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest():
     assert any("sends into" in note for note in notes(bus))
 
 
-def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_works_again():
-    bus = new_bus(AdapterConfig())
-    bus.wedge(True)
-    bus.receive(PING_1, 0)
-    assert handed_over(bus) == []
-    bus.wedge(False)
-    bus.receive(PING_1, 10 * MS)
-    assert [data for _, data in handed_over(bus)] == [PONG_1]
-    assert bus.servo(1).counts.received == 1
-    assert notes(bus)[0] == "adapter wedged"
-
-
 def test_an_unplugged_adapter_loses_what_was_on_its_way():
     bus = new_bus(AdapterConfig())
     bus.receive(PING_1, 0)
@@ -188,21 +176,6 @@ def test_a_port_does_not_outlive_its_adapter_though_it_comes_back():
 # Hooks for faults
 
 
-def test_what_the_servos_receive_of_an_instruction_can_be_changed_or_lost():
-    bus = new_bus(AdapterConfig())
-    bus.alter_next_instruction("lost", lambda packet: b"")
-    bus.alter_next_instruction("byte 5 flipped", lambda packet: packet[:5] + bytes((packet[5] ^ 1,)))
-    received = []
-    for turn in range(3):
-        bus.receive(PING_1, turn * 10 * MS)
-        received.append(b"".join(data for _, data in handed_over(bus, (turn + 1) * 10 * MS - 1)))
-    assert received == [b"", b"", PONG_1]
-    assert notes(bus)[:2] == [
-        "the servos receive another instruction: lost",
-        "the servos receive another instruction: byte 5 flipped",
-    ]
-
-
 def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_ends_it():
     bus = new_bus(AdapterConfig())
     bus.alter_next_instruction("cut", lambda packet: packet[:4])
@@ -227,17 +200,6 @@ def test_something_can_be_planned_after_so_many_instructions(make_packet):
     assert happened == ["now", "one"]
     bus.receive(PING_1, MS)
     assert happened == ["now", "one", "two"]
-
-
-def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collides():
-    bus = new_bus(AdapterConfig())
-    bus.add_servo(ServoConfig(7, "AX-12A", 1.0))
-    bus.receive(bytes.fromhex("ff ff 07 02 01 f5"), 0)
-    assert handed_over(bus)[0][1] == bytes.fromhex("ff ff 07 02 00 f6")
-    bus.add_servo(ServoConfig(1, "AX-12A", 1.0))
-    bus.receive(READ_1, 10 * MS)
-    reply = handed_over(bus)[0][1]
-    assert sum(reply[2:]) & 0xFF != 0xFF
 
 
 def test_each_servo_counts_instructions_and_replies(make_packet):
@@ -300,15 +262,3 @@ def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2
     twin.poke("id", 9)  # on the line of its own from now on
     sync_read(line)
     assert [each.servo_id for each in line.statuses()] == [1, 2, 3]
-
-
-def test_a_servo_that_changes_its_id_or_rate_is_found_under_the_new_one_only(make_line2):
-    line = make_line2((1,))
-    assert line.request(9, 0x01) is None
-    assert line.set("id", 9) == 0
-    assert line.request(1, 0x01) is None
-    assert line.request(9, 0x01) is not None
-    line.bus.change_rate(57_600)
-    assert line.request(9, 0x01) is None
-    line.servo(9).poke("baud_rate", 1)
-    assert line.request(9, 0x01) is not None

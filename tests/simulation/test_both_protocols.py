@@ -115,6 +115,17 @@ def test_a_list_of_writes_of_a_wrong_length_changes_nothing(line_of, word, instr
     assert any("INSTRUCTION" in note for note in line.notes())
 
 
+def test_a_pause_inside_an_instruction_ends_it(both, make_packet, make_packet2):
+    ping, most_ns = (make_packet(1, 1), 100_000_000) if both.WORD == 1 else (make_packet2(1, 1), 1_500_000)
+    at_ns = 0
+    for pause_ns, answered in ((most_ns, True), (most_ns + 1, False)):
+        both.bus.receive(ping[:3], at_ns)
+        both.bus.receive(ping[3:], at_ns + 30_000 + pause_ns)
+        at_ns += 10**9
+        assert (both.bus.take(at_ns) != b"") == answered
+    assert both.notes() == ["an instruction of 3 bytes was broken off"]
+
+
 def test_reg_write_waits_for_action(both):
     registered = "registered" if both.WORD == 1 else "registered_instruction"
     for servo_id in (1, 2):

@@ -52,25 +52,6 @@ def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet):
     assert int.from_bytes(reply[5:7], "little") < int.from_bytes(later[5:7], "little")
 
 
-def test_a_pause_of_more_than_100_ms_ends_an_instruction():
-    bus = new_bus()
-    bus.receive(PING_1[:3], 0)
-    bus.receive(PING_1[3:], 30_000 + 100_000_000)
-    assert bus.take(10**12) == PONG_1
-    bus.receive(PING_1[:3], 200_000_000)
-    bus.receive(PING_1[3:], 200_030_000 + 100_000_001)
-    assert bus.take(10**12) == b""
-    assert [entry.note for entry in bus.ledger.entries if entry.note] == [
-        "an instruction of 3 bytes was broken off"
-    ]
-
-
-def test_noise_before_an_instruction_is_passed_over():
-    bus = new_bus()
-    bus.receive(b"\x00\xff\x17\xff\xff" + PING_1, 0)
-    assert bus.take(10**12) == PONG_1
-
-
 def test_two_instructions_in_one_write_are_both_obeyed(make_packet):
     bus = new_bus()
     bus.receive(make_packet(0xFE, 3, 25, 1) + PING_1, 0)

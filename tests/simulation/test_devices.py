@@ -31,6 +31,14 @@ def line(make_line2, make_line):
     return make
 
 
+def inject(wire, text: str) -> str:
+    """Let a fault happen now; return its line."""
+    script = FaultScript([fault := parse_fault(text)])
+    script.attach((wire.bus,), now_ns=wire.clock.now_ns())
+    wire.wait(0.001)
+    return str(fault)
+
+
 def words(*values: int) -> bytes:
     return b"".join(value.to_bytes(2, "little") for value in values)
 
@@ -135,15 +143,13 @@ def test_states_say_what_is_measured(line):
 def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis, seen):
     wire = line(DeviceConfig(241, "bitbots-imu"))
     imu = wire.bus.device(241)
-    script = FaultScript([])
-    script.attach((wire.bus,), start_ns=wire.clock.now_ns())
 
     def read() -> tuple[list[float], list[float], tuple[float, float, float]]:
         values = struct.unpack("<10f", wire.read_bytes(241, 36, 40))
         return [*values[:3]], [*values[3:6]], imu.world.roll_pitch_yaw
 
     turn = [1.0 if index == seen else 0.0 for index in range(3)]
-    script.add(parse_fault(f"tip servo=241 by=60deg about={axis} for=500ms"), wire.clock.now_ns())
+    inject(wire, f"tip servo=241 by=60deg about={axis} for=500ms")
     wire.wait(0.25)
     rates, _, angles = read()
     assert rates == pytest.approx([2 * math.radians(60) * each for each in turn], abs=1e-5)
@@ -161,9 +167,9 @@ def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis, seen):
         assert pull == pytest.approx([9.80665 * each for each in down[axis]], abs=1e-4)
         if times == 1:
             assert angles == pytest.approx([tipped * each for each in turn], abs=1e-6)
-        script.add(parse_fault(f"tip servo=241 by=60deg about={axis} for=500ms"), wire.clock.now_ns())
+        inject(wire, f"tip servo=241 by=60deg about={axis} for=500ms")
     with pytest.raises(InputError, match="1 on bus main is a servo, so tip cannot happen to it"):
-        script.add(parse_fault("tip servo=1 by=60deg"), wire.clock.now_ns())
+        inject(wire, "tip servo=1 by=60deg")
     assert str(parse_fault("tip servo=241 by=-1rad")) == "tip servo=241 by=-57.29577951308232deg"
 
 
@@ -199,33 +205,27 @@ def test_values_end_at_the_range_of_the_item(line):
 
 def test_faults_happen_to_devices_too(line):
     wire = line(DeviceConfig(241, "bitbots-imu"))
-    script = FaultScript([])
-    script.attach((wire.bus,), start_ns=wire.clock.now_ns())
-    script.add(parse_fault("silence servo=241 for=50ms"), wire.clock.now_ns())
+    inject(wire, "silence servo=241 for=50ms")
     assert wire.request(241, PING) is None
     wire.wait(0.1)
     assert wire.request(241, PING) is not None
-    script.add(parse_fault("other_model servo=241 number=7"), wire.clock.now_ns())
-    wire.wait(0.001)
+    inject(wire, "other_model servo=241 number=7")
     assert wire.request(241, PING).parameters[:2] == words(7)
-    script.add(parse_fault("lose servo=241"), wire.clock.now_ns())
-    wire.wait(0.001)
+    inject(wire, "lose servo=241")
     assert wire.request(241, PING) is None
     wire.write_bytes(241, 10, b"\x09")
-    script.add(parse_fault("reboot servo=241 for=50ms"), wire.clock.now_ns())
+    inject(wire, "reboot servo=241 for=50ms")
     wire.wait(0.1)
     assert wire.read_bytes(241, 10, 1) == b"\x00", "RAM is lost"
     with pytest.raises(InputError, match="241 on bus main is no servo, so turn cannot happen to it"):
-        script.add(parse_fault("turn servo=241 by=10deg"), wire.clock.now_ns())
+        inject(wire, "turn servo=241 by=10deg")
     with pytest.raises(InputError, match="its servos are 1, its other devices 241"):
-        script.add(parse_fault("lose servo=5"), wire.clock.now_ns())
+        inject(wire, "lose servo=5")
 
 
 def test_the_voltage_of_the_line_is_shown(line):
     wire = line(DeviceConfig(42, "bitbots-core"))
-    script = FaultScript([])
-    script.attach((wire.bus,), start_ns=wire.clock.now_ns())
-    script.add(parse_fault("voltage volts=15 for=50ms"), wire.clock.now_ns())
+    inject(wire, "voltage volts=15 for=50ms")
     wire.wait(0.01)
     assert wire.read_bytes(42, 32, 2) == words(776), "15 V * 1024 / 19.8 V"
     wire.wait(0.1)

@@ -1,4 +1,4 @@
-"""Replies to a group read that are sent ahead, cached or handed over together: as those one by one."""
+"""Replies to a group read that are sent ahead or handed over together: as those one by one."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_gathered_replies_are_in_the_ledger_as_single_ones(seed, absent):
 
 @pytest.mark.parametrize("absent", ["silent", "slot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_replies_sent_ahead_or_cached_are_those_that_are_decided_one_by_one(seed, absent):
+def test_replies_sent_ahead_are_those_that_are_decided_one_by_one(seed, absent):
     def entries(one_by_one: bool) -> list[LedgerEntry]:
         return entries_of(seed, absent, SimulatedBus.next_due_ns, midway=True, one_by_one=one_by_one)[0]
 

@@ -264,15 +264,11 @@ def test_an_l42_counts_as_an_ax_does(make_line2):
     assert line.get("present_velocity") == pytest.approx(100, abs=2)
 
 
-def test_an_rh_p12_before_a_closes(make_line2):
-    line = make_line2((1,), "RH-P12-RN", position=0.0)
-    assert move(line, 740) == pytest.approx(740, abs=5)
+@pytest.mark.parametrize(("model", "rest"), [("RH-P12-RN", 5), ("RH-P12-RN(A)", REST)])
+def test_an_rh_p12_closes(make_line2, model, rest):
+    line = make_line2((1,), model, position=0.0)
+    assert move(line, 740) == pytest.approx(740, abs=rest)
     assert line.set("goal_position", 1151) == ErrorNumber.DATA_RANGE
-
-
-def test_an_rh_p12_closes(make_line2):
-    line = make_line2((1,), "RH-P12-RN(A)", position=0.0)
-    assert move(line, 740) == near(740)
 
 
 def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):
