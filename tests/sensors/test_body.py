@@ -15,7 +15,7 @@ from dxlrun.contract.body import Shafts
 from dxlrun.plan.simulation_plan import NO_LOAD, SensedBodies
 from dxlrun.run.sensor_process import RemoteBody
 from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
-from dxlrun.simulation.motion.body import SensedBody, ShaftLook, ShaftsShown, SimulatedBody, quaternion
+from dxlrun.simulation.motion.body import SensedBody, ShaftsShown, SimulatedBody, quaternion
 from dxlrun.simulation.motion.control_law import LIMP
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor
@@ -136,7 +136,7 @@ def test_the_body_in_another_process_moves_as_in_this_one():
     memory = slot.private(9)
     shown = ShaftsShown(mechanics, SlotWriter(memory))
     remote = RemoteBody(sensed, SlotReader(memory))
-    here = SensedBody(SimulatedBody(sensed), ShaftLook(mechanics, 3), lambda: mechanics.grid_ns)
+    here = SensedBody(sensed, mechanics, lambda: mechanics.grid_ns)
     for index in range(3):
         command = LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.2 * (index + 1))
         mechanics.command(index, command)
@@ -153,8 +153,8 @@ def test_the_body_in_another_process_moves_as_in_this_one():
 def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest():
     mechanics = Mechanics(0)
     mechanics.add(ROTOR, NO_LOAD, 0.0)
-    body = SimulatedBody(SensedBodies(UrdfBodies(CRANE, (UrdfJoint("turn", 0.0, 1.0),))))
-    here = SensedBody(body, ShaftLook(mechanics, 1), lambda: mechanics.grid_ns)
+    sensed = SensedBodies(UrdfBodies(CRANE, (UrdfJoint("turn", 0.0, 1.0),)))
+    here = SensedBody(sensed, mechanics, lambda: mechanics.grid_ns)
     mechanics.command(0, LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.5))
     before = 0.0
     for step in range(1, 20):

@@ -37,7 +37,7 @@ from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_sign
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.on_links import fix_to_links
-from dxlrun.simulation.motion.body import SensedBody, ShaftLook, SimulatedBody
+from dxlrun.simulation.motion.body import SensedBody
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.virtual_ports import VirtualPorts
 
@@ -124,8 +124,7 @@ class VirtualRobot:
         bodies = sensed_bodies(self.plan)
         body = None
         if bodies is not None:
-            look = ShaftLook(mechanics, len(bodies.bodies.joints))
-            body = SensedBody(SimulatedBody(bodies), look, self.clock.now_ns)
+            body = SensedBody(bodies, mechanics, self.clock.now_ns)
         slots = []
         self.sensors: dict[str, Sensor[Any]] = {}
         """Those of the plan, by name, as their plug-ins made them."""

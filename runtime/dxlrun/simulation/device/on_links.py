@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from dxlrun.contract.body import LinkMotion
+from dxlrun.contract.body import LinkMotion, Shafts
 from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.device.measured import STANDARD_GRAVITY, Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice
-from dxlrun.simulation.motion.body import ShaftLook, SimulatedBody
+from dxlrun.simulation.motion.body import SimulatedBody
 from dxlrun.simulation.motion.mechanics import Mechanics
 
 
@@ -19,27 +19,28 @@ def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sense
 
     Raises KeyError for a link that the URDF does not have.
     """
-    body, look = SimulatedBody(sensed), ShaftLook(mechanics, len(sensed.bodies.joints))
+    body, count = SimulatedBody(sensed), len(sensed.bodies.joints)
+    mechanics.sense()
     for device in devices:
         if device.link:
             body.motion(device.link)
-            device.world.update = _Feeling(device, body, look)
+            device.world.update = _feeling(device, body, lambda t_ns: mechanics.shafts(t_ns, count))
 
 
-class _Feeling:
-    """Brings what one device measures to its time, once for all items of a reading."""
+def _feeling(
+    device: SimulatedDevice, body: SimulatedBody, shafts: Callable[[int], Shafts]
+) -> Callable[[], None]:
+    """Return what brings what a device measures to its time, once for all items of a reading."""
+    at_ns = -1
 
-    def __init__(self, device: SimulatedDevice, body: SimulatedBody, look: ShaftLook) -> None:
-        self._device, self._body, self._look = device, body, look
-        self._at_ns = -1
+    def update() -> None:
+        nonlocal at_ns
+        if device.now_ns != at_ns:
+            at_ns = device.now_ns
+            body.move(shafts(at_ns))
+            feel(device.world, body.motion(device.link))
 
-    def __call__(self) -> None:
-        device = self._device
-        if device.now_ns == self._at_ns:
-            return
-        self._at_ns = device.now_ns
-        self._body.move(self._look.at(device.now_ns))
-        feel(device.world, self._body.motion(device.link))
+    return update
 
 
 def feel(world: Measured, motion: LinkMotion) -> None:

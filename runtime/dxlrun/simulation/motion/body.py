@@ -145,29 +145,6 @@ def _moved(sensed: SensedBodies) -> tuple[tuple[str, ...], Floats, Floats]:
     return tuple(names), np.array(rows).reshape(-1, count), np.array(offsets)
 
 
-class ShaftLook:
-    """Looks at the shafts of a simulation: their angles, speeds and accelerations at a time."""
-
-    def __init__(self, mechanics: Mechanics, count: int) -> None:
-        """`count` shafts, the first ones."""
-        self._mechanics = mechanics
-        self._count = count
-        mechanics.sense()
-
-    def at(self, now_ns: int) -> Shafts:
-        """Return them; between two points of the mechanics' grid they go on with their velocity."""
-        mechanics, count = self._mechanics, self._count
-        mechanics.advance(now_ns)
-        velocity = mechanics.plant.velocity[:count].copy()
-        ahead_s = max(0, now_ns - mechanics.grid_ns) * 1e-9
-        return Shafts(
-            now_ns,
-            mechanics.plant.angle[:count] + velocity * ahead_s,
-            velocity,
-            mechanics.acceleration[:count].copy(),
-        )
-
-
 class ShaftsShown:
     """Leaves in a slot how the shafts move, for processes of sensors, after each step of the mechanics."""
 
@@ -192,12 +169,15 @@ class ShaftsShown:
 class SensedBody:
     """The body of a simulation in this process, as it is now."""
 
-    def __init__(self, body: SimulatedBody, look: ShaftLook, now_ns: Callable[[], int]) -> None:
-        self._body, self._look, self._now_ns = body, look, now_ns
+    def __init__(self, sensed: SensedBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
+        """Raises InputError for a URDF that is wrong."""
+        self._body, self._mechanics, self._now_ns = SimulatedBody(sensed), mechanics, now_ns
+        self._count = len(sensed.bodies.joints)
+        mechanics.sense()
 
     def motion(self, link: str) -> LinkMotion:
         """Return how a link moves now. Raises KeyError for one that the URDF does not have."""
-        self._body.move(self._look.at(self._now_ns()))
+        self._body.move(self._mechanics.shafts(self._now_ns(), self._count))
         return self._body.motion(link)
 
 

@@ -17,6 +17,7 @@ from importlib.metadata import entry_points
 import msgspec
 import numpy as np
 
+from dxlrun.contract.body import Shafts
 from dxlrun.plan.simulation_plan import Coupling, Load, UrdfBodies
 from dxlrun.simulation.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
 from dxlrun.simulation.motion.coupled_joints import joints_without_bodies
@@ -187,6 +188,13 @@ class Mechanics:
         if self.still or self._before is None or len(self._before) != len(self._motors):
             return np.zeros(len(self._motors))
         return (self.plant.velocity - self._before) / (STEP_NS * 1e-9)
+
+    def shafts(self, now_ns: int, count: int) -> Shafts:
+        """Return the first shafts at a time; between points of the grid they go on with their velocity."""
+        self.advance(now_ns)
+        velocity = self.plant.velocity[:count].copy()
+        angle = self.plant.angle[:count] + velocity * (max(0, now_ns - self.grid_ns) * 1e-9)
+        return Shafts(now_ns, angle, velocity, self.acceleration[:count].copy())
 
     # Time
 

@@ -29,6 +29,8 @@ class Cells(NamedTuple):
     eeprom: bool  # True when one of the items is in the EEPROM area
     single: str
     """Name of the item that they are, whole, where none of them is Indirect Data; else empty."""
+    live: tuple[tuple[str, Callable[[], int]], ...]
+    """What shows something else whenever it is looked at, and what it shows now."""
 
 
 class Run(NamedTuple):
@@ -63,7 +65,6 @@ class Memory:
         self._places = {item.name: _place(item) for item in table.items.values()}
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self._live: dict[str, Callable[[], int]] = {}
-        self._live_at: dict[tuple[int, int], tuple[tuple[str, Callable[[], int]], ...]] = {}
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -125,12 +126,12 @@ class Memory:
     def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
         """Let items of the model show what functions return: worked out when they are read, not before."""
         self._live = {name: show for name, show in live.items() if name in self}
-        self._live_at.clear()
+        self._cells_at.clear()
 
     def show_no_more(self, name: str) -> None:
         """Let an item keep what it has."""
         self._live.pop(name, None)
-        self._live_at.clear()
+        self._cells_at.clear()
 
     def refresh(self) -> None:
         """Set all live items to what they show now."""
@@ -163,15 +164,7 @@ class Memory:
         return b"".join(self._cells_now(target, last - first) for target, first, last in places)
 
     def _cells_now(self, address: int, length: int) -> bytes:
-        live = self._live_at.get((address, length))
-        if live is None:
-            if len(self._live_at) >= _CELLS_KEPT:
-                self._live_at.clear()
-            cells = range(address, address + length)
-            items = {item.name: None for cell in cells if (item := self._item_at.get(cell)) is not None}
-            live = tuple((name, self._live[name]) for name in items if name in self._live)
-            self._live_at[address, length] = live
-        for name, show in live:
+        for name, show in self.cells(address, length).live:
             wire = show()
             if wire != self._values[name]:
                 self.show(name, wire)
@@ -220,6 +213,7 @@ class Memory:
                 single=names[0] if whole and direct and len(names) == 1 else "",
                 read_only=any(item.access == "R" for item in items),
                 eeprom=any(item.area == "EEPROM" for item in items),
+                live=tuple((name, self._live[name]) for name in dict.fromkeys(owned) if name in self._live),
             )
             if len(self._cells_at) >= _CELLS_KEPT:
                 self._cells_at.clear()
