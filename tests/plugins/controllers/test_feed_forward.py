@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from pydantic import ValidationError
 from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
@@ -209,22 +208,6 @@ def test_the_state_is_published_fifty_times_a_second() -> None:
     topic, state = robot.messages[-1]
     assert topic == "state"
     assert state.duty == pytest.approx([0.0, HOLD])
-
-
-@pytest.mark.parametrize(
-    ("more", "what"),
-    [
-        ({"pass_on": True}, "positions are commanded already; take pass_on out"),
-        ({"scale": 1.5}, "less than or equal to 1"),
-        ({"scale": {"c": 1.0}}, "scale names c, which is not one of its joints"),
-        ({"most": 0.0}, "greater than 0"),
-        ({"friction_speed": "0 rad/s"}, "greater than 0"),
-        ({"command_interface": "velocity"}, "position"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(more: dict[str, object], what: str) -> None:
-    with pytest.raises(ValidationError, match=what):
-        FeedForwardParameters.model_validate(TWO | more)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from tests.kit.stages import Stage
 
 from dxlrun import Outcome
@@ -57,23 +56,6 @@ def outcomes(robot):
 def seen(robot, times, **options):
     """Return the positions that are commanded at these times, shape (times, joints)."""
     return np.array([robot.update(time, **options) for time in times])
-
-
-@pytest.mark.parametrize(
-    ("interface", "claims"),
-    [
-        ("position", ("position",)),
-        ("posvel", ("position", "velocity")),
-        ("velocity", ("velocity",)),
-        ("effort", ("effort",)),
-    ],
-)
-def test_what_it_claims(interface, claims):
-    gains = {"gains": {"p": 1.0}} if interface in ("velocity", "effort") else {}
-    found = Stage(
-        JointTrajectoryController, TWO | {"command_interface": interface} | gains, others=("c",)
-    ).interfaces
-    assert (found.joints, found.command) == (("a", "b"), claims)
 
 
 def test_it_holds_until_its_first_command():
@@ -202,45 +184,6 @@ def test_times_may_have_units():
     np.testing.assert_array_equal(*written)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"points": one(1, 2)}, r"2 positions in point 1 for 1 joints \(a\)"),
-        ({"points": [one(1)[0] | {"velocities": []}]}, "0 velocities in point 1"),
-        ({"points": one(1) * 2}, "the times of a trajectory must grow: point 2 is at 1 s"),
-        ({"points": []}, "validation error"),
-        ({"points": one(1, time=-1)}, "validation error"),
-        ({"points": one(1, time="1 deg")}, "validation error"),
-        ({"points": one(1), "joints": ["c"]}, r"c is not one of its joints \(a\)"),
-        ({"points": one(1, 1), "joints": ["a", "a"]}, "joints names a twice"),
-    ],
-)
-def test_a_trajectory_that_does_not_fit_is_refused_in_words(wrong, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        started().prepare("trajectory", **wrong)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"command_interface": "effort"}, "effort needs gains"),
-        ({"gains": {"p": 1.0}}, "gains count only for velocity and effort"),
-        ({"tolerances": {"path": {"c": "1 deg"}}}, "tolerances.path names c"),
-        ({"deceleration": "0 rad/s^2"}, "greater than 0"),
-        ({"speed": -0.1}, "greater than or equal to 0"),
-    ],
-)
-def test_wrong_parameters_are_refused_in_words(wrong, sentence):
-    with pytest.raises(ValidationError, match=sentence):
-        JointTrajectoryController.Parameters.model_validate(TWO | wrong)
-
-
-def test_parameters_survive_the_plan():
-    model = started(GOAL | POSVEL).model
-    assert model.tolerances.goal_time == 500_000_000
-    assert JointTrajectoryController.Parameters.model_validate_json(model.model_dump_json()) == model
-
-
 # Interfaces with a law of their own
 
 
@@ -293,17 +236,6 @@ def test_at_rest_an_effort_holds_the_joint_against_its_load():
     robot.change(0.0, gains={"p": 4.0})
     robot.update(0.02, follow=False)
     assert robot.commands.effort[0] == pytest.approx(0.2)
-
-
-def test_activated_again_it_has_forgotten_what_it_was_doing():
-    robot = moving(TWO, to=(1.3, 0.8))
-    robot.update(0.5)
-    robot.send(0.5, "trajectory", joints=["b"], points=one(0.8, time=9))
-    robot.update(0.51)
-    robot.controller.on_deactivate(510_000_000)
-    robot.sent.position[:] = robot.states.position[:] = 0.1, 0.2
-    robot.activate()
-    np.testing.assert_array_equal(seen(robot, (2.0, 2.5, 9.0)), [[0.1, 0.2]] * 3)
 
 
 def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest():

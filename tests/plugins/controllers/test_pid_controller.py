@@ -4,7 +4,6 @@ from typing import Annotated
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from tests.kit.stages import Stage
 
 from dxlrun import LIVE, ParametersModel
@@ -43,21 +42,6 @@ class Law(Stage):
 
 def started(**more):
     return Law(**more).activate()
-
-
-@pytest.mark.parametrize(
-    ("more", "command", "reference"),
-    [
-        ({}, "effort", ("position", "velocity", "effort")),
-        ({"command_interface": "velocity"}, "velocity", ("position", "velocity")),
-        (POSITION, "position", ("position", "velocity")),
-        (VELOCITY | {"command_interface": "pwm"}, "pwm", ("velocity", "pwm")),
-        (VELOCITY, "effort", ("velocity", "effort")),
-    ],
-)
-def test_what_it_claims_and_exports(more, command, reference):
-    found = Law(**more).interfaces
-    assert (found.joints, found.command, found.reference) == (("a", "b"), (command,), reference)
 
 
 def test_it_is_the_joint_position_controller_too():
@@ -145,17 +129,6 @@ def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limi
     assert robot.commanded()[0] < 0.5  # it did not wind up
 
 
-def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
-    robot = started(**VELOCITY, gains={"d": 1.0}).sees(0.5)
-    robot.references.velocity[:] = 1.0
-    robot.commanded()
-    robot.references.velocity[:] = np.nan
-    robot.activate().give("velocities", velocities=[0.5, 0.5])
-    robot.sees(3.0).commands_are(0.0, 0.0)  # no rate of a velocity of long ago
-    robot.change(gains={"p": 1.0, "d": 1.0})
-    robot.commands_are(-2.5, -2.5)  # the command stands: no reference has ended
-
-
 def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
     robot = started(**POSITION, gains={"p": 0.5}).sees(position=1.0)
     robot.commands_are(1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2)
@@ -227,48 +200,6 @@ def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(interface):
     robot.commands_are(*none)  # held where it was heard
     robot.states.position[0] = 0.9
     robot.commands_are(0.2, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("more", "kind", "values", "sentence"),
-    [
-        (
-            {},
-            "velocities",
-            [0.1, 0.2],
-            "its reference is the position, so it takes positions, not velocities",
-        ),
-        (VELOCITY, "positions", [0.1, 0.2], "so it takes velocities, not positions"),
-        ({}, "positions", [0.1], r"1 positions for 2 joints \(a, b\)"),
-    ],
-)
-def test_a_command_that_does_not_fit_is_refused(more, kind, values, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        started(**more).prepare(kind, **{kind: values})
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"gains": {"p": -1.0}}, "greater than or equal to 0"),
-        ({"gains": {"p": {"c": 1.0}}}, r"gains.p names c, which is not one of its joints \(a, b\)"),
-        ({"output_limit": {"c": 1.0}}, "output_limit names c"),
-        ({"wrap": ["c"]}, "wrap names c"),
-        (VELOCITY | {"wrap": ["a"]}, "velocities do not wrap"),
-        (VELOCITY | POSITION, "cannot be commanded as positions"),
-        ({"gains": {"p": "3 Nm"}}, "valid number"),
-    ],
-)
-def test_wrong_parameters_are_refused_in_words(wrong, sentence):
-    with pytest.raises(ValidationError, match=sentence):
-        PidController.Parameters.model_validate(TWO | wrong)
-
-
-def test_parameters_survive_the_plan():
-    written = TWO | {"gains": {"p": {"a": 1.0}, "d": 0.1}, "derivative_filter": "10 ms", "output_limit": 2.0}
-    model = PidController.Parameters.model_validate(written)
-    assert model.derivative_filter == 10_000_000
-    assert PidController.Parameters.model_validate_json(model.model_dump_json()) == model
 
 
 class TextByJoint(ParametersModel):

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from tests.kit.stages import Stage
 
 from dxlrun import Outcome
@@ -217,29 +216,3 @@ def test_rows_that_come_while_a_table_is_played_end_it(player: Any) -> None:
     stage.send(0.04, "samples", period=0.02, rows=ROWS[3:])
     assert stage.update(0.04).tolist() == ROWS[0]
     assert stage.update(0.06).tolist() == ROWS[3]
-
-
-@pytest.mark.parametrize(
-    ("rows", "sentence"),
-    [
-        ([], "there is no row; give at least one"),
-        ([[0.1, 0.1], [0.1]], r"1 numbers in row 2 for 2 joints \(a, b\)"),
-        ([[0.1, 0.1], [0.1, 0.7]], "row 2 sends b to 0.7 rad, outside of its range of -0.5 to 0.5 rad"),
-    ],
-)
-def test_wrong_rows_are_refused(player: Any, rows: list[list[float]], sentence: str) -> None:
-    stage = player(range={"b": ("-0.5 rad", "0.5 rad")})
-    with pytest.raises(ValueError, match=sentence):
-        stage.prepare("samples", period=0.02, rows=rows)
-    with pytest.raises(ValueError, match=sentence):
-        stage.prepare("rows", rows=rows)
-
-
-def test_wrong_parameters_are_refused() -> None:
-    model = SamplePlayer.Parameters.model_validate
-    with pytest.raises(
-        ValidationError, match=r"the range of a ends at 0\.1 rad, where it begins at 0\.2 rad"
-    ):
-        model({"joints": ["a"], "bounds": {"range": {"a": ["0.2 rad", "0.1 rad"]}}})
-    with pytest.raises(ValidationError, match="c, which is not one of its joints"):
-        model({"joints": ["a"], "bounds": {"range": {"c": ["0.1 rad", "0.2 rad"]}}})

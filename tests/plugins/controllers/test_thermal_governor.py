@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from pydantic import ValidationError
 from tests.kit.stages import Stage
 
 from dxlrun import MotorModel, ServoModel
@@ -20,7 +19,6 @@ from dxlrun_analysis.replay.changes import Setting, with_settings
 from dxlrun_controllers.thermal_governor import (
     SMOOTHING_S,
     ThermalGovernor,
-    ThermalParameters,
     torque_scale,
 )
 
@@ -121,20 +119,6 @@ def test_events_say_once_that_a_servo_is_hot_spent_and_cool() -> None:
     ]
     assert [text.partition("has cooled")[0] for text in robot.said] == [named] * 2
     assert ["below 75" in text for text in robot.said] == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("more", "what"),
-    [
-        ({"hysteresis": -1}, "greater than or equal to 0"),
-        ({"limit": {"c": 60}}, "limit names c, which is not one of its joints"),
-        ({"reach": "0 deg"}, "greater than 0"),
-        ({"command_interface": "velocity"}, "position"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(more: dict[str, object], what: str) -> None:
-    with pytest.raises(ValidationError, match=what):
-        ThermalParameters.model_validate({"joints": ["a", "b"]} | more)
 
 
 ROBOT = """\

@@ -60,24 +60,18 @@ def test_wheels_have_the_speeds_of_their_rims(parameters, linear, angular):
     np.testing.assert_allclose(robot.commands.velocity[count:], (linear + across) / RADIUS)
 
 
-def test_it_claims_the_velocity_of_all_wheels_and_begins_at_rest():
-    robot = standing(DiffDriveController, FOUR)
-    assert robot.interfaces.joints == ("l1", "l2", "r1", "r2")
-    assert robot.interfaces.command == ("velocity",)
-    robot.activate()
+def test_it_begins_at_rest():
+    robot = standing(DiffDriveController, FOUR).activate()
     assert robot.commands.velocity.tolist() == [0.0] * 4
     robot.step()
     assert robot.commands.velocity.tolist() == [0.0] * 4
 
 
-def test_commands_may_have_units_and_must_be_finite():
+def test_commands_may_have_units():
     robot = standing(DiffDriveController, BASE)
     written = robot.prepare("velocity", linear="20 cm/s", angular="90 deg/s")
     np.testing.assert_allclose(written, [0.2, math.pi / 2])
     assert robot.prepare("velocity", linear=0.2).tolist() == [0.2, 0.0]
-    for wrong in ({"linear": float("nan")}, {"linear": "20 deg"}, {"sideways": 1.0}):
-        with pytest.raises(ValueError, match="validation error"):
-            robot.prepare("velocity", **wrong)
 
 
 def test_calibration_changes_the_wheels_apart():
@@ -339,22 +333,6 @@ def test_after_a_long_time_turns_are_not_guessed():
     angles = WheelAngles(1, fastest=6.0, period_ns=20_000_000)
     assert angles.longest_ns == round(math.pi / 12 * 1e9)
     assert WheelAngles(1, fastest=math.nan, period_ns=20_000_000).longest_ns == 40_000_000
-
-
-@pytest.mark.parametrize(
-    ("wrong", "where"),
-    [
-        ({"separation": "0 m"}, "separation"),
-        ({"radius": "33 deg"}, "radius"),
-        ({"left": []}, "left"),
-        ({"linear": {"velocity": "-1 m/s"}}, "linear"),
-        ({"odometry": "gps"}, "odometry"),
-        ({"timeout": "0 s"}, "timeout"),
-    ],
-)
-def test_wrong_parameters_are_refused(wrong, where):
-    with pytest.raises(ValueError, match=where):
-        DiffDriveController.Parameters.model_validate(BASE | wrong)
 
 
 def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known():

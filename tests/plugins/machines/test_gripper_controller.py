@@ -1,7 +1,5 @@
 """gripper_controller: reached, stalled at an object, missed, cancelled; widths by a table."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -41,11 +39,6 @@ def gripping(parameters=GRIPPER):
     """Return one that closes to 0.6 rad, and its goal."""
     robot = begun(parameters)
     return robot, robot.ask("grip", position=0.6)
-
-
-def test_it_claims_the_effort_where_it_limits_it():
-    assert begun().interfaces.command == ("position", "velocity", "effort")
-    assert begun(PLAIN).interfaces.command == ("position", "velocity")
 
 
 def test_it_holds_until_its_first_goal():
@@ -205,40 +198,6 @@ def test_a_width_is_the_inverse_of_its_angle(width, shrinking):
     angle, effort = robot.prepare("grip", width=width)
     assert robot.controller._width(angle) == pytest.approx(width, abs=1e-12)
     assert effort == 0.4
-
-
-@pytest.mark.parametrize(
-    ("parameters", "command", "sentence"),
-    [
-        (GRIPPER, {"width": 0.09}, r"width 0.09 m is not between 0.02 m and 0.078 m"),
-        (PLAIN, {"width": 0.03}, "it has no widths"),
-        (PLAIN, {"position": 0.3, "effort": 0.1}, "no limit of effort"),
-        (GRIPPER, {}, "give either position or width"),
-        (GRIPPER, {"position": 0.1, "width": 0.03}, "give either position or width"),
-        (GRIPPER, {"position": math.nan}, "finite"),
-        (GRIPPER, {"position": 0.1, "effort": -0.1}, "greater than 0"),
-        (GRIPPER, {"position": "30 kg"}, "unit kg"),
-        (GRIPPER, {"position": "30 mm"}, "the position must be an angle"),
-        ({**PLAIN, "speed": "5 mm/s"}, {"position": "30 deg"}, "must be a length, such as 10 mm"),
-    ],
-)
-def test_a_goal_that_makes_no_sense_is_refused_in_words(parameters, command, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        standing(GripperController, parameters).prepare("grip", **command)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"widths": WIDTHS[:1]}, "one width makes no line"),
-        ({"widths": [*WIDTHS, {"angle": "1 rad", "width": "50 mm"}]}, "must all grow, or all shrink"),
-        ({"widths": [WIDTHS[0], WIDTHS[0]]}, "each angle stands once"),
-        ({"effort": 0.0}, "greater than 0"),
-    ],
-)
-def test_wrong_parameters_are_refused(wrong, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        GripperController.Parameters.model_validate(GRIPPER | wrong)
 
 
 def test_what_a_goal_left_behind_ends_with_the_next_and_at_the_activation():

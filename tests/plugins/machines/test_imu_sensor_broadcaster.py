@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from tests.kit.stages import standing
 
 from dxlrun_controllers.laws.madgwick import Madgwick
-from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuParameters, ImuSensorBroadcaster
+from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
 
 Array = NDArray[np.float64]
 G = 9.81
@@ -52,23 +51,6 @@ def about(axis: int, degrees: float) -> Array:
     q = np.zeros(4)
     q[axis], q[3] = math.sin(math.radians(degrees) / 2), math.cos(math.radians(degrees) / 2)
     return q
-
-
-def test_it_reads_and_provides_what_ros2_control_calls_so() -> None:
-    bench = Bench(magnetometer="compass")
-    axes = "xyz"
-    assert bench.names == (
-        *(f"chip/angular_velocity.{axis}" for axis in axes),
-        *(f"chip/linear_acceleration.{axis}" for axis in axes),
-        "chip/age",
-        *(f"compass/magnetic_field.{axis}" for axis in axes),
-        "compass/age",
-    )
-    assert bench.stage.interfaces.provides == (
-        *(f"orientation.{axis}" for axis in "xyzw"),
-        *(f"angular_velocity.{axis}" for axis in axes),
-        *(f"linear_acceleration.{axis}" for axis in axes),
-    )
 
 
 def test_it_is_the_filter_with_the_true_times_of_the_samples() -> None:
@@ -219,20 +201,3 @@ def test_the_gain_changes_in_a_run() -> None:
     for _ in range(100):
         bench.sample(STILL, tilted)
     assert bench.orientation == pytest.approx(about(0, 45.0), abs=0.02)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"orientation": "sensor", "magnetometer": "compass"},
-        {"declination": "3 deg"},
-        {"gain": -0.1},
-        {"mounting": ["0 deg", "0 deg"]},
-        {"timeout": "0 s"},
-        {"covariance": {"orientation": [1.0, 1.0]}},
-        {"covariance": {"orientation": [1.0, 1.0, -1.0]}},
-    ],
-)
-def test_keys_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        ImuParameters.model_validate({"sensor": "chip", **wrong})

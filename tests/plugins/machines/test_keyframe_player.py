@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from tests.kit.stages import standing
 
 from dxlrun import Outcome
@@ -67,19 +66,6 @@ def wave(t):
 
 
 TORQUE = player(wave={"steps": [step(torque={"a": 0.3})]})
-
-
-@pytest.mark.parametrize(
-    ("parameters", "claims"),
-    [
-        (PLAYER, ("position",)),
-        (PLAYER | POSVEL, ("position", "velocity")),
-        (TORQUE, ("position", "effort")),
-        (TORQUE | POSVEL, ("position", "velocity", "effort")),
-    ],
-)
-def test_what_it_claims_depends_on_speeds_and_torques(parameters, claims):
-    assert standing(KeyframePlayer, parameters).interfaces.command == claims
 
 
 def test_poses_are_reached_at_their_times_on_cubics():
@@ -291,50 +277,6 @@ def test_a_live_speed_counts_in_the_middle_of_a_motion():
     robot.change(speed=2.0)
     play(robot, 0.12)
     assert robot.commands.position[0] == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"motion": "wav"}, r"there is no motion 'wav'; there are wave, bow"),
-        ({"motion": "wave", "speed": 0.0}, "validation error"),
-        ({"motion": "wave", "speed": 11}, "validation error"),
-        ({"motion": "wave", "repeat": 0}, "validation error"),
-    ],
-)
-def test_a_goal_that_does_not_fit_is_refused(wrong, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        begun(player(wave=WAVE, bow=WAVE)).prepare("play", **wrong)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        (player(), "at least 1 item"),
-        (player(w=steps()), "at least 1 item"),
-        (player(w=steps({"c": 1.0})), r"step 1 of motion w names c, not one of its joints \(a, b\)"),
-        (player(w={"steps": [step(torque={"c": 1.0})]}), "names c"),
-        (player(w={"steps": [step()], "next": "x"}), "w is followed by x, which is none of its motions"),
-        (
-            player(w={"steps": [step()], "next": "x"}, x={"steps": [step()], "next": "w"}),
-            "in a circle: w -> x -> w",
-        ),
-        (player(w={"steps": [step(time="1 ms")]}), "greater than or equal"),
-        (player(w={"steps": [step(interpolation="bezier")]}), "smooth"),
-        (PLAYER | {"start": "flap"}, "start is flap, which is none of its motions"),
-    ],
-)
-def test_motions_that_make_no_sense_are_refused_in_words(wrong, sentence):
-    with pytest.raises(ValidationError, match=sentence):
-        KeyframePlayer.Parameters.model_validate(wrong)
-
-
-def test_activated_again_it_holds():
-    robot = playing()
-    play(robot, 0.3)
-    robot.controller.on_deactivate(robot.time_ns)
-    robot.sent.position[:] = robot.states.position[:] = 0.1, 0.2
-    np.testing.assert_array_equal(play(robot.activate(), 1.0)[:, 1:], [[0.1, 0.2]] * 50)
 
 
 # Joints without torque

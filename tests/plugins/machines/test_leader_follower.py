@@ -23,19 +23,6 @@ def lead(robot, *positions, velocity=0.0, age=0.0):
     robot.context.reads[:] = [*positions, *[velocity] * count, *[age] * count]
 
 
-def test_it_reads_the_leaders_and_claims_the_followers():
-    robot = standing(LeaderFollower, TWO)
-    assert robot.interfaces.joints == ("f", "g")
-    assert robot.interfaces.command == ("position",)
-    assert robot.interfaces.reads == (
-        "l/position", "m/position", "l/velocity", "m/velocity", "l/age", "m/age",
-    )  # fmt: skip
-    assert standing(LeaderFollower, STREAM).interfaces.reads == ()
-    assert standing(LeaderFollower, PAIR | {"command_interface": "posvel"}).interfaces.command == (
-        "position", "velocity",
-    )  # fmt: skip
-
-
 def test_it_starts_at_its_speed_and_is_then_in_step_at_once():
     robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 0.5)
@@ -151,44 +138,3 @@ def test_a_live_speed_counts_at_once():
     robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
     robot.step()
     assert robot.commands.position[0] == pytest.approx(0.06)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"pairs": []}, "at least 1 item"),
-        ({"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g"}]}, "g has no leader"),
-        ({"pairs": [{"joint": "f", "scale": 2.0}]}, "scale and offset are for a leader"),
-        ({"pairs": [{"joint": "f", "leader": "l", "scale": 0.0}]}, "a scale of 0"),
-        (
-            {"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g", "leader": "f"}]},
-            "f is leader and follower",
-        ),
-        ({"pairs": [{"joint": "f"}], "command_interface": "posvel"}, "posvel commands the speed of leaders"),
-    ],
-)
-def test_pairs_that_make_no_sense_are_refused_in_words(wrong, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        LeaderFollower.Parameters.model_validate(wrong)
-
-
-def test_commands_that_do_not_fit_are_refused_in_words():
-    with pytest.raises(ValueError, match="its joints follow leaders"):
-        standing(LeaderFollower, PAIR).prepare("positions", positions=[0.1])
-    with pytest.raises(ValueError, match=r"1 positions for 2 joints \(f, g\)"):
-        standing(LeaderFollower, STREAM).prepare("positions", positions=[0.1])
-
-
-def test_activated_again_it_starts_softly_and_has_forgotten_old_positions():
-    robot = standing(LeaderFollower, PAIR).activate()
-    lead(robot, 0.0)
-    robot.step()
-    robot.activate()
-    lead(robot, 1.0)
-    robot.step()
-    assert robot.commands.position[0] == pytest.approx(0.02)
-    robot = standing(LeaderFollower, STREAM).activate()
-    robot.give("positions", positions=[1.0, 1.0])
-    robot.activate()
-    robot.step()
-    np.testing.assert_array_equal(robot.commands.position, 0.0)
