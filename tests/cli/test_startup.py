@@ -52,7 +52,7 @@ def test_check_imports_no_part_that_runs(checked: set[str]) -> None:
 
 
 def test_check_imports_no_library_that_it_does_not_use(checked: set[str]) -> None:
-    unused = "mujoco mcap starlette uvicorn lz4 zstandard serial matplotlib simpleeval"
+    unused = "mujoco mcap starlette uvicorn lz4 zstandard serial matplotlib simpleeval rich"
     assert beneath(checked, *unused.split()) == set()
 
 
@@ -67,5 +67,5 @@ def test_check_imports_what_it_uses(checked: set[str]) -> None:
 def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
     ran = loaded("robots/bioloid_torso.yaml", "--virtual", "--duration", "0.1", "--no-record")
     assert "dxlrun.simulation.server" not in ran
-    assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "dxlrun.remote") == set()
+    assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "rich", "dxlrun.remote") == set()
     assert "dxlrun.run.virtual_run" in ran

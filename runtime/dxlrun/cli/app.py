@@ -40,7 +40,8 @@ USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
        dxlrun COMMAND ...
 """
 
-EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
+EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130
+interrupted."""
 
 
 def build(verb: str = "", *, listed: bool = False) -> App:
@@ -52,7 +53,6 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         help_format="plaintext",  # rich.markdown takes as long to import as all else together
         help_formatter=_Help(),
         usage=USAGE,
-        console=None if sys.stdout.isatty() else out(_PIPED_HELP),
         version=_version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
     )
@@ -91,15 +91,15 @@ class _Help:
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         """Print the commands or the parameters of one group."""
         facts = ((" ".join(entry.display_labels_with_metavar), _about(entry)) for entry in panel.entries)
-        show(Table.facts(str(panel.title), facts), console=console)
+        show(Table.facts(str(panel.title), facts), console=out(_PIPED_HELP))
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: object) -> None:
         """Print how a command is called."""
-        show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}", console=console)
+        show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}")
 
     def render_description(self, console: Console, options: ConsoleOptions, description: object) -> None:
         """Print what a command does."""
-        show(_filled(description), console=console, folded=True)
+        show(_filled(description), console=out(_PIPED_HELP), folded=True)
 
 
 def _about(entry: HelpEntry) -> str:

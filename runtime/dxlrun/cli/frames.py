@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
 from dxlrun.errors import InputError, counted
-from dxlrun.output.terminal import out, print_warning, show, show_json
+from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.transform import Transform
@@ -103,7 +103,7 @@ def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
     show(
         f"{plan.robot}: {counted(len(tree.frames), 'frame', 'frames')}, {moving} of them "
         f"{'moves' if moving == 1 else 'move'}; {logged}",
-        *_lines(plan, tree, _ASCII if out().options.ascii_only else _LINES),
+        *_lines(plan, tree, _ASCII if ascii_only(out()) else _LINES),
     )
 
 

@@ -1,6 +1,6 @@
 """The terminal: results to stdout, errors to stderr; colours only on a terminal, plain text into a pipe.
 
-rich is imported when something is shown, so that a command line which shows nothing does not load it.
+What is shown is laid out here, line by line; rich colours lines on a terminal, and a pipe does without it.
 """
 
 from __future__ import annotations
@@ -12,20 +12,19 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import IO, TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING, TypeAlias, cast
 
 from dxlrun.output.escaping import escaped, escaped_json
 from dxlrun.output.json import json_text, problems_json
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.table import Table as RichTable
-    from rich.text import Text
+    from rich.console import Console
 
     from dxlrun.errors import Problem
-    from dxlrun.output.graph import Graph
 
+Line: TypeAlias = Sequence[tuple[str, str]]
+"""The pieces of a line, each with its style."""
 STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "error": "red"}
 _PIPE = 200
 """Columns of a pipe: wide enough not to break a table."""
@@ -60,19 +59,43 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
 
     Lines are not broken, so that a command in them can be copied, unless they are to be `folded`.
     """
-    from rich.text import Text
-
     console = console or out()
     for part in parts:
-        if isinstance(part, Table):
-            if part.rows:
-                _show_table(part, console)
-        elif isinstance(part, str | Sentence):
-            line = Sentence(part) if isinstance(part, str) else part
-            console.print(Text(escaped(line.text), style=STYLES[line.tone]), soft_wrap=not folded)
-        else:
-            _show_graph(part, console)
+        for line in _lines(part, console, folded=folded):
+            _print(line, console)
     console.file.flush()  # a reader behind a pipe waits for it
+
+
+def _lines(part: Part, console: Console, *, folded: bool) -> Iterator[Line]:
+    if isinstance(part, Table):
+        if part.rows:
+            yield from [[("", "")], [(escaped(part.title), "bold")]] if part.title else []
+            yield from fitted(part, console.width)
+    elif isinstance(part, str | Sentence):
+        line = Sentence(part) if isinstance(part, str) else part
+        for text in escaped(line.text).split("\n"):
+            for piece in textwrap.wrap(text, console.width) or [""] if folded else [text]:
+                yield [(piece, STYLES[line.tone])]
+    else:
+        from dxlrun.output.graph_text import graph_text
+
+        yield from [[("", "")], [(escaped(part.title), "bold")]]
+        drawn = escaped(graph_text(part, console.width, ascii_only=ascii_only(console)))
+        yield from ([(text, "")] for text in drawn.split("\n"))
+
+
+def _print(line: Line, console: Console | Pipe) -> None:
+    if isinstance(console, Pipe):
+        console.print("".join(text for text, _ in line))
+        return
+    from rich.text import Text
+
+    console.print(Text.assemble(*line), soft_wrap=True)
+
+
+def ascii_only(console: Console) -> bool:
+    """Return whether nothing but ASCII can be shown."""
+    return not (getattr(console.file, "encoding", None) or "utf-8").lower().startswith("utf")
 
 
 def show_json(value: object) -> None:
@@ -147,17 +170,13 @@ def live_line(text: str, more: str) -> str:
     return text if len(text) <= _LIVE else f"{text[: _LIVE - 1]}…"
 
 
-def fitted(table: Table, width: int) -> RenderableType:
-    """Return a table for a terminal of `width` columns.
+def fitted(table: Table, width: int) -> list[Line]:
+    """Return the lines of a table for a terminal of `width` columns.
 
     Where it does not fit, its heads are broken at blanks, then what is equal in all rows is said above it,
     then its details are left out; texts are folded between words. What is still too wide is cut: texts, then
     names. On a terminal that is narrower than usual nothing is cut, but each row becomes a paragraph.
     """
-    from rich.console import Group
-    from rich.constrain import Constrain
-    from rich.text import Text
-
     table = table.escaped()
     caption, rest = table.without_constants()
     alike = len(rest.columns) == 1 < len(table.columns)
@@ -172,21 +191,18 @@ def fitted(table: Table, width: int) -> RenderableType:
         for tight in (False, True):
             least = _width(part, tight=tight)
             if least <= width:
-                shown = Constrain(_rich_table(part, tight=tight), min(width, max(least, _WIDEST)))
-                return Group(_caption(said, width), shown) if said else shown
+                drawn = _drawn(part, min(width, max(least, _WIDEST)), tight=tight)
+                return [*_caption(said, width), *drawn]
     if alike and any(column.name for column in table.columns):
         return fitted(table.turned(), width)
     cut = _cut(least_table, width) if width >= _USUAL else None
     if cut is None:
-        return Text("\n".join(_paragraphs(table, width)))
-    shown = Constrain(_rich_table(cut, tight=True), width)
-    return Group(_caption(caption, width), shown) if caption else shown
+        return [[(line, "")] for line in _paragraphs(table, width)]
+    return [*_caption(caption, width), *_drawn(cut, width, tight=True)]
 
 
-def _caption(said: str, width: int) -> Text:
-    from rich.text import Text
-
-    return Text("\n".join(_filled(f"in all rows: {said}", width)), style="dim")
+def _caption(said: str, width: int) -> list[Line]:
+    return [[(line, "dim")] for line in _filled(f"in all rows: {said}", width)] if said else []
 
 
 def _cut(table: Table, width: int) -> Table | None:
@@ -220,25 +236,6 @@ def _cut(table: Table, width: int) -> Table | None:
     return replace(table, columns=columns, rows=tuple(rows))
 
 
-def _show_table(table: Table, console: Console) -> None:
-    from rich.text import Text
-
-    if table.title:
-        console.print(Text(f"\n{escaped(table.title)}", style="bold"))
-    shown = fitted(table, console.width)
-    console.print(shown, soft_wrap=isinstance(shown, Text))
-
-
-def _show_graph(graph: Graph, console: Console) -> None:
-    from rich.text import Text
-
-    from dxlrun.output.graph_text import graph_text
-
-    ascii_only = console.options.ascii_only
-    console.print(Text(f"\n{escaped(graph.title)}", style="bold"), soft_wrap=True)
-    console.print(Text(escaped(graph_text(graph, console.width, ascii_only=ascii_only))), soft_wrap=True)
-
-
 def _width(table: Table, *, tight: bool) -> int:
     """Return how many columns a table takes at least."""
     heads = [column.name.split(" ") if tight else [column.name] for column in table.columns]
@@ -256,31 +253,53 @@ def _least(table: Table, index: int) -> int:
     return max(min(longest, _FOLDED), min(word, _LONGEST_WORD))
 
 
-def _rich_table(table: Table, *, tight: bool) -> RichTable:
-    from rich import box
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    headed = any(column.name for column in table.columns)
-    shown = RichTable(
-        box=box.SIMPLE_HEAD if headed else None,
-        show_header=headed,
-        header_style="dim",
-        padding=(0, (0 if tight else 1) + (not headed), 0, 0),
-        pad_edge=False,
-        show_edge=False,
-    )
-    for index, column in enumerate(table.columns):
-        shown.add_column(
-            column.name.replace(" ", "\n") if tight else column.name,
-            justify="right" if column.kind == "number" else "left",
-            overflow="fold",
-            no_wrap=column.kind != "text",
-            min_width=_least(table, index),
-        )
+def _drawn(table: Table, width: int, *, tight: bool) -> Iterator[Line]:
+    """Yield a table in `width` columns, which is as wide as it must be at least: its texts are folded."""
+    names = [column.name.replace(" ", "\n") if tight else column.name for column in table.columns]
+    texts = [[name, *(row[index].text for row in table.rows)] for index, name in enumerate(names)]
+    widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
+    foldable = [column.kind == "text" for column in table.columns]
+    gap = 1 if tight else 2
+    excess = sum(widths) + gap * (len(widths) - 1) - width
+    while excess > 0:  # the widest texts become narrower together
+        widest = max(each for each, text in zip(widths, foldable, strict=True) if text)
+        for index, each in enumerate(widths):
+            if excess > 0 and foldable[index] and each == widest:
+                widths[index] -= 1
+                excess -= 1
+    if any(names):
+        heads = [name.split("\n") for name in names]
+        most = max(map(len, heads))
+        bottom = [[*[""] * (most - len(head)), *head] for head in heads]
+        yield from _row(bottom, ["dim"] * len(heads), widths, table, gap)
+        yield [("\N{BOX DRAWINGS LIGHT HORIZONTAL}" * (sum(widths) + gap * (len(widths) - 1)), "")]
     for row in table.rows:
-        shown.add_row(*(Text(cell.text, style=STYLES[cell.tone]) for cell in row))
-    return shown
+        cells = [
+            _folded(cell.text, each) if text else cell.text.split("\n")
+            for cell, each, text in zip(row, widths, foldable, strict=True)
+        ]
+        yield from _row(cells, [STYLES[cell.tone] for cell in row], widths, table, gap)
+
+
+def _folded(text: str, width: int) -> list[str]:
+    lines = (textwrap.wrap(line, width, break_on_hyphens=False) or [""] for line in text.split("\n"))
+    return [piece for line in lines for piece in line]
+
+
+def _row(
+    cells: Sequence[Sequence[str]], styles: Sequence[str], widths: Sequence[int], table: Table, gap: int
+) -> Iterator[Line]:
+    """Yield the lines of a row; `cells`: each with its lines."""
+    for number in range(max(map(len, cells))):
+        pieces = []
+        for index, (cell, style, width) in enumerate(zip(cells, styles, widths, strict=True)):
+            text = cell[number] if number < len(cell) else ""
+            right = table.columns[index].kind == "number"
+            pieces += [
+                (" " * gap * (index > 0), ""),
+                (text.rjust(width) if right else text.ljust(width), style),
+            ]
+        yield pieces
 
 
 def _paragraphs(table: Table, width: int) -> Iterator[str]:
@@ -302,33 +321,38 @@ def _filled(text: str, width: int) -> list[str]:
 
 
 def _print_to_stderr(line: str, style: str) -> None:
-    from rich.text import Text
-
     # a path or a name may hold line breaks or escape sequences; one problem stays one line
     safe = escaped(line).replace("\n", "\\n")
     with suppress(OSError):  # full, or gone: the exit code is left
-        _console(sys.stderr.isatty(), _PIPE, stderr=True).print(Text(safe, style=style), soft_wrap=True)
+        _print([(safe, style)], err())
 
 
 def _console(terminal: bool, pipe: int, *, stderr: bool) -> Console:
+    if not terminal:
+        return cast("Console", Pipe(sys.stderr if stderr else sys.stdout, pipe))
     from rich.console import Console
 
-    if terminal:
-        return Console(stderr=stderr, highlight=False, force_terminal=True)
-    file = cast("IO[str]", _WithoutPadding(sys.stderr if stderr else sys.stdout))
-    return Console(file=file, highlight=False, force_terminal=False, width=pipe)
+    return Console(stderr=stderr, highlight=False, force_terminal=True)
 
 
-class _WithoutPadding:
-    """A stream that gets no blanks before the end of a line: rich fills the last column of a table."""
+class Pipe:
+    """A console that is no terminal: plain lines without blanks at their ends, and no status."""
 
-    def __init__(self, stream: IO[str]) -> None:
-        self._stream = stream
+    is_terminal = False
 
-    def write(self, text: str) -> int:
-        """Write text of whole lines, as a console does."""
-        self._stream.write("\n".join(line.rstrip(" ") for line in text.split("\n")))
-        return len(text)
+    def __init__(self, file: IO[str], width: int) -> None:
+        self.file = file
+        self.width = width
+        self.console = self
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._stream, name)
+    def print(self, text: str = "", **_: object) -> None:
+        """Write a line."""
+        self.file.write(f"{text.rstrip(' ')}\n")
+
+    @contextmanager
+    def status(self, text: str) -> Iterator[Pipe]:
+        """Give a status that nothing shows."""
+        yield self
+
+    def update(self, text: str) -> None:
+        """Show no other status."""

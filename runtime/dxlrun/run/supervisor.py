@@ -11,10 +11,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from msgspec.structs import replace
-from rich.console import Console
 
 from dxlrun.channels import process, slot
 from dxlrun.channels.commands import LOOP, Command
@@ -72,6 +71,9 @@ from dxlrun.run.run_summary import (
     show_grants,
 )
 from dxlrun.simulation.messages import SimulationMessage
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _POLL_S = 0.1
 _RESTART_S = 2.0

@@ -8,9 +8,7 @@ import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Any
 
 from dxlrun.channels import slot
 from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
@@ -40,6 +38,9 @@ from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.motion.body import SensedBody
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.virtual_ports import VirtualPorts
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class VirtualRobot:

@@ -240,7 +240,8 @@ def page(look: SimulationMessage, typed: str | None, width: int, height: int, *,
 
     room = max(1, height - _AROUND)
     servos = look.servos or ()
-    parts = [fitted(servo_table(servos[:room], several=several), width)]
+    table = servo_table(servos[:room], several=several)
+    parts = [Text.assemble(*line) for line in (fitted(table, width) if table.rows else ())]
     if len(servos) > room:
         parts.append(Text(f"... and {len(servos) - room} more; a higher window shows them", style="dim"))
     if look.lateness_us:
