@@ -34,8 +34,6 @@ from dxlrun.run.guardian import (
     Ended,
     Guardian,
     GuardianMessage,
-    LineReturns,
-    SafeStop,
     standstill_timeout_ns,
 )
 from dxlrun.run.loop_process import AskedToStop, Pulse
@@ -197,9 +195,8 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     control, terminal = process.message_channel(Decoder(Stop | Cut))
     line, loops_end = process.message_channel(Decoder(LineLost))
     watcher = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
-    lines = KeptLines(())
     with terminal, loops_end, subprocess.Popen(["/bin/sleep", "60"]) as loop:
-        ended = watcher._watch(loop, LineReturns(lines, line, control, SafeStop(watcher._job)))
+        ended = watcher._watch(loop, KeptLines(()), line)
         assert loop.returncode == -signal.SIGKILL
     control.close()
     line.close()

@@ -15,7 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -185,43 +185,6 @@ class SafeStop:
         self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
 
 
-class LineReturns:
-    """Opens the lines again that the loop has lost, and hands them to the loop and to the terminal."""
-
-    def __init__(
-        self,
-        lines: KeptLines,
-        loop: MessageChannel[LineLost],
-        terminal: MessageChannel[Stop | Cut],
-        safe_stop: SafeStop,
-    ) -> None:
-        self._lines = lines
-        self._loop = loop
-        self._terminal = terminal
-        self._safe_stop = safe_stop
-
-    @property
-    def watched(self) -> list[int]:
-        """What can wake the guardian for it; a loop that is gone asks for nothing."""
-        return [self._lines.fileno()] + ([] if self._loop.closed else [self._loop.fileno()])
-
-    def look(self, ready: Collection[int]) -> None:
-        """Take what the loop asks for, and hand over what is back."""
-        if self._loop.fileno() in ready:
-            for message in self._loop.receive():
-                self._terminal.send(message)
-                if not self._lines.lost(message.bus):
-                    self._safe_stop.report("a line is gone and is not opened again", Severity.ERROR)
-        if self._lines.fileno() in ready:
-            for opened in self._lines.returned():
-                if opened.done:
-                    self._safe_stop.report(opened.done, Severity.INFO)
-                if opened.wrong:
-                    self._safe_stop.report(opened.wrong, Severity.ERROR)
-                for channel in (self._loop, self._terminal):
-                    channel.send(LineReturned(opened.index), [self._lines.descriptors[opened.index]])
-
-
 class Guardian:
     """Watches one loop process from its start to its end."""
 
@@ -256,7 +219,7 @@ class Guardian:
         theirs.close()
         # the terminal gets the ports too: should this process die, they are still held, and still open
         self._control.send(Started(loop.pid, grants), lines.descriptors)
-        ending = self._watch(loop, LineReturns(lines, loop_channel, self._control, self._safe_stop))
+        ending = self._watch(loop, lines, loop_channel)
         outcome: list[str] = []
         how = self._how(ending, loop)
         if ending == "unused":
@@ -283,18 +246,25 @@ class Guardian:
             job.memory.stderr,
         )
 
-    def _watch(self, loop: subprocess.Popen[bytes], returns: LineReturns) -> Ending:
+    def _watch(
+        self, loop: subprocess.Popen[bytes], lines: KeptLines, channel: MessageChannel[LineLost]
+    ) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
         nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
-            ready, _, _ = select.select([*self._watched(watched), *returns.watched], [], [], nap)
+            # a terminal that is gone would wake it for ever, a loop that is gone asks for nothing
+            channels = [one for one in (self._control, channel) if not one.closed]
+            ready, _, _ = select.select([watched, lines, *channels], [], [], nap)
             self._heartbeat.look()
             if watched in ready:
                 return self._ending(loop.wait())
-            returns.look(ready)
-            request = self._request() if self._control.fileno() in ready else None
+            if channel in ready:
+                self._lose(lines, channel)
+            if lines in ready:
+                self._hand_over(lines, channel)
+            request = self._request() if self._control in ready else None
             if request == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
                 loop.send_signal(signal.SIGTERM)
@@ -318,9 +288,22 @@ class Guardian:
             return "done" if code == -signal.SIGTERM and self._stop_by_ns < _NEVER else "unused"
         return "died"
 
-    def _watched(self, pidfd: int) -> list[int]:
-        """Return what can wake the guardian; a terminal that is gone would wake it for ever."""
-        return [pidfd] if self._control.closed else [pidfd, self._control.fileno()]
+    def _lose(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
+        """Open the lines again that the loop has lost."""
+        for message in channel.receive():
+            self._control.send(message)
+            if not lines.lost(message.bus):
+                self._safe_stop.report("a line is gone and is not opened again", Severity.ERROR)
+
+    def _hand_over(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
+        """Hand lines that are back to the loop and to the terminal."""
+        for opened in lines.returned():
+            if opened.done:
+                self._safe_stop.report(opened.done, Severity.INFO)
+            if opened.wrong:
+                self._safe_stop.report(opened.wrong, Severity.ERROR)
+            for each in (channel, self._control):
+                each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
     def _timed_out(self, processor: ProcessorTime) -> Literal["hung", "late"] | None:
         """Return why the loop is not waited for any longer, if it is not."""
