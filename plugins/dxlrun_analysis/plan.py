@@ -7,10 +7,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
+from msgspec import structs
 
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.plan.loop_plan import TOLERATED_SKIPS, ScheduleName
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 
 
@@ -76,23 +77,6 @@ class LoggedBus(msgspec.Struct):
         return joints | {device.servo_id: device.name for device in self.devices}
 
 
-class LoggedJoint(msgspec.Struct):
-    """One joint of the plan; its limits in rad/s."""
-
-    name: str
-    velocity: float | None = None
-    top_speed: float | None = None
-    top_effort: float | None = None
-    """In the unit of its effort; None: that is a fraction of the maximum."""
-    linear: bool = False
-    """Its positions are m, its speeds m/s."""
-
-    @property
-    def unit(self) -> str:
-        """Of its positions."""
-        return "m" if self.linear else "rad"
-
-
 class Mover(NamedTuple):
     """A servo that moves a joint."""
 
@@ -102,50 +86,27 @@ class Mover(NamedTuple):
     """rad of the joint, or m, for each rad of the servo, without its sign"""
 
 
-class LoggedController(msgspec.Struct):
-    """One controller of the plan, or a sensor."""
-
-    name: str
-    type: str = ""
-    fallback: str = ""
-    """The controller that takes over when it breaks its contract; empty: none."""
-
-
-class LoggedCommand(msgspec.Struct):
-    """One command of a motion that is played."""
-
-    at_ns: int
-    """Since the first deadline."""
-    controller: str
-    origin: str = ""
-    """Place in a motion file: `/robots/motions/wave.yaml:14:9`."""
-
-
-class LoggedLoop(msgspec.Struct):
-    """The loop of the plan."""
-
-    tolerated_skips: float = TOLERATED_SKIPS
-    schedule: ScheduleName = "absolute"
-    joints: list[LoggedJoint] = []
-    controllers: list[LoggedController] = []
-    sensors: list[LoggedController] = []
-    commands: list[LoggedCommand] = []
+NO_LOOP = LoopPlan(0, SchedulerPlan("other", 0, lock_memory=False), (), (), (), None)
+"""Of a log without a plan."""
+UNKNOWN_JOINT = JointPlan("", -math.inf, math.inf, None)
 
 
 class LoggedPlan(msgspec.Struct):
-    """Loop and buses; all keys that are not read here are left out."""
+    """The loop as it was planned, and of the buses what is read here."""
 
-    loop: LoggedLoop = msgspec.field(default_factory=LoggedLoop)
+    loop: LoopPlan = NO_LOOP
     buses: list[LoggedBus] = []
     mechanics: MechanicsPlan = MechanicsPlan()
 
-    def joint(self, name: str) -> LoggedJoint:
+    def joint(self, name: str) -> JointPlan:
         """Return a joint; of one that the plan does not have only its name is known."""
-        return next((joint for joint in self.loop.joints if joint.name == name), LoggedJoint(name))
+        unknown = structs.replace(UNKNOWN_JOINT, name=name)
+        return next((joint for joint in self.loop.joints if joint.name == name), unknown)
 
-    def controller(self, name: str) -> LoggedController:
+    def controller(self, name: str) -> ControllerPlan:
         """Return a controller; of one that the plan does not have only its name is known."""
-        return next((one for one in self.loop.controllers if one.name == name), LoggedController(name))
+        unknown = ControllerPlan(name, "", "", "{}", (), (), (), active=False, every=1)
+        return next((one for one in self.loop.controllers if one.name == name), unknown)
 
     @property
     def movers(self) -> dict[str, tuple[Mover, ...]]:
@@ -175,7 +136,7 @@ class LoggedPlan(msgspec.Struct):
         """
         if not any(bus.simulated for bus in self.buses):
             return False
-        real = {one.name for one in (*self.loop.controllers, *self.loop.sensors)}
+        real = {one.name for one in self.loop.controllers} | {one.name for one in self.loop.sensors}
         for bus in self.buses:
             if not bus.simulated:
                 real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}

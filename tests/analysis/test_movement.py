@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.channels.cycle import Torque
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Series
 from dxlrun_analysis.joints.movement import Movement
@@ -20,7 +21,6 @@ from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.page.canvas import Canvas
 from dxlrun_analysis.page.findings import finding_plots
-from dxlrun_analysis.plan import LoggedJoint
 
 Floats = npt.NDArray[np.float64]
 DT = 0.02
@@ -272,7 +272,7 @@ def test_the_report_draws_the_error_of_the_joint_and_that_of_the_others() -> Non
         assert plot.text == "It did."
 
 
-QUICK = {"logged": LoggedJoint("j0", top_speed=5.0)}
+QUICK = {"logged": JointPlan("j0", -9.0, 9.0, None, top_speed=5.0)}
 SHIFTED = behind(SWING) + 0.4 * np.exp(-np.maximum(TIME - 5.0, 0.0) / 0.1) * FAULT
 
 
@@ -288,7 +288,7 @@ def test_a_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -
     "joint",
     [
         Joint(position=SHIFTED),  # its top speed is not known
-        Joint(position=SHIFTED, planned={"logged": LoggedJoint("j0", top_speed=18.0)}),
+        Joint(position=SHIFTED, planned={"logged": JointPlan("j0", -9.0, 9.0, None, top_speed=18.0)}),
         Joint(position=SHIFTED, planned=QUICK, torque=np.where(np.abs(TIME - 5.0) < 0.01, 0, Torque.ON)),
         Joint(position=behind(SWING) + 0.15 * FAULT, planned=QUICK),  # less than 9 deg
         Joint(position=-SWING, planned=QUICK),  # against its goal, but as slowly as it can

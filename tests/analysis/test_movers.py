@@ -9,9 +9,10 @@ from pathlib import Path
 import msgspec
 import pytest
 from msgspec import structs
-from tests.kit.made_logs import JOINTS, Cycle
+from tests.kit.made_logs import JOINTS, Cycle, loop_of
 
 from dxlrun.log.reader import read_log
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.plan import LoggedPlan, plan_of
@@ -25,8 +26,8 @@ def servo(row: int, joint: str, **more: object) -> dict[str, object]:
 
 
 def plan(servos: list[dict[str, object]], *, linear: bool = False, **mechanics: object) -> dict[str, object]:
-    joints = [{"name": name, "linear": linear} for name in JOINTS]
-    return {"loop": {"joints": joints}, "buses": [{"name": "main", "servos": servos}], "mechanics": mechanics}
+    loop = loop_of(joints=tuple(JointPlan(name, 0.0, 1.0, None, linear=linear) for name in JOINTS))
+    return {"loop": loop, "buses": [{"name": "main", "servos": servos}], "mechanics": mechanics}
 
 
 def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> None:

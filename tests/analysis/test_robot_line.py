@@ -17,13 +17,14 @@ from msgspec import structs
 from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
+from dxlrun.plan.loop_plan import ScheduledCommand
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.conduct.conduct import Conduct, ConductHistory, Takeover
 from dxlrun_analysis.conduct.steering import Act
 from dxlrun_analysis.cycles.latency import Periods
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.plan import LoggedCommand, LoggedLoop, LoggedPlan
+from dxlrun_analysis.plan import NO_LOOP, LoggedPlan
 from dxlrun_analysis.report import analyze
 from dxlrun_analysis.tally import RunTotals, totals_of
 from dxlrun_analysis.verdict import judge
@@ -32,13 +33,14 @@ S = 10**9
 ROBOTS = Path(__file__).parents[2] / "robots"
 WAVE = "/robots/motions/wave.yaml"
 PLAN = LoggedPlan(
-    LoggedLoop(
-        commands=[
-            LoggedCommand(0, "arm", f"{WAVE}:4:5"),
-            LoggedCommand(S, "head", f"{WAVE}:9:9"),
-            LoggedCommand(2 * S, "head", f"{WAVE}:10:9"),
-            LoggedCommand(90 * S, "late", f"{WAVE}:12:5"),
-        ]
+    structs.replace(
+        NO_LOOP,
+        commands=(
+            ScheduledCommand(0, "arm", "", b"", f"{WAVE}:4:5"),
+            ScheduledCommand(S, "head", "", b"", f"{WAVE}:9:9"),
+            ScheduledCommand(2 * S, "head", "", b"", f"{WAVE}:10:9"),
+            ScheduledCommand(90 * S, "late", "", b"", f"{WAVE}:12:5"),
+        ),
     )
 )
 

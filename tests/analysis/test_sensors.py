@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.kit.made_logs import loop_of
 
+from dxlrun.plan.loop_plan import SensorPlan
 from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.finding import Rank
 
@@ -27,7 +29,7 @@ def findings(values: Floats, joint: Floats = MOVES, name: str = "gyro") -> list[
     cycles["read_ns"], cycles["source_valid"] = 10**9 + np.rint(TIME * 1e9).astype(np.int64), True
     cycles["position"][:, 0], cycles["source_state"][:, 0] = joint, values
     sensors, layout = Sensors(), SimpleNamespace(source_slice=lambda name: slice(0, 2))
-    plan = {"loop": {"sensors": [{"name": name}]}}
+    plan = {"loop": loop_of(sensors=(SensorPlan(name, "", "", "{}", ("x", "y"), 1, 1),))}
     for begin in range(0, len(TIME), 170):
         part: Any = SimpleNamespace(
             cycles=cycles[begin : begin + 170],

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from msgspec import structs
-from tests.kit.made_logs import made_log
+from tests.kit.made_logs import loop_of, made_log
 
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.joints.tracking import JointTracking, reachable, tracking
 from dxlrun_analysis.report import analyze, tables
 
@@ -25,6 +26,7 @@ DT = 0.02
 TICK = math.radians(300) / 1023
 Way = npt.NDArray[np.float64]
 Make = Callable[..., Log]
+NECK = JointPlan("neck", -3.0, 3.0, None, top_speed=6.0)
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def make(tmp_path: Path) -> Make:
         servo = {"joint": "neck", "model": "MX-64", "rad_per_tick": TICK, "rad_s_per_tick": 0.01}
         servo["registers"] = [{"name": name, "value": value} for name, value in (registers or {}).items()]
         plan = {
-            "loop": {"joints": [{"name": "neck", "top_speed": 6.0, **joint}]},
+            "loop": loop_of(joints=(structs.replace(NECK, **joint),)),
             "buses": [{"protocol": 1.0, "servos": [servo]}],
         }
         log = read_log(made_log(tmp_path, plan=plan))

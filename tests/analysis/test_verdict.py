@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
+from tests.kit.made_logs import loop_of
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode, EventGroup, Severity
@@ -17,6 +19,7 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.run_log import log_header
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
@@ -28,7 +31,7 @@ from dxlrun_analysis.cycles import latency
 from dxlrun_analysis.cycles.latency import Latency, Periods
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
+from dxlrun_analysis.plan import NO_LOOP, LoggedBus, LoggedPlan, LoggedServo
 from dxlrun_analysis.plan import plan_of as plan_in
 from dxlrun_analysis.report import analyze, analyze_log
 from dxlrun_analysis.servos import exchanges as pairing
@@ -53,7 +56,7 @@ def totals(**changed: Any) -> RunTotals:
 
 
 def tolerating(share: float) -> LoggedPlan:
-    return LoggedPlan(LoggedLoop(tolerated_skips=share))
+    return LoggedPlan(structs.replace(NO_LOOP, tolerated_skips=share))
 
 
 def test_a_good_run_is_good() -> None:
@@ -122,10 +125,10 @@ def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, writ
     simulated_robot(robot, duration_s=0.1, log=log).run()
     assert totals_of(log).plan.loop.tolerated_skips == 0.6
 
-    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": 0.6}})
+    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": loop_of(tolerated_skips=0.6)})
     assert analyze_log(path).verdict.good
     path.unlink()
-    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": "all"}})
+    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": loop_of(tolerated_skips="all")})
     assert not analyze_log(path).verdict.good
 
 
@@ -293,7 +296,8 @@ def plan(*ports: str) -> LoggedPlan:
     """Buses `bus0`, `bus1` ... with a servo each: elbow, wrist; and a controller."""
     joints = (LoggedServo(joint, number) for number, joint in enumerate(("elbow", "wrist"), 1))
     buses = [LoggedBus(f"bus{n}", port, servos=[next(joints)]) for n, port in enumerate(ports)]
-    return LoggedPlan(LoggedLoop(controllers=[LoggedController("arm")]), buses)
+    arm = ControllerPlan("arm", "", "", "{}", (), (), (), active=True, every=1)
+    return LoggedPlan(structs.replace(NO_LOOP, controllers=(arm,)), buses)
 
 
 def accusing(code: str, subject: str = "bus0", share: float = 0.5, rank: Rank = Rank.CAUSE) -> Finding:

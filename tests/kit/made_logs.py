@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+from msgspec import structs
+
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch, PacketKind
@@ -14,6 +17,7 @@ from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
+from dxlrun_analysis.plan import NO_LOOP
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_yaw_joint")
@@ -25,6 +29,11 @@ PLAN = {
         }
     ]
 }
+
+
+def loop_of(**changed: object) -> object:
+    """Return the loop of a plan as it is in a log, an empty one with something in it."""
+    return msgspec.to_builtins(structs.replace(NO_LOOP, **changed))
 
 
 @dataclass(frozen=True)

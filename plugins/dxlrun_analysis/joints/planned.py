@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
-from dxlrun_analysis.plan import LoggedJoint, Mover, plan_of
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
@@ -44,7 +45,7 @@ class PlannedJoint:
     """m of a linear joint for each rad of its servo; 1 of one that turns"""
     softness: float = 1.0
     """So many times lower than its model's is the gain in the robot file, from 1 to 3"""
-    logged: LoggedJoint = field(default_factory=lambda: LoggedJoint(""))
+    logged: JointPlan = UNKNOWN_JOINT
 
 
 def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
@@ -64,7 +65,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 ", ".join(f"servo {one.servo.servo_id} on bus {one.bus.name}" for one in mine),
                 np.fmin.reduce([_register(one, _LIMITS, math.nan, shipped=True) for one in mine]).item(),
                 1.0 if joint.top_effort is None else joint.top_effort,
-                min(math.inf if limit is None else limit for limit in (joint.velocity, joint.top_speed)),
+                joint.highest_speed,
                 sum(one.share * _register(one, _ACCELERATIONS, math.inf) for one in mine),
                 sum(one.share * one.servo.rad_per_tick for one in mine),
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),

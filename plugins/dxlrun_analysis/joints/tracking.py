@@ -400,6 +400,6 @@ class _Row:
             settling_ms=None if self.settled_s is None else self.settled_s * 1e3,
             rest_rad=self.rest_rad,
             delay_ms=None if delay_s is None else delay_s * 1e3,
-            unit=self.limits.logged.unit,
+            unit="m" if self.limits.logged.linear else "rad",
             lost_at=self.lost_at,
         )

@@ -271,8 +271,8 @@ def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None
 def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make) -> None:
     log = read_log(write([Cycle(0)], (), [Said(EventCode.SCHEDULER, Severity.INFO, "one")]))
     (event,) = log.events
-    storm = [replace(event, t_ns=number) for number in range(MOST_EVENTS + 100)]
-    error = replace(event, t_ns=10**6, severity=int(Severity.ERROR))
+    storm = [structs.replace(event, t_ns=number) for number in range(MOST_EVENTS + 100)]
+    error = structs.replace(event, t_ns=10**6, severity=int(Severity.ERROR))
     collector = EventCollector()
     collector.take(replace(log, events=tuple(storm)))
     collector.take(replace(log, events=(error,)))
