@@ -14,32 +14,11 @@ from typing import Any
 import pytest
 import serial
 from tests.foreign.patience import PATIENCE_S
+from tests.kit.packets import crc, packet1, packet2
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
 RATE = 1_000_000
-
-
-def crc(data: bytes) -> bytes:
-    """Return the CRC-16 of Protocol 2.0 bit by bit, as a textbook has it."""
-    value = 0
-    for byte in data:
-        value ^= byte << 8
-        for _ in range(8):
-            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
-    return value.to_bytes(2, "little")
-
-
-def packet2(servo_id: int, body: bytes) -> bytes:
-    """Return a packet of Protocol 2.0 around instruction and parameters, which are stuffed here."""
-    body = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
-    whole = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little") + body
-    return whole + crc(whole)
-
-
-def packet1(servo_id: int, *body: int) -> bytes:
-    inner = bytes((servo_id, len(body) + 1, *body))
-    return b"\xff\xff" + inner + bytes((~sum(inner) & 0xFF,))
 
 
 def line2(name: str, count: int = 1) -> BusConfig:
@@ -90,7 +69,7 @@ def status2(port: serial.Serial) -> bytes:
     assert head[:4] == b"\xff\xff\xfd\x00"
     whole = bytes(head + port.read(int.from_bytes(head[5:], "little")))
     assert whole[7] == 0x55
-    assert crc(whole[:-2]) == whole[-2:]
+    assert crc(whole[:-2]) == int.from_bytes(whole[-2:], "little")
     return whole
 
 
@@ -113,7 +92,7 @@ def test_an_instruction_in_pieces_is_one_instruction(open_serial: Any, simulatio
     simulation.expect_haste("pieces")
     answer = insist(open_serial("pieces"), PING2, size, 14)
     assert answer[:11] == bytes.fromhex("ff ff fd 00 01 07 00 55 00 fc 03")  # model 1020
-    assert crc(answer[:-2]) == answer[-2:]
+    assert crc(answer[:-2]) == int.from_bytes(answer[-2:], "little")
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5])
@@ -128,10 +107,10 @@ def test_a_heap_of_instructions_in_one_write_is_obeyed_in_order(open_serial: Any
     port = open_serial("heap")
     address = (112).to_bytes(2, "little")  # Profile Velocity; sync writes are not answered
     heap = [
-        packet2(0xFE, b"\x83" + address + b"\x04\x00\x01" + value.to_bytes(4, "little"))
+        packet2(0xFE, 0x83, address + b"\x04\x00\x01" + value.to_bytes(4, "little"))
         for value in range(1, 101)
     ]
-    port.write(b"".join(heap) + packet2(1, b"\x02" + address + b"\x04\x00"))
+    port.write(b"".join(heap) + packet2(1, 0x02, address + b"\x04\x00"))
     assert status2(port)[8:-2] == b"\x00" + (100).to_bytes(4, "little")
 
 
@@ -187,7 +166,7 @@ def test_rubbish_before_an_instruction_of_protocol_1_is_passed_over(open_serial:
 @pytest.mark.parametrize("size", [1, 3, 17, 64, 1000])
 def test_many_answers_read_in_pieces_are_the_same_bytes(open_serial: Any, size: int) -> None:
     port = open_serial("many")
-    port.write(packet2(0xFE, b"\x82" + b"\x00\x00\x40\x00" + bytes(range(1, 13))))  # the EEPROM of all
+    port.write(packet2(0xFE, 0x82, b"\x00\x00\x40\x00" + bytes(range(1, 13))))  # the EEPROM of all
     whole = b""
     while len(whole) < 12 * 75:
         piece = port.read(min(size, 12 * 75 - len(whole)))
@@ -198,18 +177,18 @@ def test_many_answers_read_in_pieces_are_the_same_bytes(open_serial: Any, size: 
         assert status[:9] == b"\xff\xff\xfd\x00" + bytes((servo_id,)) + b"\x44\x00\x55\x00"
         assert status[9:11] == b"\xfc\x03"
         assert status[16] == servo_id
-        assert crc(status[:-2]) == status[-2:]
+        assert crc(status[:-2]) == int.from_bytes(status[-2:], "little")
     assert port.in_waiting == 0
 
 
 def test_data_that_look_like_a_header_are_stuffed_both_ways(open_serial: Any) -> None:
     port = open_serial("stuffed")
     tricky = bytes.fromhex("ff ff ff ff fd 00 00 00")  # Goal Velocity -1, Profile Acceleration 253
-    port.write(packet2(1, b"\x03\x68\x00" + tricky))
+    port.write(packet2(1, 0x03, b"\x68\x00" + tricky))
     assert status2(port)[8] == 0
-    port.write(packet2(1, b"\x02\x68\x00\x08\x00"))
+    port.write(packet2(1, 0x02, b"\x68\x00\x08\x00"))
     status = status2(port)
-    assert status == packet2(1, b"\x55\x00" + tricky)
+    assert status == packet2(1, 0x55, b"\x00" + tricky)
     assert status[5:7] == b"\x0d\x00"  # the length counts the stuffing
 
 
@@ -234,7 +213,7 @@ def test_a_host_that_floods_and_never_reads_is_heard_when_it_behaves(
 def test_the_longest_instruction_is_answered_with_an_error(open_serial: Any, simulation: Any) -> None:
     port = open_serial("long")
     simulation.expect_refusals("long", 1)
-    port.write(packet2(1, b"\x03\x40\x00" + bytes(2000)))
+    port.write(packet2(1, 0x03, b"\x40\x00" + bytes(2000)))
     assert status2(port)[8] & 0x7F != 0
     port.write(PING2)
     assert status2(port)[8] == 0

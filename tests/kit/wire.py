@@ -9,6 +9,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
+from tests.kit.packets import crc
+
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import LedgerEntry
 
@@ -55,27 +57,6 @@ def stands_at(servo: ServoPlan, state: bytes) -> float:
     address, size = FACTS[servo.model].items["present_position"]
     at = address - servo.state.address
     return angle(servo, int.from_bytes(state[at : at + size], "little", signed=size == 4))
-
-
-def _crc_table() -> tuple[int, ...]:
-    found = []
-    for byte in range(256):
-        value = byte << 8
-        for _ in range(8):
-            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
-        found.append(value)
-    return tuple(found)
-
-
-_CRC = _crc_table()
-
-
-def crc(data: bytes) -> int:
-    """Return the CRC-16 of Protocol 2.0 (polynomial 0x8005)."""
-    value = 0
-    for byte in data:
-        value = (value << 8 & 0xFF00) ^ _CRC[value >> 8 ^ byte]
-    return value
 
 
 class Instruction(NamedTuple):

@@ -13,6 +13,7 @@ from typing import IO, Any, ClassVar, NamedTuple
 
 import pytest
 from tests.kit.bus_process import PATIENCE_S, bare
+from tests.kit.packets import crc, packet1, packet2
 
 from dxlrun.clock import VirtualClock
 from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, ServoTimes, read_ledger
@@ -27,28 +28,6 @@ class Answer(NamedTuple):
     parameters: bytes
 
 
-def packet(servo_id: int, instruction: int, *parameters: int) -> bytes:
-    body = bytes((servo_id, len(parameters) + 2, instruction, *parameters))
-    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-
-
-def crc(data: bytes) -> int:
-    """Return the CRC-16 of Protocol 2.0 bit by bit, as a textbook has it."""
-    value = 0
-    for byte in data:
-        value ^= byte << 8
-        for _ in range(8):
-            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
-    return value
-
-
-def packet2(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    body = bytes((instruction,)) + parameters
-    assert b"\xff\xff\xfd" not in body, "this host stuffs nothing"
-    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little")
-    return head + body + crc(head + body).to_bytes(2, "little")
-
-
 @dataclass
 class Line:
     """One bus with an open port, on virtual time."""
@@ -61,7 +40,7 @@ class Line:
     ports: VirtualPorts
 
     def send(self, servo_id: int, instruction: int, *parameters: int) -> None:
-        self.ports.ports[0].write(packet(servo_id, instruction, *parameters))
+        self.ports.ports[0].write(packet1(servo_id, instruction, *parameters))
 
     def receive(self, wait_ns: int = 10_000_000) -> bytes:
         """Return everything that arrives in a time."""
@@ -186,16 +165,6 @@ class Line2(Line):
         """Read an item by name, in ticks."""
         item = self.item(name, servo_id)
         return item.decode(self.read_bytes(servo_id, item.address, item.size))
-
-
-@pytest.fixture
-def make_packet2() -> Callable[..., bytes]:
-    return packet2
-
-
-@pytest.fixture
-def make_packet() -> Callable[..., bytes]:
-    return packet
 
 
 def build_line(

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import PortError
@@ -189,23 +190,23 @@ def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_end
     assert [data for _, data in handed_over(bus)] == [PONG_1]
 
 
-def test_something_can_be_planned_after_so_many_instructions(make_packet):
+def test_something_can_be_planned_after_so_many_instructions():
     bus = new_bus(AdapterConfig())
     happened: list[str] = []
     bus.after(2, lambda: happened.append("two"))
     bus.after(1, lambda: happened.append("one"))
     bus.after(0, lambda: happened.append("now"))
     assert happened == ["now"]
-    bus.receive(make_packet(0xFE, 3, 25, 1), 0)
+    bus.receive(packet1(0xFE, 3, 25, 1), 0)
     assert happened == ["now", "one"]
     bus.receive(PING_1, MS)
     assert happened == ["now", "one", "two"]
 
 
-def test_each_servo_counts_instructions_and_replies(make_packet):
+def test_each_servo_counts_instructions_and_replies():
     bus = new_bus(AdapterConfig())
-    asked = (PING_1, make_packet(0xFE, 3, 25, 1), make_packet(1, 3, 25, 1), make_packet(2, 3, 25, 9))
-    spoiled = make_packet(2, 2, 36, 2)[:-1] + b"\x00"
+    asked = (PING_1, packet1(0xFE, 3, 25, 1), packet1(1, 3, 25, 1), packet1(2, 3, 25, 9))
+    spoiled = packet1(2, 2, 36, 2)[:-1] + b"\x00"
     for turn, data in enumerate((*asked, spoiled)):
         bus.receive(data, turn * 10 * MS)
         bus.take((turn + 1) * 10 * MS)
@@ -222,12 +223,10 @@ def sync_read(line: Any) -> None:
     line.instruct(0xFE, 0x82, bytes.fromhex("84000400 010203"))
 
 
-def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instruction(
-    make_line2, make_packet2
-):
+def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instruction(make_line2):
     line = make_line2((1, 2, 3), return_delay_ns=500_000)
     sync_read(line)
-    line.bus.receive(make_packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
+    line.bus.receive(packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
     assert [each.servo_id for each in line.statuses()] == [1]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.simulation import ServoConfig
 from dxlrun.simulation.servo.making import make_servo
@@ -115,8 +116,8 @@ def test_a_list_of_writes_of_a_wrong_length_changes_nothing(line_of, word, instr
     assert any("INSTRUCTION" in note for note in line.notes())
 
 
-def test_a_pause_inside_an_instruction_ends_it(both, make_packet, make_packet2):
-    ping, most_ns = (make_packet(1, 1), 100_000_000) if both.WORD == 1 else (make_packet2(1, 1), 1_500_000)
+def test_a_pause_inside_an_instruction_ends_it(both):
+    ping, most_ns = (packet1(1, 1), 100_000_000) if both.WORD == 1 else (packet2(1, 1), 1_500_000)
     at_ns = 0
     for pause_ns, answered in ((most_ns, True), (most_ns + 1, False)):
         both.bus.receive(ping[:3], at_ns)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.kit.packets import packet1
 
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -41,9 +42,9 @@ def test_an_instruction_waits_for_the_bytes_before_it():
     assert bus.next_due_ns() == 1_000_000 + 60_000 + 500_000 + 60_000
 
 
-def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet):
+def test_what_is_read_is_the_state_when_the_instruction_arrived():
     bus = new_bus(delay_ns=0)
-    bus.receive(make_packet(1, 3, 30, 255, 3), 0)  # goal 1023
+    bus.receive(packet1(1, 3, 30, 255, 3), 0)  # goal 1023
     bus.take(1_000_000)
     bus.receive(READ_1, 200_000_000)
     reply = bus.take(10**12)
@@ -52,9 +53,9 @@ def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet):
     assert int.from_bytes(reply[5:7], "little") < int.from_bytes(later[5:7], "little")
 
 
-def test_two_instructions_in_one_write_are_both_obeyed(make_packet):
+def test_two_instructions_in_one_write_are_both_obeyed():
     bus = new_bus()
-    bus.receive(make_packet(0xFE, 3, 25, 1) + PING_1, 0)
+    bus.receive(packet1(0xFE, 3, 25, 1) + PING_1, 0)
     assert bus.take(10**12) == PONG_1
     assert bus.servo(2).registers["led"] == 1
 

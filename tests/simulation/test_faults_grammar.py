@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.faults.fault import parse_fault
@@ -74,7 +75,7 @@ def test_the_sample_has_a_value_for_every_key():
 @pytest.mark.parametrize("protocol", [1, 2])
 def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(protocol, request):
     make = request.getfixturevalue("make_line" if protocol == 1 else "make_line2")
-    ping = request.getfixturevalue("make_packet" if protocol == 1 else "make_packet2")
+    ping = packet1 if protocol == 1 else packet2
     chance = random.Random(protocol)
     share: list[float] = []
     for _ in range(6):

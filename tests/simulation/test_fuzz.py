@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.bench import fuzz_simulation
+from tests.kit.packets import crc, packet1, packet2
 
 from dxlrun.simulation.wire.protocol1 import ErrorBit
-from dxlrun.simulation.wire.protocol2 import crc16
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
@@ -37,18 +37,7 @@ def check2(received: bytes) -> None:
         size = 7 + int.from_bytes(received[5:7], "little")
         packet, received = received[:size], received[size:]
         assert packet[7] == 0x55
-        assert crc16(packet[:-2]) == int.from_bytes(packet[-2:], "little")
-
-
-def framed1(servo_id: int, instruction: int, parameters: bytes) -> bytes:
-    body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
-    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-
-
-def framed2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
-    body = (bytes((instruction,)) + parameters).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
-    packet = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little") + body
-    return packet + crc16(packet).to_bytes(2, "little")
+        assert crc(packet[:-2]) == int.from_bytes(packet[-2:], "little")
 
 
 INSTRUCTIONS = st.sampled_from([1, 2, 3, 4, 5, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A, 0x77])
@@ -70,7 +59,9 @@ def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(protocol)
 def test_noise_and_any_packet_of_protocol_1(make_line, model, pieces):
     line = make_line((1,), model)
     for piece in pieces:
-        line.ports.ports[0].write(piece if isinstance(piece, bytes) else framed1(*piece))
+        line.ports.ports[0].write(
+            piece if isinstance(piece, bytes) else packet1(piece[0], piece[1], *piece[2])
+        )
         check1(line.receive())
 
 
@@ -81,7 +72,7 @@ def test_noise_and_any_packet_of_protocol_2(make_line2, model, pieces):
     line = make_line2((1,), model)
     line.bus.absent = "slot"
     for piece in pieces:
-        line.ports.ports[0].write(piece if isinstance(piece, bytes) else framed2(*piece))
+        line.ports.ports[0].write(piece if isinstance(piece, bytes) else packet2(*piece))
         received = line.receive()
         if isinstance(piece, bytes) or piece[1] not in (0x8A, 0x9A):
             check2(received)
@@ -95,7 +86,7 @@ def test_a_broken_crc_is_never_obeyed(make_line2, answers, parameters, bit, plac
     line = make_line2((1,))
     line.servo().answers_damaged = answers
     before = bytes(line.read_bytes(1, 0, 120))
-    packet = bytearray(framed2(1, 0x03, bytes((64, 0)) + parameters))
+    packet = bytearray(packet2(1, 0x03, bytes((64, 0)) + parameters))
     packet[7 + place % (len(packet) - 7)] ^= 1 << bit
     line.ports.ports[0].write(packet)
     assert line.statuses() == ([(1, 3, b"")] if answers else [])
@@ -109,8 +100,8 @@ def test_a_broken_crc_is_never_obeyed(make_line2, answers, parameters, bit, plac
 def test_a_broken_checksum_is_never_obeyed(make_line, answers, parameters, bit, place):
     line = make_line((1,))
     line.servo().answers_damaged = answers
-    packet = bytearray(framed1(1, 0x03, bytes((24,)) + parameters))
+    packet = bytearray(packet1(1, 0x03, 24, *parameters))
     packet[4 + place % (len(packet) - 4)] ^= 1 << bit
     line.ports.ports[0].write(packet)
-    assert line.receive() == (framed1(1, ErrorBit.CHECKSUM, b"") if answers else b"")
+    assert line.receive() == (packet1(1, ErrorBit.CHECKSUM) if answers else b"")
     assert line.read(1, 24, 1) == 0

@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable
 
 import pytest
-from fastcrc import crc16
+from tests.kit.packets import packet2
 
 from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, LedgerEntry, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -15,12 +15,6 @@ MICROFRAME_NS = 125_000
 SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x82, 0x8A, 0x92
 PRESENT_POSITION = bytes((132, 0, 4, 0))
 IDS = (1, 2, 3, 4, 5)
-
-
-def packet2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
-    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(parameters) + 3).to_bytes(2, "little")
-    packet = head + bytes((instruction,)) + parameters
-    return packet + crc16.umts(packet).to_bytes(2, "little")
 
 
 def bus_of(ledger: Ledger, *, absent: str = "silent", baud_rate: int = 4_000_000) -> SimulatedBus:

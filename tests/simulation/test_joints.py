@@ -76,9 +76,10 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_each_slope_counts_in_its_own_direction(make_line, side):
+@pytest.mark.parametrize("what", ["slope", "margin"])
+def test_each_slope_and_margin_counts_in_its_own_direction(make_line, side, what):
     sags = []
-    for soft in ("ccw_compliance_slope", "cw_compliance_slope"):
+    for soft in (f"ccw_compliance_{what}", f"cw_compliance_{what}"):
         load = Load(gravity=0.5, gravity_angle=2.0 - side * math.pi / 2)
         line = make_line((1,), "AX-12A", position=2.0, load=load)
         line.set(soft, 128)

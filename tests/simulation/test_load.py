@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import pytest
 import serial
+from tests.kit.packets import packet2
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
@@ -105,12 +106,12 @@ def test_both_ways_of_moving_show_the_host_the_same(hang):
     assert alone > START + 500
 
 
-def test_the_process_of_simulated_buses_moves_bodies(start_buses, make_packet2):
+def test_the_process_of_simulated_buses_moves_bodies(start_buses):
     pytest.importorskip("mujoco")
     bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
     running = start_buses(SimulationConfig((bus,), bodies=bodies))
-    read = make_packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position
+    read = packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position
     with serial.Serial(running.ports["main"], 1_000_000, timeout=20) as port:
         for _ in range(20_000):  # limp, it falls within a second, however busy the machine
             port.write(read)

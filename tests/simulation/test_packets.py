@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import (
     BROADCAST,
-    Codec,
     GroupRead,
     InstructionPacket,
     InstructionReceiver,
@@ -94,16 +94,6 @@ def found_in(receiver: InstructionReceiver, data: bytes) -> Iterator[Instruction
         yield packet
 
 
-def framed(codec: Codec, servo_id: int, instruction: int, parameters: bytes) -> bytes:
-    """Return an instruction packet, put together by hand."""
-    if codec is ONE:
-        body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
-        return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-    body = stuffed(bytes((instruction,)) + parameters)
-    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little")
-    return head + body + crc16(head + body).to_bytes(2, "little")
-
-
 @pytest.mark.parametrize(("codec", "text", "servo_id", "instruction", "parameters"), INSTRUCTIONS)
 def test_instructions_of_the_manual_are_understood(codec, text, servo_id, instruction, parameters):
     data = bytes.fromhex(text)
@@ -170,8 +160,9 @@ def test_a_forgotten_begin_does_not_spoil_the_next_packet():
 )
 def test_every_packet_between_noise_is_found_once_however_it_is_cut(codec, packets, cuts):
     line, expected = b"", [each[1:] for each in packets]
-    for noise, *packet in packets:
-        line += noise + framed(codec, *packet)
+    for noise, servo_id, instruction, parameters in packets:
+        made = packet1(servo_id, instruction, *parameters), packet2(servo_id, instruction, parameters)
+        line += noise + made[codec is TWO]
     receiver, found, at = InstructionReceiver(codec), [], 0
     while at < len(line):
         piece = line[at : at + cuts[at % len(cuts)]]

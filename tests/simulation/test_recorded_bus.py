@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 from msgspec.structs import replace
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
@@ -24,7 +25,6 @@ from dxlrun.simulation import BusConfig, Ledger, SimulationConfig
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.messages import SimulationMessage
-from dxlrun.simulation.wire import protocol1, protocol2
 from exchange.simulated import SimulatedServos
 
 ROBOT = """\
@@ -144,18 +144,6 @@ class Host:
         return [entry.note for entry in self.ledger.entries if entry.direction == "note"]
 
 
-def packet1(servo_id: int, *content: int) -> bytes:
-    body = bytes((servo_id, len(content) + 1, *content))
-    return protocol1.HEADER + body + bytes((protocol1.checksum(body),))
-
-
-def packet2(servo_id: int, *content: int) -> bytes:
-    head = (
-        b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(content) + 2).to_bytes(2, "little") + bytes(content)
-    )
-    return head + protocol2.crc16(head).to_bytes(2, "little")
-
-
 def test_each_time_the_next_and_behind_the_end_the_last_again(run):
     log = run("1.0")
     asked, heard = None, []
@@ -197,7 +185,7 @@ def test_what_is_put_together_follows_what_was_heard_last(run):
         if one.kind == PacketKind.INSTRUCTION and one.data[7] in (0x82, 0x8A, 0x92)
     }
     cycle = [one for one in groups if sum(one == each.data for each in log.packets) > 20]
-    present = packet2(2, 2, 132, 0, 4, 0)
+    present = packet2(2, 2, bytes((132, 0, 4, 0)))
     heard = []
     for _ in range(30):
         for instruction in cycle:

@@ -189,6 +189,13 @@ def test_position_of_a_wheel_stays_in_its_range(line):
 # Protection
 
 
+def test_every_error_of_a_servo_that_is_listed_twice_counts(line):
+    line.put(cw_angle_limit=300, shutdown=ErrorBit.ANGLE_LIMIT)
+    line.send(BROADCAST, SYNC_WRITE, 30, 2, 1, *low_high(0), 1, *low_high(500))
+    assert line.receive() == b""
+    assert (line.get("goal_position"), line.get("torque_limit")) == (500, 0)
+
+
 def test_overload_takes_the_torque_until_the_limit_is_written(line):
     line.write(1, 30, *low_high(700))
     line.receive()

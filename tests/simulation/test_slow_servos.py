@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from tests.kit.packets import packet1, packet2
 
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, ServoTimes
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -80,18 +81,16 @@ def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came():
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_a_servo_receives_nothing_for_its_time_after_a_write(
-    make_line, make_line2, make_packet, make_packet2, protocol
-):
+def test_a_servo_receives_nothing_for_its_time_after_a_write(make_line, make_line2, protocol):
     line = (make_line if protocol == 1.0 else make_line2)((1,), write_time_ns=3 * MS)
     if protocol == 1.0:
-        ping = make_packet(1, 1)
-        write = make_packet(0xFE, 0x83, 30, 2, 1, 0, 2)
-        read = make_packet(1, 2, 36, 2)
+        ping = packet1(1, 1)
+        write = packet1(0xFE, 0x83, 30, 2, 1, 0, 2)
+        read = packet1(1, 2, 36, 2)
     else:
-        ping = make_packet2(1, 1)
-        write = make_packet2(0xFE, 0x83, bytes((116, 0, 4, 0, 1, 0, 4, 0, 0)))
-        read = make_packet2(1, 2, bytes((132, 0, 4, 0)))
+        ping = packet2(1, 1)
+        write = packet2(0xFE, 0x83, bytes((116, 0, 4, 0, 1, 0, 4, 0, 0)))
+        read = packet2(1, 2, bytes((132, 0, 4, 0)))
     port = line.ports.ports[0]
     assert ask(line, port, read)
     assert ask(line, port, read), "a read takes no such time"
