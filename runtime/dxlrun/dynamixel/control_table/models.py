@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -99,13 +100,15 @@ def all_tables() -> tuple[ControlTable, ...]:
     return tuple(sorted(tables, key=lambda each: (each.protocol, each.model_number, each.firmware)))
 
 
-def models_by_number(number: int, protocol: float) -> tuple[ControlTable, ...]:
+def models_by_number(number: int, protocol: float, firmware: float = math.inf) -> tuple[ControlTable, ...]:
     """Return the tables of a model number that a servo of this protocol answers, newest firmware first.
 
-    It is empty when the number is unknown; it has several when the table depends on the firmware.
+    It is empty when the number is unknown; it has several when the table depends on the firmware: the first
+    one is that of a servo of this `firmware`.
     """
     found = [listing.build() for listing in _listings(protocol) if listing.model_number == number]
-    return tuple(sorted(found, key=lambda each: -each.firmware))
+    fitting = [each for each in found if each.firmware <= firmware]
+    return tuple(sorted(fitting, key=lambda each: -each.firmware))
 
 
 def add_control_table(text: str) -> ControlTable:

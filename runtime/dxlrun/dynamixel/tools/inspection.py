@@ -13,17 +13,16 @@ from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
+from dxlrun.dynamixel.plan.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
+from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Result
 
-_IDENTITY_LENGTH = 3
-"""Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
 NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken
 
 
@@ -154,9 +153,7 @@ def _identify(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity,
     for servo in plan.servos:
         if servo.joint not in joints:
             continue
-        reply = yield from retry(line.ping(servo.servo_id))
-        if reply.answered and line.dialect.PING_LENGTH < _IDENTITY_LENGTH:
-            reply = yield from retry(line.read(servo.servo_id, 0, _IDENTITY_LENGTH))
+        _, reply = yield from identity(line, servo.servo_id)
         identities.append(_identity(plan, servo, reply))
     return tuple(identities)
 
@@ -172,9 +169,8 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
         problem = f"{name} {how}; its model is not known, so write it in the robot file"
         return Identity(servo.joint, "", problem)
     number, firmware = reply.word(), reply.parameters[2]
-    for table in models_by_number(number, plan.protocol):
-        if table.firmware <= firmware:
-            return Identity(servo.joint, table.model, "")
+    if tables := models_by_number(number, plan.protocol, firmware):
+        return Identity(servo.joint, tables[0].model, "")
     problem = (
         f"{name} is model number {number}, firmware {firmware}, and no control table of Protocol "
         f"{plan.protocol} has it: a plug-in can add one"

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
+from dxlrun.dynamixel.control_table import ControlItem, all_tables, models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
@@ -33,6 +33,7 @@ LATE_OF_FEW_NS = 100_000_000
 FEW = 20  # So many IDs are quicker pinged one by one
 _USUAL = (1_000_000, 57_600, 115_200)
 _IDENTITY_LENGTH = 3
+"""Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2  # Of a ping at a rate that is one of many
 _TRIES_ALONE = 4  # Where protocol and rate are given: there it is awaited with longer timeouts
@@ -196,20 +197,25 @@ def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Trans
     return structs.replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
 
 
+def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
+    """Ping a servo; return the reply to that, and the one with its model number and firmware version."""
+    ping = yield from retry(line.ping(servo_id))
+    if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
+        return ping, ping
+    return ping, (yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH)))
+
+
 def look(line: Line, servo_id: int) -> Program[FoundServo]:
     """Read the model and settings of a servo that is there; writes nothing."""
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
-    ping = yield from retry(line.ping(servo_id))
-    reply = ping
-    if ping.answered and dialect.PING_LENGTH < _IDENTITY_LENGTH:
-        reply = yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH))
+    ping, reply = yield from identity(line, servo_id)
     if not reply.answered:
         garbled = Outcome.GARBLED in (ping.outcome, reply.outcome)
         return replace(servo, garbled=garbled, remarks=(_mute(ping, reply, line),))
     number, firmware = reply.word(), reply.parameters[2]
     remarks = [dialect.describe_error(reply.error)] if reply.error else []
-    table = _table(number, firmware, dialect.PROTOCOL)
+    table = next(iter(models_by_number(number, dialect.PROTOCOL, firmware)), None)
     device = next(iter(devices_by_number(number, dialect.PROTOCOL)), None)
     if table is None and device is not None:
         known = replace(servo, model=device.model, model_number=number, firmware=firmware, device=True)
@@ -263,7 +269,3 @@ def _mute(ping: Reply, reply: Reply, line: Line) -> str:
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
     return "answers pings but no read: its Status Return Level (16) is 0"
-
-
-def _table(number: int, firmware: int, protocol: float) -> ControlTable | None:
-    return next((each for each in models_by_number(number, protocol) if each.firmware <= firmware), None)

@@ -58,10 +58,7 @@ def _table(config: ServoConfig, protocol: float) -> ControlTable:
     table = control_table(config.model, protocol)
     if config.firmware is None:
         return table
-    fitting = (
-        each for each in models_by_number(table.model_number, protocol) if each.firmware <= config.firmware
-    )
-    return next(fitting, table)
+    return next(iter(models_by_number(table.model_number, protocol, config.firmware)), table)
 
 
 def _baud_value(table: ControlTable, baud_rate: int) -> int:
