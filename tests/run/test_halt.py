@@ -56,14 +56,7 @@ def loop(kind: str, data: bytes = b"") -> Command:
     return Command(next(NUMBERS), LOOP, kind, data, "anna")
 
 
-def ran(
-    folder: Path,
-    steps: dict[float, list[Command]],
-    *,
-    seconds: float = 3.0,
-    text: str = ROBOT,
-    before: Callable[[VirtualRobot], None] = lambda robot: None,
-) -> tuple[VirtualRobot, Log]:
+def ran(folder, steps, *, seconds=3.0, text=ROBOT, before=lambda robot: None):
     (folder / "robot.yaml").write_text(text)
     robot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=folder / "run.mcap")
 

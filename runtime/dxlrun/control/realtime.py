@@ -64,21 +64,15 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
 
     Order matters: what allocates comes first, the policy last, so that nothing slow runs with priority.
     """
-    grants = (
-        freeze_collector(),
-        _timer_slack(),
-        *((_stay_on(plan.cores),) if plan.cores else ()),
-        _keep_memory(),
-        *((lock_memory(),) if plan.lock_memory else ()),
-        *((keep_awake(),) if plan.idle_latency else ()),
-        *(
-            (set_policy(plan.policy, plan.priority, guardian_priority(plan)),)
-            if plan.policy != "other"
-            else ()
-        ),
-    )
+    grants = [freeze_collector(), _timer_slack()]
+    grants += [_stay_on(plan.cores)] if plan.cores else []
+    grants += [_keep_memory()]
+    grants += [lock_memory()] if plan.lock_memory else []
+    grants += [keep_awake()] if plan.idle_latency else []
+    if plan.policy != "other":
+        grants += [set_policy(plan.policy, plan.priority, guardian_priority(plan))]
     ordinary = plan.policy == "other" or not grants[-1].granted
-    return (*grants, *_short_slice()) if ordinary else grants
+    return (*grants, *_short_slice()) if ordinary else tuple(grants)
 
 
 def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
@@ -128,14 +122,20 @@ def _tasks() -> int | None:
         return None
 
 
-def _requested(request: str) -> Callable[[Callable[P, Grant]], Callable[P, Grant]]:
-    """Let whatever fails be a refusal, because a robot runs without it too."""
+class _Refused(Exception):
+    """The sentence and the fix of a grant that was refused."""
 
-    def decorate(act: Callable[P, Grant]) -> Callable[P, Grant]:
+
+def _requested(request: str) -> Callable[[Callable[P, str]], Callable[P, Grant]]:
+    """Make a grant of what is returned, or raised: whatever fails is refused, as a robot runs without it."""
+
+    def decorate(act: Callable[P, str]) -> Callable[P, Grant]:
         @wraps(act)
         def attempt(*arguments: P.args, **named: P.kwargs) -> Grant:
             try:
-                return act(*arguments, **named)
+                return Grant(request, True, act(*arguments, **named))
+            except _Refused as refused:
+                return Grant(request, False, *refused.args)
             except (AttributeError, OSError, ValueError) as error:
                 return Grant(request, False, f"{request}: this system does not offer it ({error})")
 
@@ -145,32 +145,30 @@ def _requested(request: str) -> Callable[[Callable[P, Grant]], Callable[P, Grant
 
 
 @_requested("scheduler")
-def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant:
+def set_policy(policy: Policy, priority: int, limit: int | None = None) -> str:
     """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
 
     `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
     """
     if policy == "other":
-        return Grant("scheduler", True, "the ordinary scheduler was asked for")
+        return "the ordinary scheduler was asked for"
     kind = os.SCHED_FIFO if policy == "fifo" else os.SCHED_RR
     try:
         os.sched_setscheduler(0, kind | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except PermissionError:
-        return Grant(
-            "scheduler",
-            False,
+        raise _Refused(
             f"scheduler {policy} {priority} was refused, it runs with ordinary priority and any busy "
             "program may delay it by milliseconds",
             f"allow it with `{allow('rtprio', limit or priority)}` {_AGAIN}",
-        )
-    return Grant("scheduler", True, f"scheduler {policy}, priority {priority}")
+        ) from None
+    return f"scheduler {policy}, priority {priority}"
 
 
 @_requested("timer slack")
-def _timer_slack() -> Grant:
+def _timer_slack() -> str:
     """Ask Linux to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
     succeed(libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0))
-    return Grant("timer slack", True, "timer slack 1 ns")
+    return "timer slack 1 ns"
 
 
 SLICE_NS = 100_000
@@ -197,37 +195,26 @@ def _short_slice() -> tuple[Grant, ...]:
         return ()
     if _SCHED_ATTR.unpack(found.raw)[5] != SLICE_NS:
         return ()
-    return (
-        Grant(
-            "time slice",
-            True,
-            f"time slices of {SLICE_NS / 1e6:g} ms, they begin sooner than those of other programs",
-        ),
-    )
+    sentence = f"time slices of {SLICE_NS / 1e6:g} ms, they begin sooner than those of other programs"
+    return (Grant("time slice", True, sentence),)
 
 
 @_requested("cores")
-def _stay_on(cores: Sequence[int]) -> Grant:
+def _stay_on(cores: Sequence[int]) -> str:
     """Bind the calling thread to cores; Linux drops those that there are not (sched_setaffinity(2))."""
-    before = os.sched_getaffinity(0)
+    before, fix = os.sched_getaffinity(0), "write others under loop.scheduler.cores"
     try:
         os.sched_setaffinity(0, cores)
     except OSError:
-        return Grant(
-            "cores",
-            False,
-            f"there is no core {_listed(cores)} for this process, it runs on {_listed(sorted(before))}",
-            "write others under loop.scheduler.cores",
+        found, missing = sorted(before), list(cores)
+    else:
+        found = sorted(os.sched_getaffinity(0))
+        missing, fix = sorted(set(cores) - set(found)), "take it out of loop.scheduler.cores"
+    if missing:
+        raise _Refused(
+            f"there is no core {_listed(missing)} for this process, it runs on {_listed(found)}", fix
         )
-    found = sorted(os.sched_getaffinity(0))
-    if missing := sorted(set(cores) - set(found)):
-        return Grant(
-            "cores",
-            False,
-            f"there is no core {_listed(missing)} for this process, it runs on {_listed(found)}",
-            "take it out of loop.scheduler.cores",
-        )
-    return Grant("cores", True, f"stays on {'core' if len(found) == 1 else 'cores'} {_listed(found)}")
+    return f"stays on {'core' if len(found) == 1 else 'cores'} {_listed(found)}"
 
 
 def _listed(cores: Sequence[int]) -> str:
@@ -235,41 +222,37 @@ def _listed(cores: Sequence[int]) -> str:
 
 
 @_requested("memory in place")
-def _keep_memory() -> Grant:
+def _keep_memory() -> str:
     kept = keep_freed()
     touch()
-    how = "what is freed is kept" if kept else "what is freed goes back to the kernel, mallopt is missing"
-    return Grant("memory in place", kept, f"{HEAP >> 20} MiB of heap and the stack are touched, {how}")
+    touched = f"{HEAP >> 20} MiB of heap and the stack are touched, what is freed"
+    if not kept:
+        raise _Refused(f"{touched} goes back to the kernel, mallopt is missing")
+    return f"{touched} is kept"
 
 
 @_requested("locked memory")
-def lock_memory() -> Grant:
+def lock_memory() -> str:
     """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
     if not may_lock():
-        return Grant(
-            "locked memory",
-            False,
+        raise _Refused(
             "memory is not locked, a page that was swapped out may delay it by milliseconds",
             f"allow it with `{allow('memlock', 'unlimited')}` {_AGAIN}",
         )
     succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))  # mlockall(2)
-    return Grant("locked memory", True, "all memory is locked")
+    return "all memory is locked"
 
 
 @_requested("idle latency")
-def keep_awake() -> Grant:
+def keep_awake() -> str:
     """Keep the cores from deep idle states for as long as this process lives; never raises."""
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
     except PermissionError:
-        return Grant(
-            "idle latency",
-            False,
-            "cores may sleep deeply and wake some 100 us late",
-            f"allow it with `{allow_idle_latency()}`",
-        )
+        sentence = "cores may sleep deeply and wake some 100 us late"
+        raise _Refused(sentence, f"allow it with `{allow_idle_latency()}`") from None
     os.write(descriptor, struct.pack("i", 0))  # never closed: the request ends with the descriptor
-    return Grant("idle latency", True, "cores are kept from deep idle states")
+    return "cores are kept from deep idle states"
 
 
 def allow_idle_latency(account: str = "") -> str:
