@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from dxlrun.compile import Compiled, compile_files
 from dxlrun.description import Description, Replacement, read_motion, survey_robot
@@ -16,8 +17,8 @@ from dxlrun.description.document import text_of
 from dxlrun.errors import InputError, Mark, Problem
 from dxlrun.run.virtual_run import require_simulated
 from dxlrun_lab.desired import DesiredPath, desired_paths, motion_samples
-from dxlrun_lab.sweep.places import Place, find_place
-from dxlrun_lab.sweep.ranges import Range, Value, parse_range
+from dxlrun_lab.sweep.places import find_place
+from dxlrun_lab.sweep.ranges import Parameter, Value, parse_range
 
 MOST_RUNS = 10_000
 _MOST_TRIED = 16
@@ -26,20 +27,6 @@ _MOST_CHECKED = 64
 """Values of each parameter, evenly spaced, its ends among them; of more, a mistake may be a row."""
 Point = tuple[int, ...]
 """Of each parameter, which of its values."""
-
-
-class Parameter(NamedTuple):
-    """One value of the robot file that the sweep changes."""
-
-    place: Place
-    range: Range
-    mark: Mark
-    """Where it stands"""
-
-    @property
-    def name(self) -> str:
-        """As the command line has it: `gains.p`."""
-        return self.range.path
 
 
 class Grid:
@@ -64,28 +51,26 @@ class Grid:
     @property
     def size(self) -> int:
         """How many points there are."""
-        return math.prod(len(parameter.range.values) for parameter in self.parameters)
+        return math.prod(len(parameter.values) for parameter in self.parameters)
 
     @property
     def points(self) -> Iterator[Point]:
         """Yield every point, the last parameter changing first."""
-        return itertools.product(*(range(len(parameter.range.values)) for parameter in self.parameters))
+        return itertools.product(*(range(len(parameter.values)) for parameter in self.parameters))
 
     def values(self, point: Point) -> tuple[Value, ...]:
         """Return the values of a point, in the order of the parameters."""
-        return tuple(
-            parameter.range.values[index] for parameter, index in zip(self.parameters, point, strict=True)
-        )
+        return tuple(parameter.values[index] for parameter, index in zip(self.parameters, point, strict=True))
 
     def compiled(self, point: Point) -> Compiled:
         """Return a point as a run would have it; raises InputError with what the file does not allow."""
         arguments = dict(self._arguments)
         replacements: list[Replacement] = []
         for parameter, value in zip(self.parameters, self.values(point), strict=True):
-            if parameter.place.argument is not None:
-                arguments[parameter.place.argument] = text_of(value)
+            if parameter.argument is not None:
+                arguments[parameter.argument] = text_of(value)
             else:
-                replacements.append(Replacement(parameter.place.path, value))
+                replacements.append(Replacement(parameter.place, value))
         return compile_files(self._robot, arguments, self._files, replacements=replacements)
 
     def paths(self, compiled: Compiled) -> tuple[DesiredPath, ...]:
@@ -98,7 +83,7 @@ class Grid:
         Where a range is wrong, the values cannot be checked; the file is, as it stands.
         """
         problems: list[Problem] = []
-        ranges: list[tuple[str, Range]] = []
+        ranges: list[tuple[str, Parameter]] = []
         for text in texts:
             try:
                 ranges.append((text, parse_range(text)))
@@ -115,18 +100,19 @@ class Grid:
         return tuple(parameters)
 
     def _placed(
-        self, description: Description, ranges: Sequence[tuple[str, Range]], problems: list[Problem]
+        self, description: Description, ranges: Sequence[tuple[str, Parameter]], problems: list[Problem]
     ) -> list[Parameter]:
         parameters: list[Parameter] = []
         for text, found in ranges:
             try:
                 place = find_place(description, found.steps)
-                if place.argument is not None and place.argument in self._arguments:
-                    given = self._arguments[place.argument]
-                    raise ValueError(f"argument {place.argument} is given as {given}, too; give one of them")
+                one = replace(found, place=place, mark=description.marks.value(*place))
+                if one.argument is not None and one.argument in self._arguments:
+                    given = self._arguments[one.argument]
+                    raise ValueError(f"argument {one.argument} is given as {given}, too; give one of them")
                 if any(parameter.place == place for parameter in parameters):
-                    raise ValueError(f"{place.text} is swept twice; give one range for it")
-                parameters.append(Parameter(place, found, description.marks.value(*place.path)))
+                    raise ValueError(f"{one.place_text} is swept twice; give one range for it")
+                parameters.append(one)
             except ValueError as error:
                 problems.append(_mistake(text, error))
         return parameters
@@ -144,9 +130,9 @@ class Grid:
     def _with_those_of_the_file(self, problems: list[Problem], found: Sequence[Parameter]) -> list[Problem]:
         """Return problems and what is wrong with the files, with a value for each swept argument."""
         arguments = {
-            parameter.place.argument: text_of(parameter.range.values[0])
+            parameter.argument: text_of(parameter.values[0])
             for parameter in found
-            if parameter.place.argument is not None
+            if parameter.argument is not None
         }
         try:
             compile_files(self._robot, {**arguments, **self._arguments}, self._files)
@@ -165,7 +151,7 @@ class Grid:
         start = (0,) * len(self.parameters)
         tried: dict[Point, Compiled | tuple[Problem, ...]] = {}
         for axis, parameter in enumerate(self.parameters):
-            for index in _some_of(len(parameter.range.values)):
+            for index in _some_of(len(parameter.values)):
                 point = (*start[:axis], index, *start[axis + 1 :])
                 if point not in tried:
                     tried[point] = self._tried(point)
@@ -197,7 +183,7 @@ class Grid:
 
     def _with_value(self, axis: int, index: int) -> Iterator[Point]:
         """Yield the points with a value, those first that have other values than the first ones."""
-        counts = [len(parameter.range.values) for parameter in self.parameters]
+        counts = [len(parameter.values) for parameter in self.parameters]
         return itertools.product(
             *((index,) if other == axis else reversed(range(count)) for other, count in enumerate(counts))
         )
@@ -209,12 +195,12 @@ class Grid:
         have it.
         """
         found = [tuple(problem for problem in each if problem.severity == "error") for each in bad.values()]
-        everywhere = len(bad) == sum(len(_some_of(len(one.range.values))) for one in self.parameters)
+        everywhere = len(bad) == sum(len(_some_of(len(one.values))) for one in self.parameters)
         own = {parameter.mark for parameter in self.parameters}
         shared = [problem for problem in _in_all(found) if everywhere and problem.mark not in own]
         of_axes: dict[tuple[Mark, str], dict[int, list[tuple[str, Problem]]]] = {}
         for (axis, index), problems in zip(bad, found, strict=True):
-            value = text_of(self.parameters[axis].range.values[index])
+            value = text_of(self.parameters[axis].values[index])
             for problem in problems:
                 if problem not in shared:
                     axes = of_axes.setdefault((problem.mark, problem.fix), {})
@@ -224,7 +210,7 @@ class Grid:
             axis = min(axes, key=lambda axis: (self.parameters[axis].mark != mark, len(axes[axis])))
             values, problem = [value for value, _ in axes[axis]], axes[axis][0][1]
             what = f"with {self.parameters[axis].name}={_listed(values)}: {problem.what}"
-            named.append(replace(problem, what=what))
+            named.append(dataclasses.replace(problem, what=what))
         return sorted(
             (*shared, *named), key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark)
         )

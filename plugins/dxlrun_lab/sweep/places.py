@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Set
 from contextlib import suppress
 
-import msgspec
-
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description import Description, KeyPath, Robot
@@ -19,33 +17,16 @@ _OWN_KEYS = ("type", "active", "rate", "fallback", "into")
 """Of a controller's entry; all others are parameters of its type."""
 
 
-class Place(msgspec.Struct, frozen=True):
-    """A value of the robot file: one of its arguments, or what stands at a path."""
-
-    path: KeyPath
-    """`("arguments", "rate")` for an argument."""
-
-    @property
-    def argument(self) -> str | None:
-        """The argument's name."""
-        return str(self.path[1]) if self.path[0] == "arguments" else None
-
-    @property
-    def text(self) -> str:
-        """The path as text; of an argument its name."""
-        return self.argument or path_text(self.path)
-
-
-def find_place(description: Description, steps: KeyPath) -> Place:
+def find_place(description: Description, steps: KeyPath) -> KeyPath:
     """Return the place that a path means, shortened as far as it stays clear.
 
-    An argument's name is that argument. Else it is the only value of the file whose path ends so; else the
-    only place that the file could have, such as a register that it does not declare. Raises ValueError with
-    `what; how to fix it`.
+    An argument's name is that argument, ("arguments", NAME). Else it is the only value of the file whose path
+    ends so; else the only place that the file could have, such as a register that it does not declare. Raises
+    ValueError with `what; how to fix it`.
     """
     name = path_text(steps)
     if len(steps) == 1 and steps[0] in description.arguments:
-        return Place(("arguments", str(steps[0])))
+        return ("arguments", str(steps[0]))
     written = set(_written(description))
     containers = {path[:end] for path in written for end in range(len(path))}
     found = sorted((path for path in written if path[-len(steps) :] == steps), key=path_text)
@@ -58,7 +39,7 @@ def find_place(description: Description, steps: KeyPath) -> Place:
         possible = _possible(description, steps, containers)
         found = sorted((path for path in possible if not _below_one(path, written)), key=path_text)
     if len(found) == 1:
-        return Place(found[0])
+        return found[0]
     if found:
         raise ValueError(
             f"{name} stands at {len(found)} places; name one of them: {_some([path_text(p) for p in found])}"

@@ -7,7 +7,10 @@ import re
 
 import msgspec
 
+from dxlrun.description.arguments import COMMAND_LINE
 from dxlrun.description.document import KeyPath, plain_value
+from dxlrun.description.problems import path_text
+from dxlrun.errors import Mark
 
 Value = str | float | bool
 """As the robot file has it (int included): 0.5, `5 rad/s^2`, true."""
@@ -23,15 +26,29 @@ _NUMBER = re.compile(
 _STEP = re.compile(r"(?P<key>[A-Za-z_][A-Za-z0-9_]*)(?P<indices>(?:\[\d+\])*)")
 
 
-class Range(msgspec.Struct, frozen=True):
-    """The values of one parameter, in order, before its place in the robot file is known."""
+class Parameter(msgspec.Struct, frozen=True):
+    """One value of the robot file that the sweep changes, and what it is in turn."""
 
-    path: str
+    name: str
     """As it was written: `gains.p`."""
     steps: KeyPath
     values: tuple[Value, ...]
     unit: str = ""
     """Of all values: `rad/s^2`; empty for plain numbers and for words."""
+    place: KeyPath = ()
+    """Where it is in the robot file, `("arguments", "rate")` for an argument; empty: not looked up yet."""
+    mark: Mark = Mark(COMMAND_LINE)
+    """Where it stands"""
+
+    @property
+    def argument(self) -> str | None:
+        """The argument's name; None: it is none."""
+        return str(self.place[1]) if self.place[0] == "arguments" else None
+
+    @property
+    def place_text(self) -> str:
+        """The place as text; of an argument its name."""
+        return self.argument or path_text(self.place)
 
     @property
     def cells(self) -> tuple[float, ...] | tuple[str, ...]:
@@ -42,7 +59,7 @@ class Range(msgspec.Struct, frozen=True):
         return tuple(str(value).lower() if isinstance(value, bool) else str(value) for value in self.values)
 
 
-def parse_range(text: str) -> Range:
+def parse_range(text: str) -> Parameter:
     """Read one `--over`; raises ValueError with `what; how to fix it`."""
     path, sign, values = text.partition("=")
     path, values = path.strip(), values.strip()
@@ -65,7 +82,7 @@ def parse_range(text: str) -> Range:
         raise ValueError(
             f"its values have different units ({', '.join(map(_unit, sorted(units)))}); give all one"
         )
-    return Range(path, steps, read, next(iter(units)))
+    return Parameter(path, steps, read, next(iter(units)))
 
 
 def _steps(path: str) -> KeyPath:
@@ -82,7 +99,7 @@ def _steps(path: str) -> KeyPath:
     return tuple(steps)
 
 
-def _spaced(path: str, steps: KeyPath, found: re.Match[str]) -> Range:
+def _spaced(path: str, steps: KeyPath, found: re.Match[str]) -> Parameter:
     (low, low_unit), (high, unit) = (_split(_scalar(found[end].strip())) for end in ("low", "high"))
     count, log = int(found["count"]), found["log"] is not None
     if low is None or high is None:
@@ -104,7 +121,7 @@ def _spaced(path: str, steps: KeyPath, found: re.Match[str]) -> Range:
         if len(set(numbers)) < count:
             raise ValueError(f"{low}..{high} has fewer than {count} whole numbers; give fewer points")
     whole = isinstance(low, int) and isinstance(high, int)
-    return Range(path, steps, tuple(_written(number, unit, whole=whole) for number in numbers), unit)
+    return Parameter(path, steps, tuple(_written(number, unit, whole=whole) for number in numbers), unit)
 
 
 def _written(number: float, unit: str, *, whole: bool) -> Value:

@@ -109,7 +109,7 @@ class Sweep:
 
     def _numbers(self, point: Point) -> tuple[Value, ...]:
         return tuple(
-            parameter.range.cells[index] for parameter, index in zip(self.grid.parameters, point, strict=True)
+            parameter.cells[index] for parameter, index in zip(self.grid.parameters, point, strict=True)
         )
 
     def _keep(self, run: str, result: Measured) -> None:
@@ -142,9 +142,9 @@ def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHe
         arguments=dict(arguments),
         parameters=tuple(
             ParameterColumn(
-                parameter.place.text,
-                parameter.range.unit,
-                "number" if isinstance(parameter.range.cells[0], float) else "word",
+                parameter.place_text,
+                parameter.unit,
+                "number" if isinstance(parameter.cells[0], float) else "word",
             )
             for parameter in grid.parameters
         ),

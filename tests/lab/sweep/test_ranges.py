@@ -37,7 +37,7 @@ def test_a_range_is_these_values(text, values):
 
 def test_a_range_keeps_its_unit_apart_from_its_numbers():
     found = parse_range("limits.velocity=1 rad/s..3 rad/sx3")
-    assert (found.path, found.unit, found.cells) == ("limits.velocity", "rad/s", (1, 2, 3))
+    assert (found.name, found.unit, found.cells) == ("limits.velocity", "rad/s", (1, 2, 3))
     assert parse_range("active=true,false").cells == ("true", "false")
     logarithmic = parse_range("p=2..32x5log")
     assert [math.log2(number) for number in logarithmic.cells] == pytest.approx([1, 2, 3, 4, 5])
