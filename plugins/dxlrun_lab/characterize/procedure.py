@@ -62,7 +62,6 @@ class Found:
     moves: list[response.Step] = field(default_factory=list)
     gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
     """By interface"""
-    rests: list[dead_band.Approach] = field(default_factory=list)
     band: Trace | None = None
 
     def value(self, name: str) -> float | None:
@@ -280,7 +279,7 @@ class Characterize:
             trace = self._trace(situation, joint, recorded)
             rests = dead_band.approaches(trace)
             turned = [one for one in rests if math.isfinite(one.reversal)]
-            found.band, found.rests = trace, rests
+            found.band = trace
             if len(turned) >= len(places) or reach >= most:
                 break
             reach *= 3

@@ -122,15 +122,9 @@ class PlayedOn:
 NOWHERE = PlayedOn()
 
 
-@dataclass(frozen=True, slots=True)
-class Form:
-    """How the result is printed."""
-
-    as_json: bool
-    debug: bool
-
-
-def play_recorded(log: Path, chosen: Chosen, played_on: PlayedOn, part: RecordedPart, form: Form) -> int:
+def play_recorded(
+    log: Path, chosen: Chosen, played_on: PlayedOn, part: RecordedPart, *, as_json: bool
+) -> int:
     """Play the motion of a recording on the robot of `chosen`, and return the exit code."""
     from dxlrun_analysis.playback.rows import rows_of
     from dxlrun_lab.playback import Playback
@@ -147,10 +141,10 @@ def play_recorded(log: Path, chosen: Chosen, played_on: PlayedOn, part: Recorded
     )
     playback = Playback(rows)
     chosen = chosen._replace(joints=rows.joints)
-    options = OnRobot(virtual=played_on.virtual, yes=played_on.yes, as_json=form.as_json, debug=form.debug)
+    options = OnRobot(virtual=played_on.virtual, yes=played_on.yes)
     course = Course("the motion", ranges=None, back=False, expected=playback.expected)
     ran = perform_on(playback, chosen, plan, options, course)
-    if form.as_json:
+    if as_json:
         show_json(_content(ran))
     elif ran.result is not None:
         show(*_parts(ran, ran.result, log))

@@ -12,7 +12,7 @@ from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import print_warning, show, show_json
 from dxlrun_lab.commands.on_robot import Chosen
-from dxlrun_lab.commands.recorded import ALL_OF_IT, NOWHERE, Form, PlayedOn, RecordedPart, play_recorded
+from dxlrun_lab.commands.recorded import ALL_OF_IT, NOWHERE, PlayedOn, RecordedPart, play_recorded
 
 if TYPE_CHECKING:
     from dxlrun.output.table import Part
@@ -57,7 +57,7 @@ def replay(
                 "--set belongs to the controllers of the log, which --on does not run; leave one out"
             )
         chosen = Chosen(played_on.on, assignments, ())
-        return play_recorded(log, chosen, played_on, part, Form(as_json, debug))
+        return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")

@@ -7,9 +7,11 @@ simulated side by side: each from a bit before the part that is compared, so tha
 from __future__ import annotations
 
 import itertools
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Torque
@@ -118,15 +120,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
             f"identification takes at least {_LEAST_S:g} s; record a longer run"
         )
     _require_motion(name, time_s[fresh], position[fresh], servo)
-    run = _Columns(time_s, sent_s, position, effort, command, volts, fresh)
-    groups = []
-    for mode in (True, False):
-        chosen = [span for span in spans if bool(by_position[span.start]) is mode]
-        group = _compared(run, chosen, servo.control(by_position=mode))
-        groups += [group] if group is not None else []
-    if not groups:
-        raise InputError(f"{name}: too few samples of it arrived in this log; look at `dxlrun analyze`")
-    return Measured(
+    run = Measured(
         servo=servo,
         time_s=time_s[fresh],
         position=position[fresh],
@@ -134,20 +128,27 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
         command=command[fresh],
         voltage=volts[fresh],
         by_position=by_position[fresh],
-        groups=tuple(groups),
+        groups=(),
         seconds=seconds,
         lost_s=float(time_s[-1] - time_s[0]) - seconds,
     )
+    sent = _Sent(sent_s, command, volts)
+    groups = []
+    for mode in (True, False):
+        chosen = [span for span in spans if bool(by_position[span.start]) is mode]
+        group = _compared(run, sent, chosen, servo.control(by_position=mode))
+        groups += [group] if group is not None else []
+    if not groups:
+        raise InputError(f"{name}: too few samples of it arrived in this log; look at `dxlrun analyze`")
+    return replace(run, groups=tuple(groups))
 
 
-class _Columns(msgspec.Struct, frozen=True):
+class _Sent(NamedTuple):
+    """What was sent in each cycle, also where no reply came."""
+
     time_s: Floats
-    sent_s: Floats
-    position: Floats
-    effort: Floats
     command: Floats
     voltage: Floats
-    fresh: Flags
 
 
 def _usable(cycles: NDArray[np.void], row: int) -> Flags:
@@ -252,20 +253,19 @@ def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
     return slopes
 
 
-def _compared(run: _Columns, spans: list[slice], control: Control) -> Compared | None:
+def _compared(run: Measured, sent: _Sent, spans: list[slice], control: Control) -> Compared | None:
     """Cut spans into pieces of one length, and find the samples of each; None: there are none."""
     starts: list[float] = []
     for span in spans:
-        first, last = float(run.sent_s[span.start]), float(run.sent_s[span.stop - 1])
+        first, last = float(sent.time_s[span.start]), float(sent.time_s[span.stop - 1])
         count = int((last - first - LEAD_S) / PIECE_S)
         starts += [first + index * PIECE_S for index in range(count)]
-    fresh_s, fresh_at = run.time_s[run.fresh], run.position[run.fresh]
-    efforts = run.effort[run.fresh]
-    if not starts or len(fresh_s) < 2:
+    if not starts or len(run.time_s) < 2:
         return None
     steps = round((LEAD_S + PIECE_S) / STEP_S)
     samples = [
-        np.flatnonzero((fresh_s >= start + LEAD_S) & (fresh_s < start + LEAD_S + PIECE_S)) for start in starts
+        np.flatnonzero((run.time_s >= start + LEAD_S) & (run.time_s < start + LEAD_S + PIECE_S))
+        for start in starts
     ]
     kept = [(start, some) for start, some in zip(starts, samples, strict=True) if len(some) >= 10]
     if not kept:
@@ -275,15 +275,15 @@ def _compared(run: _Columns, spans: list[slice], control: Control) -> Compared |
     pieces = Pieces(
         start_s=begin,
         steps=steps,
-        voltage=np.interp(grid, run.sent_s, run.voltage),
-        position=np.interp(begin, fresh_s, fresh_at),
-        velocity=_slopes(fresh_s, fresh_at, begin),
-        command_s=run.sent_s[np.isfinite(run.command)],
-        command=run.command[np.isfinite(run.command)],
+        voltage=np.interp(grid, sent.time_s, sent.voltage),
+        position=np.interp(begin, run.time_s, run.position),
+        velocity=_slopes(run.time_s, run.position, begin),
+        command_s=sent.time_s[np.isfinite(sent.command)],
+        command=sent.command[np.isfinite(sent.command)],
     )
     piece = np.concatenate([np.full(len(some), index) for index, (_, some) in enumerate(kept)])
     chosen = np.concatenate([some for _, some in kept])
-    along = (fresh_s[chosen] - begin[piece]) / STEP_S
+    along = (run.time_s[chosen] - begin[piece]) / STEP_S
     step = np.minimum(along.astype(np.intp), steps - 1)
     return Compared(
         pieces=pieces,
@@ -291,8 +291,8 @@ def _compared(run: _Columns, spans: list[slice], control: Control) -> Compared |
         piece=piece,
         step=step,
         part=along - step,
-        position=fresh_at[chosen],
-        effort=efforts[chosen],
-        effort_rate=np.abs(np.gradient(efforts, fresh_s))[chosen],
-        time_s=fresh_s[chosen],
+        position=run.position[chosen],
+        effort=run.effort[chosen],
+        effort_rate=np.abs(np.gradient(run.effort, run.time_s))[chosen],
+        time_s=run.time_s[chosen],
     )
