@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -11,7 +12,6 @@ from dxlrun.output.terminal import out, print_error, progress_bar, show, show_js
 
 if TYPE_CHECKING:
     from dxlrun_analysis.latency.conditions import Settings
-    from dxlrun_analysis.latency.statistics import Result
     from dxlrun_lab.latency.measurement import Measured
 
 _INTERRUPTED = 130
@@ -141,6 +141,7 @@ def _show(
 ) -> int:
     import msgspec
 
+    from dxlrun_analysis.latency.latency_log import machine, write
     from dxlrun_analysis.latency.statistics import figures
     from dxlrun_analysis.latency.tables import parts
 
@@ -151,14 +152,22 @@ def _show(
         if measured.interrupted:
             raise KeyboardInterrupt
         raise InputError(measured.failure or "nothing was measured")
+    if not as_json:
+        show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
+    with out().status("writing the log") if not as_json else nullcontext():
+        if target is not None:
+            summary = write(target, settings, measured.blocks, load, measured.remarks)
+            if summary.error:
+                code = code or 1
+                print_error(f"dxlrun: the log {target} is incomplete: {summary.error}")
+        if report is not None:
+            from dxlrun_analysis.latency.page import page
+
+            write_report(report, page(result, measured.blocks, machine()))
     if as_json:
-        incomplete = _keep(settings, measured, result, load, target, report)
         more = {"log": None if target is None else str(target), "failure": measured.failure}
         show_json(msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted})
-        return code or incomplete
-    show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
-    with out().status("writing the log"):
-        incomplete = _keep(settings, measured, result, load, target, report)
+        return code
     if target is not None:
         show(f"\nlog: {target}")
     if report is not None:
@@ -167,30 +176,7 @@ def _show(
         print_error(f"dxlrun: {measured.failure}; the table has what was measured before")
     if measured.interrupted:
         print_error("interrupted; the table has what was measured before")
-    return code or incomplete
-
-
-def _keep(  # noqa: PLR0917  what there is to keep, and where
-    settings: Settings,
-    measured: Measured,
-    result: Result,
-    load: str,
-    target: Path | None,
-    report: Path | None,
-) -> int:
-    from dxlrun_analysis.latency.latency_log import machine, write
-
-    incomplete = False
-    if target is not None:
-        summary = write(target, settings, measured.blocks, load, measured.remarks)
-        incomplete = bool(summary.error)
-        if summary.error:
-            print_error(f"dxlrun: the log {target} is incomplete: {summary.error}")
-    if report is not None:
-        from dxlrun_analysis.latency.page import page
-
-        write_report(report, page(result, measured.blocks, machine()))
-    return int(incomplete)
+    return code
 
 
 def _announced(settings: Settings, load: str) -> str:

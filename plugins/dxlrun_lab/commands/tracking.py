@@ -23,12 +23,7 @@ from dxlrun.output.terminal import err, out, print_error, print_warning, show, s
 from dxlrun.output.unblocked import unblocked
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from rich.console import Console
-
     from dxlrun_lab.tracking.experiment import Experiment
-    from dxlrun_lab.tracking.setups import Setup
 
 experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
 
@@ -101,17 +96,9 @@ def tracking(
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()
     with terminated_as_interrupted():
-        load = Stress(wanted=not no_stress)
-        result = run_experiment(prepared.plan, desired, found, load, console, _progress(found, console))
+        result = run_experiment(prepared.plan, desired, found, Stress(wanted=not no_stress), console)
     _show(result, report, as_json=as_json)
     return result.exit_code
-
-
-def _progress(setups: Sequence[Setup], console: Console) -> Callable[[Setup], None]:
-    def announce(setup: Setup) -> None:
-        show(f"{setups.index(setup) + 1} of {len(setups)}: {setup.title}", console=console)
-
-    return announce
 
 
 def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:

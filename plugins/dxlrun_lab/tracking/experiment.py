@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from rich.console import Console
 from dxlrun.channels.events import EventCode, Granted, Severity
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
+from dxlrun.output.terminal import show
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
@@ -44,23 +45,18 @@ class Experiment:
         return _INTERRUPTED if self.interrupted else 1 if self.failures else 0
 
 
-def run_experiment(  # noqa: PLR0917  what there is to decide
-    plan: Plan,
-    motion: DesiredMotion,
-    setups: Sequence[Setup],
-    stress: Stress,
-    console: Console,
-    progress: Callable[[Setup], None],
+def run_experiment(
+    plan: Plan, motion: DesiredMotion, setups: Sequence[Setup], stress: Stress, console: Console
 ) -> Experiment:
-    """Run a robot in each set-up, under a load, and measure it; `progress` is called before each.
+    """Run a robot in each set-up, under a load, and measure it; progress goes to the console.
 
     A run that fails is measured as far as it came; the others follow. Each leaves the robot as its policy
     demands.
     """
     experiment = Experiment(plan.robot, plan.loop.period_ns, motion, stress.text)
     try:
-        for setup in setups:
-            progress(setup)
+        for number, setup in enumerate(setups, 1):
+            show(f"{number} of {len(setups)}: {setup.title}", console=console)
             _one(experiment, setup, plan, stress, console)
             if experiment.interrupted:
                 break

@@ -220,7 +220,7 @@ def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
 
     pretend([summary(0, ran.log.path)])
     monkeypatch.setattr(experiment, "read_log", lambda path: steps.append("measured") or ran.log)
-    one = experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None, lambda setup: None)
+    one = experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None)
     assert steps == ["loaded", "free", "measured"]
     assert one.measured[0].tracked.remarks == ("the load ended",)
 
