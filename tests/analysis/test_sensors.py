@@ -53,10 +53,11 @@ def test_a_sensor_whose_values_stay_while_joints_move_hangs() -> None:
         (NOISE, MOVES, "gyro"),
         (np.where(TIME % 3 < 1.5, 0.0, 1.0), MOVES, "gyro"),
         (np.zeros(600), MOVES, "gyro"),
+        (np.where(TIME < 0.5, 0.0, HANGS), MOVES, "gyro"),
         (HANGS, np.where(TIME < 2.0, MOVES, MOVES[199]), "gyro"),
         (HANGS, MOVES, "another"),
     ],
-    ids=["measures", "a switch", "never changed", "at rest", "no sensor"],
+    ids=["measures", "a switch", "never changed", "rested before", "at rest", "no sensor"],
 )
 def test_one_that_has_a_reason_does_not(values: Floats, joint: Floats, name: str) -> None:
     assert findings(values, joint, name) == []

@@ -14,8 +14,8 @@ from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import plan_of
 
 _HANGS_S = 1.0
-_TIMES_LONGER = 50
-"""Than from one change to the next on average: the values of a switch stay for long."""
+_TIMES_LONGER = 10
+"""Than ever before: those of a switch stay for long, and of a simulated sensor without noise at rest."""
 _MOVED_RAD = 0.1
 """A robot at rest may have a sensor, a simulated one, that measures the same."""
 
@@ -28,7 +28,8 @@ class _Sensor:
     values: Floats
     position: Floats
     """Of the joints, at that change."""
-    changes: int = 0
+    longest_ns: int = 0
+    """Between two changes."""
     hung_s: float = 0.0
     from_s: float = 0.0
 
@@ -37,17 +38,18 @@ class _Sensor:
         changed = (np.vstack([self.values, values[:-1]]) != values).any(axis=1)
         rows = np.flatnonzero(changed)
         times = np.concatenate([[self.since_ns], at_ns[rows], at_ns[-1:]])
-        for gap in np.flatnonzero(np.diff(times) > max(_HANGS_S, self.hung_s) * 1e9).tolist():
+        gaps = np.diff(times)
+        longest = np.maximum.accumulate(np.append(self.longest_ns, gaps))
+        for gap in np.flatnonzero(gaps > max(_HANGS_S, self.hung_s) * 1e9).tolist():
             begin, end = times[gap : gap + 2].tolist()
-            usual = (begin - self.begin_ns) / max(self.changes + gap, 1)
             there = position[rows[gap - 1]] if gap else self.position
             during = position[(at_ns >= begin) & (at_ns <= end)]
             moved = np.abs(during - there).max(initial=0.0) > _MOVED_RAD
-            if self.changes + gap and moved and end - begin > _TIMES_LONGER * usual:
+            if longest[gap] and moved and end - begin > _TIMES_LONGER * longest[gap]:
                 self.hung_s, self.from_s = (end - begin) * 1e-9, (begin - self.begin_ns) * 1e-9
         if len(rows):
             self.since_ns, self.position = int(at_ns[rows[-1]]), position[rows[-1]].copy()
-        self.changes += len(rows)
+        self.longest_ns = int(longest[-2])  # the last one may go on
         self.values = values[-1].copy()
 
 
