@@ -71,21 +71,6 @@ def test_joint_states_are_read_by_rosbags(
     assert bytes(again) == data
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**16 - 1), TEXT, TEXT, TEXT)
-def test_an_event_is_the_same_for_us_and_for_rosbags(
-    t_ns: int, code: int, name: str, source: str, text: str
-) -> None:
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(schemas.EVENT.text, schemas.EVENT.name))
-    codec = Codec(schemas.EVENT)
-    data = codec.pack(t_ns, code, 30, 1, name, source, text, '{"a": 1}')
-    theirs = store.deserialize_cdr(data, schemas.EVENT.name)
-    ours = codec.unpack(data)
-    assert {field: getattr(theirs, field) for field in codec.fields} == ours
-    assert ours["text"] == text
-
-
 @pytest.mark.parametrize(("joints", "controllers"), [(0, 0), (1, 0), (3, 1), (8, 3)])
 def test_a_cycle_record_is_the_message_as_it_is(joints: int, controllers: int, typestore: Typestore) -> None:
     layout = CycleLayout([f"j{i}" for i in range(joints)], [f"c{i}" for i in range(controllers)])
