@@ -10,10 +10,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, ValidationError
 
 from dxlrun.description.document import Filled, KeyPath, Marks, literal, plain_value, text_of
-from dxlrun.description.form import Form, refuse
+from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.problems import problems_of
 from dxlrun.errors import Mark, Problem, suggestion
 
@@ -33,10 +33,10 @@ def _scalar(value: object) -> object:
 class Argument(Form):
     """One argument of a robot file."""
 
-    default: Annotated[object, AfterValidator(_scalar)] = Field(
-        default=None, description="Value when none is given; without one it must be given.", examples=["sim"]
+    default: Annotated[object, AfterValidator(_scalar)] = key(
+        "Value when none is given; without one it must be given.", "sim", None
     )
-    help: str = Field(default="", description="What it is for.", examples=['"serial port of the adapter"'])
+    help: str = key("What it is for.", '"serial port of the adapter"', "")
 
 
 class Arguments:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
 SIMULATED = "sim"
@@ -38,15 +38,11 @@ _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "dir
 class Adapter(Form):
     """The adapter of a bus."""
 
-    kind: Literal["ftdi", "direct"] | None = Field(
-        default=None,
-        description="An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.",
-        examples=["direct"],
+    kind: Literal["ftdi", "direct"] | None = key(
+        "An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.", "direct", None
     )
-    latency: Duration = Field(
-        default=16_000_000,
-        description="How long it may keep bytes back before it hands them over; kind says it, too.",
-        examples=["1 ms"],
+    latency: Duration = key(
+        "How long it may keep bytes back before it hands them over; kind says it, too.", "1 ms", 16_000_000
     )
 
     @property
@@ -60,65 +56,49 @@ class Adapter(Form):
 class BusSimulation(Form):
     """What a simulated bus does beside its servos; a bus on a real port does not use it."""
 
-    latency_timer: Annotated[Duration, AfterValidator(_timer)] = Field(
-        default=0,
-        description="How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.",
-        examples=["4 ms"],
+    latency_timer: Annotated[Duration, AfterValidator(_timer)] = key(
+        "How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.", "4 ms", 0
     )
-    split: Literal["whole", "byte", "random"] = Field(
-        default="whole", description="In which pieces it hands them over.", examples=["byte"]
-    )
-    echo: bool = Field(
-        default=False, description="The host hears its own bytes, as on some adapters.", examples=["true"]
-    )
-    absent: Literal["silent", "slot"] = Field(
-        default="silent",
-        description="In a sync or bulk read, the servos behind an absent one are silent, or wait its slot.",
-        examples=["slot"],
+    split: Literal["whole", "byte", "random"] = key("In which pieces it hands them over.", "byte", "whole")
+    echo: bool = key("The host hears its own bytes, as on some adapters.", "true", False)
+    absent: Literal["silent", "slot"] = key(
+        "In a sync or bulk read, the servos behind an absent one are silent, or wait its slot.",
+        "slot",
+        "silent",
     )
 
 
 class SlowRegisters(Form):
     """What is read of the servos of a bus now and then, between the cycles."""
 
-    items: Annotated[tuple[Name, ...], Field(strict=False)] | None = Field(
-        default=None,
-        description="Items by the names of the control table; without: temperature and voltage.",
-        examples=["[present_temperature]"],
+    items: Annotated[tuple[Name, ...], Field(strict=False)] | None = key(
+        "Items by the names of the control table; without: temperature and voltage.",
+        "[present_temperature]",
+        None,
     )
-    rate: Rate = Field(
-        default=1.0, ge=0.1, le=100, description="How often each of them is read, Hz.", examples=["1"]
-    )
+    rate: Rate = key("How often each of them is read, Hz.", "1", 1.0, ge=0.1, le=100)
 
 
 class Bus(Form):
     """One serial line with its servos."""
 
-    port: str = Field(min_length=1, description="Device of the adapter, or sim.", examples=["/dev/ttyUSB0"])
+    port: str = key("Device of the adapter, or sim.", "/dev/ttyUSB0", min_length=1)
     protocol: Annotated[float, AfterValidator(_protocol)] = Field(
         description="Protocol of all servos on the bus.",
         examples=["1.0"],
         json_schema_extra={"enum": [1.0, 2.0]},
     )
-    baud_rate: int = Field(gt=0, le=10_000_000, description="Bits per second.", examples=["1_000_000"])
-    adapter: Adapter = Field(default=Adapter(), description="The adapter.", examples=["{latency: 1 ms}"])
-    return_delay_time: Duration = Field(
-        default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
+    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=10_000_000)
+    adapter: Adapter = key("The adapter.", "{latency: 1 ms}", Adapter())
+    return_delay_time: Duration = key("How long a servo waits before it answers.", "500 us", 500_000)
+    bus_watchdog: AutoDuration = key(
+        "After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.", "200 ms", "auto"
     )
-    bus_watchdog: AutoDuration = Field(
-        default="auto",
-        description="After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.",
-        examples=["200 ms"],
+    slow_registers: SlowRegisters = key(
+        "What is read now and then, between the cycles.", "{rate: 2}", SlowRegisters()
     )
-    slow_registers: SlowRegisters = Field(
-        default=SlowRegisters(),
-        description="What is read now and then, between the cycles.",
-        examples=["{rate: 2}"],
-    )
-    simulation: BusSimulation = Field(
-        default=BusSimulation(),
-        description="What the bus does when it is simulated.",
-        examples=["{latency_timer: 4 ms}"],
+    simulation: BusSimulation = key(
+        "What the bus does when it is simulated.", "{latency_timer: 4 ms}", BusSimulation()
     )
 
     @property

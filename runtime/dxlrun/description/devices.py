@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, PlainValidator, WithJsonSchema
 
-from dxlrun.description.form import Form, refuse
+from dxlrun.description.form import Form, key, refuse
 
 _STATE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 _ITEM = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)
@@ -88,51 +88,41 @@ Numbers = Annotated[
 class DeviceSimulation(Form):
     """What a device shows when it is simulated."""
 
-    values: Numbers = Field(
-        default={},
-        description="What a state shows, SI units; else what the simulation knows of its name, or 0.",
-        examples=["{force.x: 12.5}"],
+    values: Numbers = key(
+        "What a state shows, SI units; else what the simulation knows of its name, or 0.",
+        "{force.x: 12.5}",
+        {},
     )
-    noise: Numbers = Field(
-        default={},
-        description="Standard deviation of what a state shows, SI units; else none.",
-        examples=["{force.x: 0.2}"],
+    noise: Numbers = key(
+        "Standard deviation of what a state shows, SI units; else none.", "{force.x: 0.2}", {}
     )
-    link: str = Field(
-        default="",
-        description="Link of the URDF with which an IMU moves; none: it stands upright and still.",
-        examples=["torso"],
+    link: str = key(
+        "Link of the URDF with which an IMU moves; none: it stands upright and still.", "torso", ""
     )
 
 
 class Device(Form):
     """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
-    bus: str = Field(description="Name of its bus.", examples=["main"])
-    id: int = Field(ge=0, le=253, description="Its ID.", examples=["241"])
+    bus: str = key("Name of its bus.", "main")
+    id: int = key("Its ID.", "241", ge=0, le=253)
     model: str = Field(
         min_length=1,
         description="Its model, as `dxlrun models` lists it, or the TOML file of its control table.",
         examples=["generic", "boards/my_board.toml"],
     )
-    states: Items = Field(
-        default=(),
-        description="Items read each cycle: a list, or NAME: ITEM for each; else those of its table.",
-        examples=["{pressure.left: register_1, pressure.right: register_2}"],
+    states: Items = key(
+        "Items read each cycle: a list, or NAME: ITEM for each; else those of its table.",
+        "{pressure.left: register_1, pressure.right: register_2}",
+        (),
     )
-    commands: Items = Field(
-        default=(),
-        description="Items that controllers may command: a list, or NAME: ITEM for each.",
-        examples=["[led]"],
-    )
-    safe: Numbers = Field(
-        default={},
-        description="What a command becomes when no controller commands it any more, and at the end of the "
+    commands: Items = key("Items that controllers may command: a list, or NAME: ITEM for each.", "[led]", ())
+    safe: Numbers = key(
+        "What a command becomes when no controller commands it any more, and at the end of the "
         "run, SI units; else the safe value of its table, if there is one.",
-        examples=["{led: 0}"],
+        "{led: 0}",
+        {},
     )
-    simulation: DeviceSimulation = Field(
-        default=DeviceSimulation(),
-        description="What it shows when it is simulated.",
-        examples=["{link: torso}"],
+    simulation: DeviceSimulation = key(
+        "What it shows when it is simulated.", "{link: torso}", DeviceSimulation()
     )

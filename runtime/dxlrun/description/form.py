@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from typing import Annotated
+from types import EllipsisType
+from typing import Annotated, TypeVar, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
+T = TypeVar("T")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
@@ -39,6 +41,31 @@ class Form(BaseModel):
     """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+
+def key(
+    description: str,
+    example: str,
+    default: T | EllipsisType = ...,
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+    min_length: int | None = None,
+) -> T:
+    """Return the field of a key: what it is, how it is written for example, and what it is when left out."""
+    field: T = Field(
+        cast("T", default),
+        description=description,
+        examples=[example],
+        ge=ge,
+        gt=gt,
+        le=le,
+        lt=lt,
+        min_length=min_length,
+    )
+    return field
 
 
 def with_parameters(entry: object, common: Collection[str]) -> object:

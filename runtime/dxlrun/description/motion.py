@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
-from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
@@ -32,13 +32,9 @@ Expression = Annotated[
 class Target(Form):
     """Where a joint shall be at a point's time, and how it moves there."""
 
-    position: Position | None = Field(
-        default=None, description="Angle of the joint, or position of a linear one.", examples=["30 deg"]
-    )
-    velocity: Speed | None = Field(default=None, description="Speed there.", examples=["1 rad/s"])
-    acceleration: Acceleration | None = Field(
-        default=None, description="Acceleration there.", examples=["0 rad/s^2"]
-    )
+    position: Position | None = key("Angle of the joint, or position of a linear one.", "30 deg", None)
+    velocity: Speed | None = key("Speed there.", "1 rad/s", None)
+    acceleration: Acceleration | None = key("Acceleration there.", "0 rad/s^2", None)
 
     @model_validator(mode="after")
     def _says_something(self) -> Self:
@@ -55,18 +51,16 @@ class Target(Form):
 class Point(Form):
     """One moment of a part."""
 
-    time: Duration = Field(description="Since the part's start.", examples=["1 s"])
-    joints: dict[Name, Target] = Field(
-        min_length=1, description="Targets by joint.", examples=["{head_joint: {position: 30 deg}}"]
-    )
+    time: Duration = key("Since the part's start.", "1 s")
+    joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", min_length=1)
 
 
 class Formula(Form):
     """The motion of one joint as formulas of t, s."""
 
-    position: Expression = Field(description="rad", examples=["0.5 * sin(2 * t)"])
-    velocity: Expression | None = Field(default=None, description="rad/s", examples=["cos(2 * t)"])
-    acceleration: Expression | None = Field(default=None, description="rad/s^2", examples=["-2 * sin(2 * t)"])
+    position: Expression = key("rad", "0.5 * sin(2 * t)")
+    velocity: Expression | None = key("rad/s", "cos(2 * t)", None)
+    acceleration: Expression | None = key("rad/s^2", "-2 * sin(2 * t)", None)
 
 
 class PointsPart(Form):
@@ -77,28 +71,21 @@ class PointsPart(Form):
         "a part has either points, or duration, samples and joints; take one of the two out",
     )
 
-    controller: str = Field(min_length=1, description="Name of the controller.", examples=["head"])
-    start: Duration = Field(default=0, description="Since the loop's first deadline.", examples=["1 s"])
-    points: Annotated[tuple[Point, ...], Field(strict=False)] = Field(
-        min_length=1, description="Points in order of time.", examples=["[{time: 0 s, joints: ...}]"]
+    controller: str = key("Name of the controller.", "head", min_length=1)
+    start: Duration = key("Since the loop's first deadline.", "1 s", 0)
+    points: Annotated[tuple[Point, ...], Field(strict=False)] = key(
+        "Points in order of time.", "[{time: 0 s, joints: ...}]", min_length=1
     )
 
 
 class FormulaPart(Form):
     """What one controller shall do, as formulas that are sampled before the loop starts."""
 
-    controller: str = Field(min_length=1, description="Name of the controller.", examples=["head"])
-    start: Duration = Field(default=0, description="Since the loop's first deadline.", examples=["1 s"])
-    duration: Annotated[Duration, Field(gt=0)] = Field(description="Length of the part.", examples=["20 s"])
-    samples: int = Field(
-        ge=2,
-        le=1_000_000,
-        description="Points, the first at the start, the last at the end.",
-        examples=["500"],
-    )
-    joints: dict[Name, Formula] = Field(
-        min_length=1, description="Formulas by joint.", examples=["{head_joint: {position: sin(t)}}"]
-    )
+    controller: str = key("Name of the controller.", "head", min_length=1)
+    start: Duration = key("Since the loop's first deadline.", "1 s", 0)
+    duration: Annotated[Duration, Field(gt=0)] = key("Length of the part.", "20 s")
+    samples: int = key("Points, the first at the start, the last at the end.", "500", ge=2, le=1_000_000)
+    joints: dict[Name, Formula] = key("Formulas by joint.", "{head_joint: {position: sin(t)}}", min_length=1)
 
 
 def _kind(part: object) -> str:
@@ -115,9 +102,9 @@ Part = Annotated[
 class Motion(Form):
     """A motion file."""
 
-    name: Name = Field(description="Name of the motion.", examples=["three_parts"])
-    motions: Annotated[tuple[Part, ...], Field(strict=False)] = Field(
-        min_length=1, description="What each controller does.", examples=["[{controller: head, ...}]"]
+    name: Name = key("Name of the motion.", "three_parts")
+    motions: Annotated[tuple[Part, ...], Field(strict=False)] = key(
+        "What each controller does.", "[{controller: head, ...}]", min_length=1
     )
 
 

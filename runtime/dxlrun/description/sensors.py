@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from dxlrun.description import units
-from dxlrun.description.form import Form, with_parameters
+from dxlrun.description.form import Form, key, with_parameters
 from dxlrun.description.units import Duration
 
 _COMMON_KEYS = ("type", "rate", "timeout", "on_lost")
@@ -16,19 +16,15 @@ _COMMON_KEYS = ("type", "rate", "timeout", "on_lost")
 class SensorEntry(Form):
     """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
 
-    type: str = Field(min_length=1, description="Type that a plug-in offers.", examples=["serial_imu"])
-    rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = Field(
-        default=None, description="Samples per second, Hz; the loop's rate when absent.", examples=["100"]
+    type: str = key("Type that a plug-in offers.", "serial_imu", min_length=1)
+    rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = key(
+        "Samples per second, Hz; the loop's rate when absent.", "100", None
     )
-    timeout: Annotated[Duration, Field(gt=0)] | None = Field(
-        default=None,
-        description="Age at which its values are no longer valid; 5 periods when absent, 50 ms at least.",
-        examples=["50 ms"],
+    timeout: Annotated[Duration, Field(gt=0)] | None = key(
+        "Age at which its values are no longer valid; 5 periods when absent, 50 ms at least.", "50 ms", None
     )
-    on_lost: Literal["continue", "stop"] = Field(
-        default="continue",
-        description="When it brings nothing for that time; stop: the run ends by the policy on_fault.",
-        examples=["stop"],
+    on_lost: Literal["continue", "stop"] = key(
+        "When it brings nothing for that time; stop: the run ends by the policy on_fault.", "stop", "continue"
     )
     parameters: dict[str, object] = Field(
         default={}, description="All other keys of the entry; the sensor's type says which there are."

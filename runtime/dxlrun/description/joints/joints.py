@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
@@ -60,65 +60,43 @@ OnOff = Annotated[
 class JointSimulation(Form):
     """What simulated servos move, at their joint, and how slow they are; real servos do not use it."""
 
-    response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = Field(
-        default=0,
-        description="Time between an instruction to the servo and its effect on the motor.",
-        examples=["20 ms"],
+    response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = key(
+        "Time between an instruction to the servo and its effect on the motor.", "20 ms", 0
     )
-    write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = Field(
-        default=0,
-        description="Time after a write in which the servo receives nothing.",
-        examples=["1 ms"],
+    write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = key(
+        "Time after a write in which the servo receives nothing.", "1 ms", 0
     )
-    motor: MotorFile | None = Field(
-        default=None,
-        description="Motor file of the simulated servo, where that shall be another motor than the joint's.",
-        examples=["other.motor.yaml"],
+    motor: MotorFile | None = key(
+        "Motor file of the simulated servo, where that shall be another motor than the joint's.",
+        "other.motor.yaml",
+        None,
     )
-    inertia: Annotated[Inertia, Field(gt=0)] | None = Field(
-        default=None, description="Moment of inertia of what it moves.", examples=["0.01 kg m^2"]
+    inertia: Annotated[Inertia, Field(gt=0)] | None = key(
+        "Moment of inertia of what it moves.", "0.01 kg m^2", None
     )
-    mass: Annotated[Mass, Field(gt=0)] | None = Field(
-        default=None, description="Mass of what a linear joint moves.", examples=["0.2 kg"]
+    mass: Annotated[Mass, Field(gt=0)] | None = key("Mass of what a linear joint moves.", "0.2 kg", None)
+    friction: Annotated[TorqueOrForce, Field(ge=0)] | None = key(
+        "Friction of the joint, at every speed.", "0.05 Nm", None
     )
-    friction: Annotated[TorqueOrForce, Field(ge=0)] | None = Field(
-        default=None, description="Friction of the joint, at every speed.", examples=["0.05 Nm"]
-    )
-    gravity: Annotated[TorqueOrForce, Field(ge=0)] | None = Field(
-        default=None,
-        description="Torque of the weight when it sticks out horizontally; of a linear joint the weight that "
+    gravity: Annotated[TorqueOrForce, Field(ge=0)] | None = key(
+        "Torque of the weight when it sticks out horizontally; of a linear joint the weight that "
         "pulls towards lower positions.",
-        examples=["0.3 Nm"],
+        "0.3 Nm",
+        None,
     )
-    gravity_angle: Angle | None = Field(
-        default=None,
-        description="Angle of the joint where the weight hangs straight down.",
-        examples=["0 deg"],
+    gravity_angle: Angle | None = key(
+        "Angle of the joint where the weight hangs straight down.", "0 deg", None
     )
 
 
 class BareJoint(Form):
     """What every joint has; a joint with nothing else is moved by a transmission."""
 
-    continuous: bool = Field(
-        default=False,
-        description="A wheel, or a joint of many turns; it needs no position limits.",
-        examples=["true"],
-    )
-    torque: OnOff = Field(
-        default=True,
-        description="off: it is limp from the start, until `dxlrun torque on`.",
-        examples=["off"],
-    )
-    limits: Limits = Field(
-        default=Limits(),
-        description="Where it may go, and how fast.",
-        examples=["{position: [-90 deg, 90 deg]}"],
-    )
-    simulation: JointSimulation = Field(
-        default=JointSimulation(),
-        description="What its servos move when they are simulated.",
-        examples=["{inertia: 0.01 kg m^2}"],
+    continuous: bool = key("A wheel, or a joint of many turns; it needs no position limits.", "true", False)
+    torque: OnOff = key("off: it is limp from the start, until `dxlrun torque on`.", "off", True)
+    limits: Limits = key("Where it may go, and how fast.", "{position: [-90 deg, 90 deg]}", Limits())
+    simulation: JointSimulation = key(
+        "What its servos move when they are simulated.", "{inertia: 0.01 kg m^2}", JointSimulation()
     )
 
 
@@ -128,33 +106,21 @@ class ServoJoint(BareJoint):
     One with `travel_per_turn` is linear, and its positions are lengths.
     """
 
-    bus: str = Field(description="Name of its bus.", examples=["main"])
-    model: str = Field(
-        min_length=1, description="Model of its servo, or auto: it is asked.", examples=["AX-12A"]
+    bus: str = key("Name of its bus.", "main")
+    model: str = key("Model of its servo, or auto: it is asked.", "AX-12A", min_length=1)
+    reference: Angle = key("Angle of the servo, from its zero, where the joint's is zero.", "150 deg")
+    direction: Direction = key("1: the joint's angle grows as the servo's does, -1: against it.", "1")
+    gear_ratio: GearRatio = key("Turns of the servo for one turn of the joint.", "2.5", 1.0)
+    travel_per_turn: TravelPerTurn | None = key(
+        "How far the joint moves in one turn of the servo; makes it a linear joint.", "94.2 mm", None
     )
-    reference: Angle = Field(
-        description="Angle of the servo, from its zero, where the joint's is zero.", examples=["150 deg"]
+    registers: dict[Name, Register] = key(
+        "What its servo's control table shall hold: written at the start where it differs.",
+        "{position_p_gain: 800, return_delay_time: 0 us}",
+        {},
     )
-    direction: Direction = Field(
-        description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
-    )
-    gear_ratio: GearRatio = Field(
-        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
-    )
-    travel_per_turn: TravelPerTurn | None = Field(
-        default=None,
-        description="How far the joint moves in one turn of the servo; makes it a linear joint.",
-        examples=["94.2 mm"],
-    )
-    registers: dict[Name, Register] = Field(
-        default={},
-        description="What its servo's control table shall hold: written at the start where it differs.",
-        examples=["{position_p_gain: 800, return_delay_time: 0 us}"],
-    )
-    motor: MotorFile | None = Field(
-        default=None,
-        description="Motor file of its servo, from the folder of the file that says it.",
-        examples=["elbow.motor.yaml"],
+    motor: MotorFile | None = key(
+        "Motor file of its servo, from the folder of the file that says it.", "elbow.motor.yaml", None
     )
 
     @property
@@ -171,20 +137,17 @@ class ServoJoint(BareJoint):
 class Joint(ServoJoint):
     """A joint with one servo."""
 
-    id: ServoId = Field(description="ID of its servo.", examples=["1"])
+    id: ServoId = key("ID of its servo.", "1")
 
 
 class SharedJoint(ServoJoint):
     """A joint with several servos, which get equal goals."""
 
-    servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = Field(
-        description="Its servos; what one does not have is the joint's.",
-        examples=["[{id: 1}, {id: 2, direction: -1}]"],
+    servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = key(
+        "Its servos; what one does not have is the joint's.", "[{id: 1}, {id: 2, direction: -1}]"
     )
-    tolerance: Tolerance | None = Field(
-        default=None,
-        description="By how much its servos may disagree, as a position of the joint.",
-        examples=["3 deg"],
+    tolerance: Tolerance | None = key(
+        "By how much its servos may disagree, as a position of the joint.", "3 deg", None
     )
 
 

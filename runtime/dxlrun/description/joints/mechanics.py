@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
-from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.units import Acceleration, Angle, Effort, Length, Measure, Position, Speed
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
@@ -75,99 +75,69 @@ class Limits(Form):
     """Where a joint may go, and how fast; the last gate before the bus holds it there."""
 
     position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
-        Field(
-            default=None,
-            description="Lower and upper limit of the joint's position.",
-            examples=["[-90 deg, 90 deg]"],
-        )
+        key("Lower and upper limit of the joint's position.", "[-90 deg, 90 deg]", None)
     )
-    velocity: Annotated[Speed, Field(gt=0)] | None = Field(
-        default=None, description="Highest speed; none: the servo's own.", examples=["2 rad/s"]
+    velocity: Annotated[Speed, Field(gt=0)] | None = key(
+        "Highest speed; none: the servo's own.", "2 rad/s", None
     )
-    acceleration: Annotated[Acceleration, Field(gt=0)] | None = Field(
-        default=None,
-        description="By how much goals may become faster or slower; none: as much as commanded.",
-        examples=["20 rad/s^2"],
+    acceleration: Annotated[Acceleration, Field(gt=0)] | None = key(
+        "By how much goals may become faster or slower; none: as much as commanded.", "20 rad/s^2", None
     )
-    effort: Effort | None = Field(
-        default=None,
-        description="Highest effort that may be commanded, in what the servo measures: Nm, N, A or %.",
-        examples=["800 mA"],
+    effort: Effort | None = key(
+        "Highest effort that may be commanded, in what the servo measures: Nm, N, A or %.", "800 mA", None
     )
 
 
 class OneOfServos(Form):
     """One of several servos on a joint; what it does not have is the joint's."""
 
-    id: ServoId = Field(description="ID of the servo.", examples=["2"])
-    bus: str | None = Field(
-        default=None, description="Name of its bus; none: the joint's.", examples=["legs"]
+    id: ServoId = key("ID of the servo.", "2")
+    bus: str | None = key("Name of its bus; none: the joint's.", "legs", None)
+    model: str | None = key("Its model; none: the joint's.", "MX-64", None, min_length=1)
+    reference: Angle | None = key(
+        "Its angle, from its zero, where the joint's is zero; none: the joint's.", "180 deg", None
     )
-    model: str | None = Field(
-        default=None, min_length=1, description="Its model; none: the joint's.", examples=["MX-64"]
+    direction: Direction | None = key(
+        "1: the joint's angle grows as the servo's does, -1: against it; none: the joint's.", "-1", None
     )
-    reference: Angle | None = Field(
-        default=None,
-        description="Its angle, from its zero, where the joint's is zero; none: the joint's.",
-        examples=["180 deg"],
+    registers: dict[Name, Register] | None = key(
+        "What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None
     )
-    direction: Direction | None = Field(
-        default=None,
-        description="1: the joint's angle grows as the servo's does, -1: against it; none: the joint's.",
-        examples=["-1"],
-    )
-    registers: dict[Name, Register] | None = Field(
-        default=None,
-        description="What its control table shall hold; none: the joint's.",
-        examples=["{position_p_gain: 800}"],
-    )
-    motor: MotorFile | None = Field(
-        default=None, description="Its motor file; none: the joint's.", examples=["hip.motor.yaml"]
-    )
+    motor: MotorFile | None = key("Its motor file; none: the joint's.", "hip.motor.yaml", None)
 
 
 class TransmissionServo(Form):
     """One servo of a transmission."""
 
-    bus: str = Field(description="Name of its bus.", examples=["main"])
-    id: ServoId = Field(description="ID of the servo.", examples=["1"])
-    model: str = Field(min_length=1, description="Its model, or auto: it is asked.", examples=["XL430-W250"])
-    reference: Angle = Field(
-        description="Its angle, from its zero, where the transmission's joints are at zero.",
-        examples=["180 deg"],
+    bus: str = key("Name of its bus.", "main")
+    id: ServoId = key("ID of the servo.", "1")
+    model: str = key("Its model, or auto: it is asked.", "XL430-W250", min_length=1)
+    reference: Angle = key(
+        "Its angle, from its zero, where the transmission's joints are at zero.", "180 deg"
     )
-    direction: Direction = Field(
-        description="1: the transmission counts as the servo does, -1: against it.", examples=["1"]
+    direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
+    gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
+    registers: dict[Name, Register] = key(
+        "What its control table shall hold: written at the start where it differs.",
+        "{position_p_gain: 800}",
+        {},
     )
-    gear_ratio: GearRatio = Field(
-        default=1.0,
-        description="Turns of the servo for one turn of the transmission's input.",
-        examples=["2.5"],
-    )
-    registers: dict[Name, Register] = Field(
-        default={},
-        description="What its control table shall hold: written at the start where it differs.",
-        examples=["{position_p_gain: 800}"],
-    )
-    motor: MotorFile | None = Field(
-        default=None,
-        description="Its motor file, from the folder of the file that says it.",
-        examples=["wrist.motor.yaml"],
+    motor: MotorFile | None = key(
+        "Its motor file, from the folder of the file that says it.", "wrist.motor.yaml", None
     )
 
 
 class Transmission(Form):
     """Several servos that move several joints together: q = M s."""
 
-    type: Literal["differential", "matrix"] = Field(
-        description="differential: half of the sum and half of the difference; matrix: as `matrix` says.",
-        examples=["differential"],
+    type: Literal["differential", "matrix"] = key(
+        "differential: half of the sum and half of the difference; matrix: as `matrix` says.", "differential"
     )
-    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
-        description="The joints that it moves, each in one transmission at most.", examples=["[roll, pitch]"]
+    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
+        "The joints that it moves, each in one transmission at most.", "[roll, pitch]"
     )
-    servos: dict[Name, TransmissionServo] = Field(
-        min_length=1, description="Its servos by name.", examples=["{left: {bus: main, id: 1, ...}}"]
+    servos: dict[Name, TransmissionServo] = key(
+        "Its servos by name.", "{left: {bus: main, id: 1, ...}}", min_length=1
     )
     matrix: (
         Annotated[
@@ -175,13 +145,11 @@ class Transmission(Form):
             Field(strict=False, min_length=1),
         ]
         | None
-    ) = Field(
-        default=None,
-        description="Rows: joints, columns: servos, both in the order of the file; rad per rad.",
-        examples=["[[0.5, 0.5], [0.5, -0.5]]"],
+    ) = key(
+        "Rows: joints, columns: servos, both in the order of the file; rad per rad.",
+        "[[0.5, 0.5], [0.5, -0.5]]",
+        None,
     )
-    tolerance: Tolerance | None = Field(
-        default=None,
-        description="By how much a servo may be off where there are more servos than joints.",
-        examples=["3 deg"],
+    tolerance: Tolerance | None = key(
+        "By how much a servo may be off where there are more servos than joints.", "3 deg", None
     )

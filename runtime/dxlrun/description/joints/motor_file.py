@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, ValidationError, create_model
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
-from dxlrun.description.form import Form, refuse
+from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import (
@@ -44,33 +44,23 @@ def _short(delay_ns: int) -> int:
 class StribeckForm(Form):
     """Friction near standstill."""
 
-    friction: Annotated[Torque, Field(ge=0)] = Field(
-        description="Friction beside the other one, at standstill.", examples=["0.05 Nm"]
+    friction: Annotated[Torque, Field(ge=0)] = key("Friction beside the other one, at standstill.", "0.05 Nm")
+    velocity: Annotated[AngularVelocity, Field(gt=0)] = key(
+        "Speed at which it has fallen to a third.", "0.2 rad/s"
     )
-    velocity: Annotated[AngularVelocity, Field(gt=0)] = Field(
-        description="Speed at which it has fallen to a third.", examples=["0.2 rad/s"]
-    )
-    exponent: float = Field(
-        default=2.0, gt=0, le=20, description="How sharply it falls around that speed.", examples=["2"]
-    )
+    exponent: float = key("How sharply it falls around that speed.", "2", 2.0, gt=0, le=20)
 
 
 class LoadForm(Form):
     """What the motor moves."""
 
-    inertia: Annotated[Inertia, Field(ge=0)] = Field(
-        default=0.0, description="Moment of inertia beside the motor's own.", examples=["0.01 kg m^2"]
+    inertia: Annotated[Inertia, Field(ge=0)] = key(
+        "Moment of inertia beside the motor's own.", "0.01 kg m^2", 0.0
     )
-    gravity: Annotated[Torque, Field(ge=0)] = Field(
-        default=0.0,
-        description="Torque of the weight when it sticks out horizontally.",
-        examples=["0.3 Nm"],
+    gravity: Annotated[Torque, Field(ge=0)] = key(
+        "Torque of the weight when it sticks out horizontally.", "0.3 Nm", 0.0
     )
-    gravity_angle: Angle = Field(
-        default=0.0,
-        description="Angle of the joint where the weight hangs straight down.",
-        examples=["0 deg"],
-    )
+    gravity_angle: Angle = key("Angle of the joint where the weight hangs straight down.", "0 deg", 0.0)
 
 
 _UNCERTAIN: Mapping[str, tuple[object, str]] = {
@@ -110,63 +100,41 @@ UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a ta
 class MotorForm(Form):
     """A motor file."""
 
-    model: str = Field(min_length=1, description="Model of the servo.", examples=["MX-64"])
-    source: str = Field(
-        default="", description="What it was identified from: log and date.", examples=["elbow.mcap"]
+    model: str = key("Model of the servo.", "MX-64", min_length=1)
+    source: str = key("What it was identified from: log and date.", "elbow.mcap", "")
+    voltage: Annotated[Voltage, Field(gt=0)] = key("Supply, where it is not measured.", "12 V")
+    torque_constant: Annotated[TorqueConstant, Field(gt=0)] = key(
+        "Torque at the horn for each ampere.", "1.6 Nm/A"
     )
-    voltage: Annotated[Voltage, Field(gt=0)] = Field(
-        description="Supply, where it is not measured.", examples=["12 V"]
+    resistance: Annotated[Resistance, Field(gt=0)] = key("Of the motor's winding.", "3.6 ohm")
+    inertia: Annotated[Inertia, Field(gt=0)] = key(
+        "Moment of inertia of rotor and gear, at the horn.", "0.011 kg m^2"
     )
-    torque_constant: Annotated[TorqueConstant, Field(gt=0)] = Field(
-        description="Torque at the horn for each ampere.", examples=["1.6 Nm/A"]
+    friction: Annotated[Torque, Field(ge=0)] = key("Friction at every speed (Coulomb).", "0.1 Nm", 0.0)
+    load_friction: float = key(
+        "Friction for each Nm between the motor's torque and the load's, Nm/Nm.", "0.08", 0.0, ge=0, lt=1
     )
-    resistance: Annotated[Resistance, Field(gt=0)] = Field(
-        description="Of the motor's winding.", examples=["3.6 ohm"]
+    viscous_friction: Annotated[ViscousFriction, Field(ge=0)] = key(
+        "Friction that grows with the speed.", "0.01 Nm s/rad", 0.0
     )
-    inertia: Annotated[Inertia, Field(gt=0)] = Field(
-        description="Moment of inertia of rotor and gear, at the horn.", examples=["0.011 kg m^2"]
+    stribeck: StribeckForm | None = key(
+        "More friction near standstill.", "{friction: 0.05 Nm, velocity: 0.2 rad/s}", None
     )
-    friction: Annotated[Torque, Field(ge=0)] = Field(
-        default=0.0, description="Friction at every speed (Coulomb).", examples=["0.1 Nm"]
+    position_gain: Annotated[Stiffness, Field(gt=0)] | None = key(
+        "Part of the full voltage for each rad of error and one unit of the P gain.", "0.158 1/rad", None
     )
-    load_friction: float = Field(
-        default=0.0,
-        ge=0,
-        lt=1,
-        description="Friction for each Nm between the motor's torque and the load's, Nm/Nm.",
-        examples=["0.08"],
-    )
-    viscous_friction: Annotated[ViscousFriction, Field(ge=0)] = Field(
-        default=0.0, description="Friction that grows with the speed.", examples=["0.01 Nm s/rad"]
-    )
-    stribeck: StribeckForm | None = Field(
-        default=None,
-        description="More friction near standstill.",
-        examples=["{friction: 0.05 Nm, velocity: 0.2 rad/s}"],
-    )
-    position_gain: Annotated[Stiffness, Field(gt=0)] | None = Field(
-        default=None,
-        description="Part of the full voltage for each rad of error and one unit of the P gain.",
-        examples=["0.158 1/rad"],
-    )
-    p_gain: int | None = Field(
-        default=None,
+    p_gain: int | None = key(
+        "Value of the P gain's register when it was identified; none: it has no such register.",
+        "32",
+        None,
         gt=0,
-        description="Value of the P gain's register when it was identified; none: it has no such register.",
-        examples=["32"],
     )
-    delay: Annotated[Duration, AfterValidator(_short)] = Field(
-        default=0,
-        description="From a goal's arrival at the servo until the motor has it.",
-        examples=["2 ms"],
+    delay: Annotated[Duration, AfterValidator(_short)] = key(
+        "From a goal's arrival at the servo until the motor has it.", "2 ms", 0
     )
-    load: LoadForm = Field(
-        default=LoadForm(), description="What it moved.", examples=["{inertia: 0.01 kg m^2}"]
-    )
-    uncertainty: UncertaintyForm = Field(
-        default=UncertaintyForm(),
-        description="Half-widths of the 95 % confidence intervals, by name.",
-        examples=["{resistance: 0.05 ohm}"],
+    load: LoadForm = key("What it moved.", "{inertia: 0.01 kg m^2}", LoadForm())
+    uncertainty: UncertaintyForm = key(
+        "Half-widths of the 95 % confidence intervals, by name.", "{resistance: 0.05 ohm}", UncertaintyForm()
     )
 
     def motor(self) -> MotorModel:
