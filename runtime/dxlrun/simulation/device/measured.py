@@ -15,6 +15,7 @@ from dxlrun.plan.simulation_plan import Shown
 STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
 ROOM_CELSIUS = 25.0
 _AXES = "xyzw"
+_VECTORS = {"angular_velocity": 3, "linear_acceleration": 3, "orientation": 4}
 _TURNS = ("roll", "pitch", "yaw")
 
 
@@ -116,25 +117,20 @@ def _constant(value: float) -> Callable[[], float]:
 def _value(state: str, world: Measured) -> Callable[[], float] | None:
     """Return what is measured under the name of a state; None: nothing that the simulation knows."""
     what, _, axis = state.partition(".")
-    vectors: dict[str, Callable[[], Sequence[float]]] = {
-        "angular_velocity": lambda: world.angular_velocity,
-        "linear_acceleration": lambda: world.linear_acceleration,
-        "orientation": lambda: world.orientation,
-    }
     index = _AXES.find(axis) if axis else -1
-    if what in vectors and 0 <= index < (4 if what == "orientation" else 3):
-        return _moving(world, vectors[what], index)
+    if 0 <= index < _VECTORS.get(what, 0):
+        return _moving(world, lambda: getattr(world, what)[index])
     if state in _TURNS:
-        return _moving(world, lambda: world.roll_pitch_yaw, _TURNS.index(state))
+        return _moving(world, lambda: world.roll_pitch_yaw[_TURNS.index(state)])
     if what == "voltage":
         return lambda: world.volts
     return (lambda: world.celsius) if state == "temperature" else None
 
 
-def _moving(world: Measured, vector: Callable[[], Sequence[float]], index: int) -> Callable[[], float]:
+def _moving(world: Measured, show: Callable[[], float]) -> Callable[[], float]:
     def value() -> float:
         world.update()
-        return vector()[index]
+        return show()
 
     return value
 

@@ -91,7 +91,7 @@ def _kind(of: str, draw: Draw = lambda random: {}) -> Callable[[_Act], _Act]:
         if "by" in own and arguments["by"].annotation == "float":
             readers["by"] = TURN
         needs = tuple(key for key in own if arguments[key].default is inspect.Parameter.empty)
-        does = " ".join(f"{does[0].lower()}{does[1:]}".split()).removesuffix(".")
+        does = " ".join(f"{does[:1].lower()}{does[1:]}".split()).removesuffix(".")
         KINDS[name] = Kind(does, of, act, draw, readers, needs)
         return act
 
