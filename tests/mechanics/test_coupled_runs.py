@@ -1,15 +1,11 @@
 """Robots with coupled joints on the simulated bus; its ledger says what each servo was sent."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import Events
 
 from dxlrun.channels.answers import Done, Refusal
 from dxlrun.channels.commands import Command
@@ -20,10 +16,8 @@ from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import ServosTogether
 from dxlrun.errors import StartUpError
 from dxlrun.log.reader import read_log
-from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation import LedgerEntry
 from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.group import (
     JointGroupEffortController,
@@ -33,21 +27,20 @@ from dxlrun_controllers.group import (
 )
 
 TURN = 4096
-PlanOf = Callable[..., Plan]
 
 
 @pytest.fixture
-def sways(monkeypatch: pytest.MonkeyPatch) -> None:
+def sways(monkeypatch):
     """All joints sway within their limits."""
 
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+    def update(controller, time_ns, period_ns):
         wave = math.sin(2 * time_ns * 1e-9)
         controller.context.commands.position[:] = [0.3 * wave, 0.5 * wave, 0.01, 0.4 * wave, -0.2 * wave]
 
     monkeypatch.setattr(JointGroupPositionController, "update", update)
 
 
-def writes(entries: list[LedgerEntry], instruction: int = 0x83) -> Iterator[tuple[int, int, int, bytes]]:
+def writes(entries, instruction=0x83):
     """Yield time, servo, address and data of every write that the servos received."""
     for entry in entries:
         if entry.direction != "in":
@@ -62,7 +55,7 @@ def writes(entries: list[LedgerEntry], instruction: int = 0x83) -> Iterator[tupl
                 yield entry.t_ns, packet[0], int.from_bytes(body[:2], "little"), body[2:]
 
 
-def goals(robot: VirtualRobot, servo: int, after_ns: int = 0) -> list[tuple[int, int]]:
+def goals(robot, servo, after_ns=0):
     """Return the goal positions that a servo was sent: time and ticks; they stand last in their block."""
     return [
         (t, int.from_bytes(data[-4:], "little", signed=True))
@@ -71,7 +64,7 @@ def goals(robot: VirtualRobot, servo: int, after_ns: int = 0) -> list[tuple[int,
     ]
 
 
-def torque_writes(robot: VirtualRobot, servo: int) -> list[tuple[int, int]]:
+def torque_writes(robot, servo):
     """Return when torque enable (64) of one servo was written, and to what."""
     return [
         (t, data[0])
@@ -80,7 +73,7 @@ def torque_writes(robot: VirtualRobot, servo: int) -> list[tuple[int, int]]:
     ]
 
 
-def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan: PlanOf, sways: None) -> None:
+def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan, sways):
     robot = VirtualRobot(plan(duration_s=1.5))
     robot.run()
     first, second = dict(goals(robot, 2)), dict(goals(robot, 3))
@@ -99,9 +92,7 @@ def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan:
     assert robot.result.invalid == (0,) * 5
 
 
-def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(
-    plan: PlanOf, tmp_path: Path
-) -> None:
+def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(plan, tmp_path):
     robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
     (bus,) = robot.buses
     bus.servo(5).turn_by_hand(math.radians(200))
@@ -120,9 +111,7 @@ def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(
     )  # right counts backwards
 
 
-def test_servos_that_disagree_are_refused_before_any_gets_torque(
-    plan: PlanOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypatch):
     right = plan()
     (bus,) = right.buses
     servos = tuple(
@@ -147,109 +136,99 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(
     assert VirtualRobot(tolerant).run().reason == "ended"
 
 
-def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree(plan: PlanOf) -> None:
-    robot, told = plan(), []
-
-    class Sink:
-        def emit(
-            self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b""
-        ) -> None:
-            told.append((code, severity, source, text))
-
+def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree(plan):
+    robot, events = plan(), Events()
     arrays = JointArrays(robot.mechanics, States.empty(5), Commands.empty(5))
-    together = ServosTogether(robot.mechanics, robot.loop, robot.buses, arrays, Sink())
+    together = ServosTogether(robot.mechanics, robot.loop, robot.buses, arrays, events)
     arrays.servo_states.position[:], arrays.servo_states.valid[:] = 0.0, True
     for degrees in (0, 2.9, 3.2, 5, 2.9, 3.5, 2.2, 1, 2.9, 4):
         arrays.servo_states.position[2] = math.radians(degrees)
         arrays.read()
         together.watch()
-    assert [(code, severity, source) for code, severity, source, _ in told] == [
+    assert [(code, severity, source) for code, severity, source, _ in events.list] == [
         (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),  # at 3.2 deg
         (EventCode.SERVOS_DISAGREE, Severity.INFO, "hip"),  # below 2.1, at 1 deg
         (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),
     ]
-    assert "ID 3 on bus main has it at 3.2 deg, ID 2 on bus main at 0.0 deg" in told[0][3]
+    assert "ID 3 on bus main has it at 3.2 deg, ID 2 on bus main at 0.0 deg" in events.list[0][3]
     arrays.servo_states.valid[1] = False  # where one stands is not known
     arrays.servo_states.position[2] = 0.0
     arrays.read()
     together.watch()
-    assert len(told) == 3
+    assert len(events.list) == 3
 
 
-@pytest.mark.parametrize("mode", ["velocity", "effort"])
-def test_velocities_and_efforts_reach_both_servos_with_their_signs(
-    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, mode: str
-) -> None:
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
-        if controller.context.name == "turn":
-            getattr(controller.context.commands, mode)[:] = [0.4, 0.2, 0.1]
-
-    kind, address, unit = (
-        ("velocity", 104, 0.229 * math.tau / 60) if mode == "velocity" else ("effort", 102, 0.00269)
-    )
-    cls = JointGroupVelocityController if mode == "velocity" else JointGroupEffortController
-    monkeypatch.setattr(cls, "update", update)
-    turn = f"  turn: {{type: joint_group_{kind}_controller, joints: [hip, pitch, roll]}}"
-    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [head, gripper]}}\n{turn}")
-    robot = VirtualRobot(plan(change, duration_s=0.15))  # before the gate lets a joint brake
-    robot.run()
-    sent: dict[int, float] = {}
-    for _, one, at, data in writes(robot.ledger.entries):
-        goal = int.from_bytes(data, "little", signed=True) * unit
-        if at == address and abs(goal) > abs(sent.get(one, 0.0)):
-            sent[one] = goal
-    # an effort is shared: half of the hip's for each servo, half of sum and difference at the wrist
-    left, right = (0.3, 0.1) if mode == "velocity" else (0.15, 0.05)
-    hip = 0.4 if mode == "velocity" else 0.2
-    expected = {2: hip, 3: -hip, 5: left, 6: -right}
-    assert sent == pytest.approx(expected, abs=unit)
+CLASSES = {
+    "velocity": JointGroupVelocityController,
+    "effort": JointGroupEffortController,
+    "posvel": JointGroupPosVelController,
+}
 
 
-def test_speeds_of_geared_and_linear_joints_are_their_own(
-    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
-        if controller.context.name == "turn":
-            controller.context.commands.velocity[:] = [0.4, 0.02]
+@pytest.fixture
+def turned(plan, monkeypatch, tmp_path):
+    """Run with a controller of a kind that gives some joints goals; return what each servo was sent most."""
 
-    monkeypatch.setattr(JointGroupVelocityController, "update", update)
-    turn = "  turn: {type: joint_group_velocity_controller, joints: [head, gripper]}"
-    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [hip, pitch, roll]}}\n{turn}")
-    robot = VirtualRobot(plan(change, duration_s=1.0), log=tmp_path / "run.mcap")
-    robot.run()
-    unit = 0.229 * math.tau / 60
-    sent = {one: data for _, one, at, data in writes(robot.ledger.entries) if at == 104}
-    speeds = {one: int.from_bytes(data, "little", signed=True) * unit for one, data in sent.items()}
-    # the head's gear is 2 : 1, a turn of the gripper's pinion 94.2 mm
-    assert speeds == pytest.approx({1: 0.8, 7: 0.02 / 0.0942 * math.tau}, abs=unit)
+    def run(kind, joints, others, duration_s, place, **given):
+        def update(controller, time_ns, period_ns):
+            for goal, values in given.items():
+                getattr(controller.context.commands, goal)[:] = values
+
+        monkeypatch.setattr(CLASSES[kind], "update", update)
+        turn = f"  turn: {{type: joint_group_{kind}_controller, joints: [{joints}]}}"
+        change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [{others}]}}\n{turn}")
+        robot = VirtualRobot(plan(change, duration_s=duration_s), log=tmp_path / "run.mcap")
+        robot.run()
+        address, unit = place
+        sent = {}
+        for _, servo, at, data in writes(robot.ledger.entries):
+            goal = int.from_bytes(data[:4], "little", signed=True) * unit
+            if at == address and abs(goal) > abs(sent.get(servo, 0.0)):
+                sent[servo] = goal
+        return sent
+
+    return run
+
+
+VELOCITY = 0.229 * math.tau / 60  # rad/s a tick
+
+
+@pytest.mark.parametrize(
+    ("mode", "place", "expected"),
+    [
+        ("velocity", (104, VELOCITY), {2: 0.4, 3: -0.4, 5: 0.3, 6: -0.1}),
+        # an effort is shared: half of the hip's for each servo, half of sum and difference at the wrist
+        ("effort", (102, 0.00269), {2: 0.2, 3: -0.2, 5: 0.15, 6: -0.05}),
+    ],
+)
+def test_velocities_and_efforts_reach_both_servos_with_their_signs(turned, mode, place, expected):
+    # it ends before the gate lets a joint brake
+    sent = turned(mode, "hip, pitch, roll", "head, gripper", 0.15, place, **{mode: [0.4, 0.2, 0.1]})
+    assert sent == pytest.approx(expected, abs=place[1])
+
+
+SPEEDS = {1: 0.8, 7: 0.02 / 0.0942 * math.tau}
+"""Of the servos, where the head turns at 0.4 rad/s and the gripper at 20 mm/s: 2 : 1, and 94.2 mm a turn."""
+
+
+def test_speeds_of_geared_and_linear_joints_are_their_own(turned, tmp_path):
+    place = (104, VELOCITY)
+    sent = turned("velocity", "head, gripper", "hip, pitch, roll", 1.0, place, velocity=[0.4, 0.02])
+    assert sent == pytest.approx(SPEEDS, abs=VELOCITY)
     head, _, gripper, *_ = read_log(tmp_path / "run.mcap").cycles["velocity"][-10]
-    assert (head, gripper) == (
-        pytest.approx(0.4, abs=unit),
-        pytest.approx(0.02, abs=2 * unit * 0.0942 / math.tau),
-    )
+    assert head == pytest.approx(0.4, abs=VELOCITY)
+    assert gripper == pytest.approx(0.02, abs=2 * VELOCITY * 0.0942 / math.tau)
 
 
-def test_the_speed_toward_a_position_is_the_servos_own(plan: PlanOf, monkeypatch: pytest.MonkeyPatch) -> None:
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
-        if controller.context.name == "turn":
-            commands = controller.context.commands
-            commands.position[:], commands.velocity[:] = [0.2, 0.01], [0.4, 0.02]
-
-    monkeypatch.setattr(JointGroupPosVelController, "update", update)
-    turn = "  turn: {type: joint_group_posvel_controller, joints: [head, gripper]}"
-    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [hip, pitch, roll]}}\n{turn}")
-    robot = VirtualRobot(plan(change, duration_s=0.2))
-    robot.run()
-    unit = 0.229 * math.tau / 60  # of Profile Velocity (112), which stands in front of Goal Position (116)
-    sent = {one: data for _, one, at, data in writes(robot.ledger.entries) if at == 112}
-    speeds = {one: int.from_bytes(sent[one][:4], "little") * unit for one in (1, 7)}
-    assert speeds == pytest.approx({1: 0.8, 7: 0.02 / 0.0942 * math.tau}, abs=unit)
+def test_the_speed_toward_a_position_is_the_servos_own(turned):
+    place = (112, VELOCITY)  # Profile Velocity stands in front of Goal Position (116)
+    goals = {"position": [0.2, 0.01], "velocity": [0.4, 0.02]}
+    sent = turned("posvel", "head, gripper", "hip, pitch, roll", 0.2, place, **goals)
+    assert {servo: sent[servo] for servo in SPEEDS} == pytest.approx(SPEEDS, abs=VELOCITY)
 
 
 @pytest.mark.parametrize("moved", [{2: 260}, {5: 260, 6: 100}])
-def test_joints_that_get_no_torque_may_stand_outside_their_limits(
-    plan: PlanOf, moved: dict[int, float]
-) -> None:
+def test_joints_that_get_no_torque_may_stand_outside_their_limits(plan, moved):
     limp = [(f"{joint}: {{", f"{joint}: {{torque: off, ") for joint in ("hip", "pitch", "roll")]
     idle = (
         "all: {type: joint_group_position_controller",
@@ -262,7 +241,7 @@ def test_joints_that_get_no_torque_may_stand_outside_their_limits(
     assert not any(robot.buses[0].servo(servo).torque_on for servo in moved)
 
 
-def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan: PlanOf) -> None:
+def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan):
     robot = VirtualRobot(plan())
     known = robot.plan.loop.controllers[1]
     part = replace(known, name="part", joints=("pitch",), command=("velocity",))
@@ -272,7 +251,7 @@ def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(pla
     assert robot.robot.manager.load(replace(part, command=("position",))) == 2
 
 
-def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan: PlanOf) -> None:
+def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan):
     robot = VirtualRobot(plan())
     for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
         robot.buses[0].servo(servo).turn_by_hand(math.radians(180 + angle))
@@ -283,13 +262,13 @@ def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_r
 GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
 
 
-def lose(robot: VirtualRobot, servo: int) -> None:
+def lose(robot, servo):
     lost = robot.buses[0].servo(servo)
     robot.buses[0].at(GONE_NS, lost.silence)
     robot.buses[0].at(BACK_NS, lambda: lost.silence(False))
 
 
-def test_a_lost_servo_holds_its_partner_where_it_is(plan: PlanOf, sways: None) -> None:
+def test_a_lost_servo_holds_its_partner_where_it_is(plan, sways):
     robot = VirtualRobot(plan(duration_s=1.4))
     lose(robot, 3)
     result = robot.run()
@@ -301,7 +280,7 @@ def test_a_lost_servo_holds_its_partner_where_it_is(plan: PlanOf, sways: None) -
     assert result.invalid[0] == 0
 
 
-def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan: PlanOf) -> None:
+def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan):
     more = "policies: {groups: {legs: {joints: [hip], on_lost_servo: limp}}}\n"
     robot = VirtualRobot(plan(more=more, duration_s=1.4))
     lose(robot, 3)
@@ -311,16 +290,19 @@ def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan:
     assert not goals(robot, 2, offs[0])
 
 
-@pytest.mark.parametrize("joint", ["hip", "roll"])
-def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(
-    plan: PlanOf, joint: str, tmp_path: Path
-) -> None:
-    servos = (2, 3) if joint == "hip" else (5, 6)
-    robot = VirtualRobot(plan(duration_s=1.2), log=tmp_path / "run.mcap")
-    for number, (ms, on) in enumerate(((400, "false"), (800, "true")), 1):
+def ask_torque(robot, joint, *wanted):
+    """Let a client ask for the torque of a joint, each at its time, ms."""
+    for number, (ms, on) in enumerate(wanted, 1):
         data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
         command = Command(number, "", "torque", data, "anna")
         robot.buses[0].at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
+
+
+@pytest.mark.parametrize("joint", ["hip", "roll"])
+def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, tmp_path):
+    servos = (2, 3) if joint == "hip" else (5, 6)
+    robot = VirtualRobot(plan(duration_s=1.2), log=tmp_path / "run.mcap")
+    ask_torque(robot, joint, (400, "false"), (800, "true"))
     robot.run()
     assert all(isinstance(robot.inbox.answers[number], Done) for number in (1, 2))
     for servo in servos:
@@ -341,18 +323,13 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(
         ({3: 170}, "hip", "the servos of hip disagree by 10.0 deg, more than its tolerance of 3.0 deg"),
     ],
 )
-def test_torque_comes_back_only_within_limits_and_where_servos_agree(
-    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, moved: dict[int, float], joint: str, problem: str
-) -> None:
+def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypatch, moved, joint, problem):
     right = plan()
     # without what couples them, as where a horn has slipped
     monkeypatch.setattr(virtual_run, "simulation_of", lambda _: replace(simulation_of(right), couplings=()))
     robot = VirtualRobot(plan(duration_s=1.4))
     (bus,) = robot.buses
-    for number, (ms, on) in enumerate(((300, "false"), (1000, "true")), 1):
-        data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
-        command = Command(number, "", "torque", data, "anna")
-        bus.at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
+    ask_torque(robot, joint, (300, "false"), (1000, "true"))
     for servo, angle in moved.items():
         bus.at(600_000_000, partial(bus.servo(servo).turn_by_hand, math.radians(angle)))
     robot.run()
@@ -363,24 +340,21 @@ def test_torque_comes_back_only_within_limits_and_where_servos_agree(
         assert 1 not in [value for t, value in torque_writes(robot, servo) if t > 200_000_000]
 
 
-def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(
-    plan: PlanOf, tmp_path: Path
-) -> None:
+def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, tmp_path):
     hands = (
         "pitch, roll]}",
         "]}\n  up: {type: joint_group_position_controller, joints: [pitch]}\n"
         "  around: {type: joint_group_position_controller, joints: [roll]}",
     )
     robot = VirtualRobot(plan((", " + hands[0], hands[1])), log=tmp_path / "run.mcap")
-    command = Command(1, "", "torque", b'{"joints": ["roll"], "on": false, "release": true}', "anna")
-    robot.buses[0].at(400_000_000, lambda: robot.inbox.waiting.append(command))
+    ask_torque(robot, "roll", (400, "false"))
     robot.run()
     assert isinstance(robot.inbox.answers[1], Done)
     active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
     assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
 
 
-def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan: PlanOf, tmp_path: Path) -> None:
+def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tmp_path):
     robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
     (bus,) = robot.buses
     bus.at(400_000_000, bus.servo(2).reset)
