@@ -135,7 +135,6 @@ class FeedForward(Controller[FeedForwardParameters]):
             inverse.supply.voltage,
             self._output,
         )
-        self._state_ns = 0
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:

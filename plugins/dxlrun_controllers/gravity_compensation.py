@@ -160,7 +160,6 @@ class GravityCompensation(Controller[GravityParameters]):
         # a velocity beside a position: for a servo one above 0, with which it goes there
         self._rest = np.zeros(count) if context.into else finite_or(limits.velocity, 1.0)
         self._state = GravityState(Header(), self._torque, self._output)
-        self._state_ns = 0
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:

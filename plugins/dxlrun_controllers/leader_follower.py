@@ -114,9 +114,6 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._wanted = np.zeros(count)
         self._in_step = np.zeros(count, dtype=np.bool_)
         self._posvel = self.parameters.command_interface == "posvel"
-        self._commanded_ns = -1
-        self._updated_ns = 0
-        self._following = self._reported = self._unknown = False
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""

@@ -167,7 +167,6 @@ class PidController(Controller[PidParameters]):
             self._bias,
             self._output,
         )
-        self._state_ns = 0
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:

@@ -132,7 +132,6 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._reference, self._scale = np.zeros((2, count))
         self._is_hot, self._is_spent = np.zeros((2, count), dtype=np.bool_)
         self._state = ThermalState(Header(), context.states.temperature, self._scale)
-        self._state_ns = 0
 
     def on_activate(self, time_ns: int) -> None:
         """Begin with the temperatures that were measured; hold the joints where they are."""

@@ -213,16 +213,15 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Joints that were left out of the goal for a while."""
         self._stand = np.zeros(count)
         """rad, where joints without torque stand."""
-        self._goal: Goal | None = None
-        self._playing = self._stopping = self._unknown = self._starting = False
         self._rate = 1.0
-        self._settle_ns = -1
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""
         hold(self.context)
         self._now.rest_at(self.context.commands.position)
-        self._goal, self._playing, self._stopping, self._settle_ns = None, False, False, -1
+        self._goal: Goal | None = None
+        self._playing = self._stopping = False
+        self._settle_ns = -1
         self._unknown = True
         self._starting = self.parameters.start is not None
 

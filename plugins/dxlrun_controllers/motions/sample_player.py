@@ -138,49 +138,42 @@ class SamplePlayer(Controller[SampleParameters]):
         count, bounds, limits = len(context.joints), self.parameters.bounds, context.limits
         self._interface = self.parameters.command_interface
         self._width = self.parameters.width
-        self._pieces: list[Floats | None] = [None] * MOST_PIECES
-        """The table, piece after piece; those that came before their goal are for the next one."""
-        self._count = self._piece = self._first = 0
-        """How many pieces there are; the one that is played, and the table's row with which it begins."""
-        self._total = 0
-        """Rows of the table."""
-        self._phase = _Phase.RESTING
-        self._goal: Goal | None = None
-        self._start_ns = self._settled_ns = self._stop_ns = 0
-        self._period_ns = 1.0
-        self._lower, self._upper = np.full((2, count), np.inf)
-        np.negative(self._upper, out=self._lower)
-        for index, joint in enumerate(context.joints):
-            self._lower[index], self._upper[index] = bounds.range.get(joint, (-np.inf, np.inf))
+        ranges = [bounds.range.get(joint, (-np.inf, np.inf)) for joint in context.joints]
+        self._lower, self._upper = np.array(ranges).T
         self._hottest = np.inf if bounds.temperature is None else bounds.temperature
         self._strongest = row_of(bounds.effort, context.joints)
         self._oldest_ns = np.int64(np.iinfo(np.int64).max if bounds.age is None else bounds.age)
         self._still = SplineSample(count)
         self._stop = Stop(count)
         self._deceleration = finite_or(limits.acceleration, DECELERATION)
-        self._rest_lower, self._rest_upper = np.full((2, count), np.inf)
-        np.negative(self._rest_upper, out=self._rest_lower)
-        if self._interface in ("position", "posvel"):
-            np.maximum(self._lower, limits.lower, out=self._rest_lower)
-            np.minimum(self._upper, limits.upper, out=self._rest_upper)
-        commands = context.commands
-        by_name = {"velocity": commands.velocity, "effort": commands.effort, "pwm": commands.pwm}
-        self._primary = by_name.get(self._interface, commands.position)
+        self._by_position = self._interface in ("position", "posvel")
+        self._rest_lower, self._rest_upper = np.full(count, -np.inf), np.full(count, np.inf)
+        if self._by_position:
+            self._rest_lower = np.maximum(self._lower, limits.lower)
+            self._rest_upper = np.minimum(self._upper, limits.upper)
+        self._primary: Floats = getattr(context.commands, commanded_by(self._interface)[0])
         """What a row's first numbers command."""
+        self._forget()
 
     # Life
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are; velocities, efforts and PWM begin with 0."""
-        self._phase, self._goal, self._count = _Phase.RESTING, None, 0
-        if self._primary is self.context.commands.position:
+        self._forget()
+        if self._by_position:
             hold(self.context)
         else:
             self._primary.fill(0.0)
 
     def on_deactivate(self, time_ns: int) -> None:
         """Forget the goal, which the runtime has ended, and rows that wait for one."""
-        self._phase, self._goal, self._count = _Phase.RESTING, None, 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._phase = _Phase.RESTING
+        self._goal: Goal | None = None
+        self._pieces: list[Floats] = []
+        """The table, piece after piece; those that came before their goal are for the next one."""
 
     # Commands
 
@@ -194,15 +187,14 @@ class SamplePlayer(Controller[SampleParameters]):
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Play the rows that were kept, and those of the goal."""
         if self._phase is _Phase.PLAYING:  # that one has ended as preempted, its rows with it
-            self._count = 0
+            self._pieces = []
         self._keep(data[2:])
-        if self._count > MOST_PIECES:
-            self._count = 0
+        if len(self._pieces) > MOST_PIECES:
+            self._pieces = []
             goal.end(Outcome.ABORTED, f"its table came in more than {MOST_PIECES} pieces")
             self._begin_stop(time_ns)
             return
-        self._total = sum(len(piece) for piece in self._pieces[: self._count] if piece is not None)
-        self._total //= self._width
+        self._total = sum(map(len, self._pieces)) // self._width
         self._piece = self._first = 0
         self._goal, self._phase = goal, _Phase.PLAYING
         self._start_ns, self._period_ns = time_ns, float(data[0]) * 1e9
@@ -213,10 +205,9 @@ class SamplePlayer(Controller[SampleParameters]):
         self._begin_stop(time_ns)
 
     def _keep(self, rows: Floats) -> None:
-        """Keep rows behind the others; of too many only the count grows, and their goal is aborted."""
-        if self._count < MOST_PIECES:
-            self._pieces[self._count] = rows
-        self._count += 1
+        """Keep rows behind the others; one piece too many aborts their goal."""
+        if len(self._pieces) <= MOST_PIECES:
+            self._pieces.append(rows)
 
     # In a cycle
 
@@ -243,12 +234,10 @@ class SamplePlayer(Controller[SampleParameters]):
             return
         index = min(int((elapsed_ns + early_ns) / self._period_ns), self._total - 1)
         piece = self._pieces[self._piece]
-        while piece is not None and index >= self._first + len(piece) // self._width:
+        while index >= self._first + len(piece) // self._width:
             self._first += len(piece) // self._width
             self._piece += 1
             piece = self._pieces[self._piece]
-        if piece is None:
-            return
         at = (index - self._first) * self._width
         joints = len(self._primary)
         np.copyto(self._primary, piece[at : at + joints])
@@ -303,13 +292,13 @@ class SamplePlayer(Controller[SampleParameters]):
     def _begin_stop(self, time_ns: int, *, over: bool = False) -> None:
         """Let the joints come to rest; `over`: those commanded by position are sent to rest already."""
         if self._phase is _Phase.PLAYING:
-            self._count = 0
+            self._pieces = []
         self._phase, self._stop_ns = _Phase.STOPPING, time_ns
         still, states, goals = self._still, self.context.states, self.context.goals
         still.rows.fill(0.0)
         if self._interface == "velocity":
             np.copyto(still.velocity, goals.velocity, where=np.isfinite(goals.velocity))
-        elif self._interface in ("position", "posvel"):
+        elif self._by_position:
             np.copyto(still.position, self._primary)
             if not over:
                 np.copyto(still.position, states.position, where=states.valid)

@@ -71,22 +71,18 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         )
 
     def on_configure(self, context: Context) -> None:
-        """Begin without a voltage."""
+        """Make the message."""
         super().on_configure(context)
         parameters, cells = self.parameters, self.parameters.cells or 1
         self._warn, self._stop = parameters.warn * cells, parameters.stop * cells
         self._good = self._warn + parameters.hysteresis * cells
         self._message = BatteryState(header=Header(frame_id=parameters.frame))
-        self._voltage = math.nan
-        self._warned = self._stopped = self._silent = False
-        self._heard_ns = self._publish_ns = 0
 
     def on_activate(self, time_ns: int) -> None:
         """Begin anew: another battery may be in."""
         self._voltage = math.nan
         self._warned = self._stopped = self._silent = False
-        self._heard_ns = time_ns
-        self._publish_ns = time_ns
+        self._heard_ns = self._publish_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Filter the voltage, and compare it."""

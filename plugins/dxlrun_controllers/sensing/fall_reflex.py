@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from dxlrun import Angle, Context, Controller, Duration, Interfaces, ParametersModel
+from dxlrun import Angle, Controller, Duration, Interfaces, ParametersModel
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ORIENTATION
 
 Bounds = Annotated[tuple[Angle, ...], Field(min_length=2, max_length=2)]
@@ -59,13 +59,6 @@ class FallReflex(Controller[FallParameters]):
             provides=("fallen",),
             takeovers=parameters.activate,
         )
-
-    def on_configure(self, context: Context) -> None:
-        """Begin upright."""
-        super().on_configure(context)
-        self._fallen = self._silent = False
-        self._since_ns = -1
-        self._heard_ns = 0
 
     def on_activate(self, time_ns: int) -> None:
         """Begin upright: a robot that lies falls anew."""

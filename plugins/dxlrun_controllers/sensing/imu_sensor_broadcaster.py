@@ -126,7 +126,6 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         self._east = (0.0, 0.0, math.sin(north / 2), math.cos(north / 2))
         self._bias = _ZERO
         self._resting_s = 0.0
-        self._silent = self._wrong = False
         self._message = Imu(header=Header(frame_id=parameters.frame))
         covariance, message = parameters.covariance, self._message
         _fill(message.orientation_covariance, covariance.orientation)

@@ -121,7 +121,6 @@ class SensorBroadcaster(Controller[SensorParameters]):
         states, weights = _states(parameters), parameters.weights
         self._count = len(states)
         self._matrix: Floats = np.array([[row.get(name, 0.0) for name in states] for row in weights.values()])
-        self._values = np.zeros(len(weights))
         self._topic, kind = MESSAGES[parameters.message]
         self._message = kind()
         self._message.header.frame_id = parameters.frame
@@ -132,7 +131,6 @@ class SensorBroadcaster(Controller[SensorParameters]):
                 owner, name = _place(self._message, path)
                 setattr(owner, name, kinds[path](value))
         self._times = [SampleTimes(context.period_ns) for _ in _owners(states)]
-        self._silent = False
 
     def on_activate(self, time_ns: int) -> None:
         """Begin anew."""
@@ -149,8 +147,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
             new |= times.take(time_ns, age_s)
         if math.isnan(sum(ages)):  # not all of them have measured yet
             return
-        np.matmul(self._matrix, reads[: self._count], out=self._values)
-        values = self._values.tolist()
+        values = (self._matrix @ reads[: self._count]).tolist()
         if not all(map(math.isfinite, values)) or max(ages) * 1e9 > self.parameters.timeout:
             self._report(ages)
             return
