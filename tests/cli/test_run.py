@@ -21,6 +21,7 @@ from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of
 
+Meanwhile = Callable[[float, Callable[[VirtualRobot], object]], None]
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, ())
 
 
@@ -43,6 +44,23 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     runs = Runs()
     monkeypatch.setattr("dxlrun.run.supervisor.run_robot", runs.run)
     return runs
+
+
+@pytest.fixture
+def meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
+    """Return what lets something happen to a robot on virtual time, in a directory of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def meanwhile(at_s: float, happen: Callable[[VirtualRobot], object]) -> None:
+        born = VirtualRobot.__init__
+
+        def planned(robot: VirtualRobot, *arguments: object, **options: object) -> None:
+            born(robot, *arguments, **options)
+            robot.buses[0].at(round(at_s * 1e9), lambda: happen(robot))
+
+        monkeypatch.setattr(VirtualRobot, "__init__", planned)
+
+    return meanwhile
 
 
 def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path):
@@ -75,19 +93,11 @@ def test_a_run_names_its_log_and_what_reads_it(dxlrun: Callable, runs: Runs, tor
 
 @pytest.mark.parametrize("code", [0, 130])
 def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyze(
-    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch, code: int
+    dxlrun: Callable, torso: Path, meanwhile: Meanwhile, code: int
 ):
-    monkeypatch.chdir(tmp_path)
-
-    def rebooting(robot: VirtualRobot, *arguments: object, **options: object) -> None:
-        born(robot, *arguments, **options)
-        servo = robot.buses[0].servos[0]
-        robot.buses[0].at(300_000_000, servo.trigger_overload)
-        if code == 130:
-            robot.buses[0].at(1_500_000_000, lambda: signal.raise_signal(signal.SIGINT))
-
-    born = VirtualRobot.__init__
-    monkeypatch.setattr(VirtualRobot, "__init__", rebooting)
+    meanwhile(0.3, lambda robot: robot.buses[0].servos[0].trigger_overload())
+    if code == 130:
+        meanwhile(1.5, lambda _: signal.raise_signal(signal.SIGINT))
 
     said = dxlrun(torso, "--virtual", "--duration", "2")
 
@@ -255,16 +265,9 @@ def group(source: str) -> EventGroup:
 
 
 def test_a_loss_without_a_log_is_reported_and_fails_the_run(
-    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
+    dxlrun: Callable, torso: Path, meanwhile: Meanwhile
 ):
-    monkeypatch.chdir(tmp_path)
-
-    def silent(robot: VirtualRobot, *arguments: object, **options: object) -> None:
-        born(robot, *arguments, **options)
-        robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servos[1].silence(True))
-
-    born = VirtualRobot.__init__
-    monkeypatch.setattr(VirtualRobot, "__init__", silent)
+    meanwhile(1.0, lambda robot: robot.buses[0].servos[1].silence(True))
 
     printed = [dxlrun(torso, "--virtual", "--duration", "2", *words) for words in ((), ("--no-record",))]
 
@@ -296,29 +299,18 @@ def test_virtual_time_ends_with_the_motions(
 
 @pytest.mark.parametrize("signals", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: PLR0917  fixtures
-    dxlrun: Callable,
-    torso: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    number: signal.Signals,
-    signals: int,
+def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(
+    dxlrun: Callable, torso: Path, meanwhile: Meanwhile, number: signal.Signals, signals: int
 ):
-    monkeypatch.chdir(tmp_path)
     robots, went_on = [], []
 
-    def interrupt() -> None:
+    def interrupt(robot: VirtualRobot) -> None:
+        robots.append(robot)
         for _ in range(signals):
             signal.raise_signal(number)
         went_on.append(True)
 
-    def interrupted(robot: VirtualRobot, *arguments: object, **options: object) -> None:
-        born(robot, *arguments, **options)
-        robots.append(robot)
-        robot.buses[0].at(1_000_000_000, interrupt)
-
-    born = VirtualRobot.__init__
-    monkeypatch.setattr(VirtualRobot, "__init__", interrupted)
+    meanwhile(1.0, interrupt)
     before = signal.getsignal(number)
 
     said = dxlrun(torso, "--virtual", "--duration", "1e6")
@@ -349,22 +341,10 @@ def full_disk(log: Path) -> None:
         (full_disk, "writing the log stopped: File too large"),
     ],
 )
-def test_a_log_that_is_gone_or_not_whole_is_no_good_run(  # noqa: PLR0917  fixtures
-    dxlrun: Callable,
-    torso: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    harm: Callable[[Path], None],
-    said_of_it: str,
+def test_a_log_that_is_gone_or_not_whole_is_no_good_run(
+    dxlrun: Callable, torso: Path, meanwhile: Meanwhile, harm: Callable[[Path], None], said_of_it: str
 ):
-    monkeypatch.chdir(tmp_path)
-
-    def harmed(robot: VirtualRobot, *arguments: object, **options: object) -> None:
-        born(robot, *arguments, **options)
-        robot.buses[0].at(500_000_000, lambda: harm(next(tmp_path.glob("logs/*.mcap"))))
-
-    born = VirtualRobot.__init__
-    monkeypatch.setattr(VirtualRobot, "__init__", harmed)
+    meanwhile(0.5, lambda _: harm(next(Path().glob("logs/*.mcap"))))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         said = dxlrun(torso, "--virtual", "--duration", "1")
@@ -374,7 +354,7 @@ def test_a_log_that_is_gone_or_not_whole_is_no_good_run(  # noqa: PLR0917  fixtu
     assert said.code == 1
     assert f"bioloid_torso: the log is incomplete: {said_of_it}" in said.errors
     assert said.out.startswith("bioloid_torso: failed: ")
-    assert ("next: dxlrun analyze" in said.out) == bool(list(tmp_path.glob("logs/*.mcap")))
+    assert ("next: dxlrun analyze" in said.out) == bool(list(Path().glob("logs/*.mcap")))
 
 
 class Line:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
-from msgspec.structs import replace
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes
@@ -31,15 +30,13 @@ from dxlrun.compile.sensors import compile_sensors, sensor_source
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
-from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
+from dxlrun.plan.robot_plan import MotionPart, Plan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import Row
@@ -222,28 +219,8 @@ def compile_robot(
     )
     tables = {str(one.path): one.table.text for one in devices.values() if one.path is not None}
     texts = {**description.included, **motors.texts, **tables}
-    played = {str(motion.path): motion.text for motion in motions}
-    plan = _plan(
-        description, loop, buses, simulation, frames, recording=recording, included=texts, played=played
-    )
-    plan = replace(plan, mechanics=compile_mechanics(joints))
-    return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
-
-
-def _plan(
-    description: Description,
-    loop: LoopPlan,
-    buses: Sequence[BusPlan],
-    simulation: SimulationPlan,
-    frames: FramesPlan | None,
-    *,
-    recording: RecordingPlan,
-    included: Mapping[str, str],
-    played: Mapping[str, str],
-) -> Plan:
-    """Return the plan; `included` are the texts of the files that the robot file includes or names."""
     robot, folder = description.robot, description.path.parent
-    return Plan(
+    plan = Plan(
         robot=robot.name,
         loop=loop,
         buses=tuple(buses),
@@ -252,13 +229,15 @@ def _plan(
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),
-        included={os.path.relpath(file, folder): text for file, text in included.items()},
-        played={os.path.relpath(file, folder): text for file, text in played.items()},
+        included={os.path.relpath(name, folder): text for name, text in texts.items()},
+        played={os.path.relpath(motion.path, folder): motion.text for motion in motions},
         frames=frames,
         simulation=simulation,
         groups=description.groups,
         gateway=robot.processes.gateway.enabled,
+        mechanics=compile_mechanics(joints),
     )
+    return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
 def _check_scheduler(file: RobotFile) -> None:
