@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
-from dxlrun.testing import plan_of
 from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import perform
 from dxlrun_lab.guided.rig import Rig
-from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 REFERENCES = {"AX-12A": "150 deg"}
 
@@ -54,27 +52,15 @@ def robot_text(  # the keys of a robot file, each with what most tests leave as 
 
 
 @pytest.fixture
-def measures(tmp_path):
-    """Characterize a joint, or perform another experiment; the rig is closed in the end."""
-    made = []
+def measures(stage):
+    """Characterize a joint, or perform another experiment."""
 
-    def measure(
-        measurements,
-        model="MX-64",
-        *,
-        reach=1.0,
-        tolerance=TOLERANCE,
-        each_cycle=lambda rig, cycle: None,
-        **keys,
-    ):
-        file = tmp_path / f"{len(made)}.yaml"
+    def measure(measurements, model="MX-64", *, reach=1.0, tolerance=TOLERANCE, each_cycle=None, **keys):
+        file = stage.directory / f"{len(stage.rigs)}.yaml"
         file.write_text(robot_text(model, **keys))
-        rig = virtual_rig(
-            plan_of(file),
-            log=tmp_path / f"{len(made)}.mcap",
-            each_cycle=lambda cycle: each_cycle(made[-1], cycle) if made else None,
-        )
-        made.append(rig)
+        rig = stage.rig(file)
+        if each_cycle is not None:
+            rig.robot.each_cycle = lambda cycle: each_cycle(rig, cycle)
         experiment = (
             Characterize(measurements, tolerance) if isinstance(measurements, Sequence) else measurements
         )
@@ -82,6 +68,4 @@ def measures(tmp_path):
         done = perform(rig, experiment, situation)
         return Done(experiment.finish(situation, done.recorded, done.why), rig)
 
-    yield measure
-    for rig in made:
-        rig.close()
+    return measure

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import json
-import re
-import shlex
 from pathlib import Path
 
 import pytest
+from tests.kit.experiments import ROOT, commands_of
 
 from dxlrun_lab.characterize import procedure
 
-ROOT = Path(__file__).parents[3]
 FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figures}
 
 
-@pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "robots").symlink_to(ROOT / "robots")
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def slow_bus(tmp_path: Path) -> Path:
@@ -34,18 +28,16 @@ def slow_bus(tmp_path: Path) -> Path:
 
 
 def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
-    text = (ROOT / "docs" / "experiments.md").read_text()
-    own = text.partition("\n## characterize")[2]
-    virtual, real, running = re.findall(r"^    dxlrun (characterize .+)$", own, re.MULTILINE)
-    done = dxlrun(*shlex.split(virtual))
+    virtual, real, running = commands_of("characterize", section="\n## characterize")
+    done = dxlrun(*virtual)
     assert (done.code, "smallest change that moves it" in done.out) == (0, True), done.err
     page = (tmp_path / "dead_band.html").read_text()
     assert '<figure id="joint-band">' in page
-    words = shlex.split(real.replace("/dev/ttyUSB0", "sim"))
+    words = [word.replace("/dev/ttyUSB0", "sim") for word in real]
     done = dxlrun(*words, "--virtual", "--measure", "dead_band", "--json")
     (joint,) = json.loads(done.out)["joints"]
     assert joint["range"] == pytest.approx([-1.0472, 1.0472], abs=1e-4)
-    assert "no robot arm runs" in dxlrun(*shlex.split(running)).err
+    assert "no robot arm runs" in dxlrun(*running).err
 
 
 def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
@@ -66,9 +58,7 @@ def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
         assert figure["why"]
 
 
-def test_every_figure_of_a_result_is_on_the_page(dxlrun):
-    text = (
-        (ROOT / "docs" / "experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]
-    )
+def test_every_figure_of_a_result_is_on_the_page():
+    text = (ROOT / "docs/experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]
     for name in FIGURES:
         assert name in text, name

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.experiments import ROOT
 
 import dxlrun
 from dxlrun.cli import main
@@ -310,8 +311,8 @@ def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answ
 
 SCRIPT = """
 import sys
-sys.path.insert(0, {tests!r})
-from conftest import Plays, sine
+sys.path.insert(0, {root!r})
+from tests.kit.experiments import Plays, sine
 from dxlrun_lab.commands.on_robot import run_on_robot
 def segments(joint):
     for number in range(3):
@@ -331,7 +332,7 @@ sys.exit(ran.exit_code)
 def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place, seed):
     """In the start, in the middle, in the end, and when it is killed: nothing is left of the run."""
     rng, before = random.Random(seed + 1), set(place.glob("logs/*.mcap"))
-    script = SCRIPT.format(tests=str(Path(__file__).parent))
+    script = SCRIPT.format(root=str(ROOT))
     others = set(sockets())
     words = [sys.executable, "-c", script]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

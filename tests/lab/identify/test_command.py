@@ -5,42 +5,30 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
 from pathlib import Path
 
 import pytest
+from tests.kit.experiments import ROBOTS, commands_of
 
 from dxlrun.description.joints.motor_file import read_motor
 
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
-ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
-
-
-def commands() -> list[list[str]]:
-    """Return the words of the commands in this command's section of the page."""
-    page = (ROBOT.parents[1] / "docs" / "experiments.md").read_text()
-    section = page.partition("## Identify\n")[2].partition("\n## ")[0]
-    return [
-        shlex.split(line)[1:] for line in re.findall(r"^    (dxlrun identify .*)$", section, re.MULTILINE)
-    ]
+ROBOT = ROBOTS / "single_joint.yaml"
+OF_THE_PAGE = commands_of("identify", section="## Identify\n")
 
 
 @pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])
-def test_the_other_commands_of_the_page(number, sentence, dxlrun, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "robots").symlink_to(ROBOT.parent)
-    words = [word.replace("/dev/ttyUSB0", "sim") for word in commands()[number]]
+def test_the_other_commands_of_the_page(number, sentence, dxlrun, here):
+    words = [word.replace("/dev/ttyUSB0", "sim") for word in OF_THE_PAGE[number]]
     said = dxlrun(*words, *(["--virtual", "--seconds", "0.5"] if number == 1 else []))
     assert said.code == 2
     assert sentence in said.err
 
 
-def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, tmp_path, monkeypatch):
+def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     """The first command of the page, for 10 s."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "robots").symlink_to(ROBOT.parent)
-    motor, report = tmp_path / "joint.motor.yaml", tmp_path / "report.html"
-    said = dxlrun(*commands()[0], "--seconds", 10, "--report", report)
+    motor, report = here / "joint.motor.yaml", here / "report.html"
+    said = dxlrun(*OF_THE_PAGE[0], "--seconds", 10, "--report", report)
     assert said.code == 0, said.err
     assert "joint (MX-64)" in said.out
     assert "* torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
@@ -75,8 +63,7 @@ def test_a_log_as_json(xl330, dxlrun):
         ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
     ],
 )
-def test_refusals(words, sentence, dxlrun, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_refusals(words, sentence, dxlrun, here):
     said = dxlrun("identify", *words)
     assert said.code == 2
     assert sentence in said.err

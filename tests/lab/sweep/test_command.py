@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import re
-import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.experiments import commands_of
 
-from dxlrun.cli import main
 from dxlrun.plan.robot_plan import from_json
 from dxlrun_lab.sweep import sweep as sweep_module
 from dxlrun_lab.sweep import workers
@@ -20,7 +18,6 @@ from dxlrun_lab.sweep.measuring import Measured, Task
 from dxlrun_lab.sweep.results import only_writer
 from dxlrun_lab.sweep.scores import Scores
 
-ROOT = Path(__file__).parents[3]
 Sweep = Callable[..., Any]
 
 
@@ -134,15 +131,10 @@ def test_the_score_is_drawn_as_a_map(sweep, no_workers, over):
     assert all(one.partition("=")[0] in drawn for one in over)
 
 
-def test_the_commands_of_the_page_are_understood(no_workers, tmp_path, monkeypatch, capsys):
-    text = (ROOT / "docs" / "experiments.md").read_text()
-    lines = re.findall(r"^    dxlrun (sweep .+)$", text, re.MULTILINE)
-    assert lines
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "robots").symlink_to(ROOT / "robots")
-    for line in lines:
-        assert main(shlex.split(line)) == 0, line
-        assert "by " in capsys.readouterr().out
+def test_the_commands_of_the_page_are_understood(no_workers, here, dxlrun):
+    for words in commands_of("sweep"):
+        said = dxlrun(*words)
+        assert (said.code, "by " in said.out) == (0, True), words
 
 
 def test_without_its_library_one_sentence_has_the_command(sweep, monkeypatch):

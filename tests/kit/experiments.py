@@ -1,12 +1,13 @@
-"""An experiment that plays what it is given, on rigs of virtual time."""
+"""Experiments: one that plays what it is given, on rigs of virtual time; and the commands of the pages."""
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from dxlrun.errors import Refused
 from dxlrun.testing import plan_of
@@ -16,7 +17,8 @@ from dxlrun_lab.guided.rig import Rig
 from dxlrun_lab.guided.segment import Recorded, Segment
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
-ROBOTS = Path(__file__).parents[3] / "robots"
+ROOT = Path(__file__).parents[2]
+ROBOTS = ROOT / "robots"
 Segments = Callable[[Joint], Iterator[Segment]]
 
 
@@ -78,9 +80,11 @@ class Stage:
         return plays, done
 
 
-@pytest.fixture
-def stage(tmp_path):
-    stage = Stage(tmp_path)
-    yield stage
-    for rig in stage.rigs:
-        rig.close()
+def commands_of(verb: str, page: str = "experiments.md", section: str = "") -> list[list[str]]:
+    """Return the words of the commands of a page in docs, or of a section of it."""
+    text = (ROOT / "docs" / page).read_text()
+    if section:
+        text = text.partition(section)[2].partition("\n## ")[0]
+    found = re.findall(rf"^    dxlrun ({verb} .*)$", text, re.MULTILINE)
+    assert found
+    return [shlex.split(line) for line in found]
