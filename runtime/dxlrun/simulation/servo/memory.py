@@ -158,13 +158,16 @@ class Memory:
         """
         if length < 1 or address + length > self.size:
             return None
-        if self.cells(address, length).direct:
-            return self._cells_now(address, length)
+        cells = self.cells(address, length)
+        if cells.direct:
+            return self._now(cells, address, length)
         places = self.places(address, length)
-        return b"".join(self._cells_now(target, last - first) for target, first, last in places)
+        return b"".join(
+            self._now(self.cells(at, last - first), at, last - first) for at, first, last in places
+        )
 
-    def _cells_now(self, address: int, length: int) -> bytes:
-        for name, show in self.cells(address, length).live:
+    def _now(self, cells: Cells, address: int, length: int) -> bytes:
+        for name, show in cells.live:
             wire = show()
             if wire != self._values[name]:
                 self.show(name, wire)
