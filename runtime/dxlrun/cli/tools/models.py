@@ -110,48 +110,26 @@ def _motor_json(table: ControlTable) -> dict[str, object]:
 
 
 def _device_json(table: DeviceTable, *, items: bool) -> dict[str, object]:
-    value: dict[str, object] = {
-        "kind": "device",
-        "model": table.model,
-        "aliases": list(table.aliases),
-        "model_number": table.model_number,
-        "protocol": table.protocol,
-        "cyclic": list(table.cyclic),
-        "capabilities": sorted(table.capabilities),
-        "baud_rates": dict(table.baud_rates),
-    }
-    if items:
-        value["items"] = [asdict(item) for item in table.items.values()]
-    return value
+    about = _known(table, "model aliases model_number protocol cyclic")
+    return {"kind": "device", **about, **_ends(table, items=items)}
 
 
 def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
-    value: dict[str, object] = {
-        "kind": "servo",
-        "model": table.model,
-        "aliases": list(table.aliases),
-        "model_number": table.model_number,
-        "protocol": table.protocol,
-        "firmware": table.firmware,
-        "rad_per_tick": table.rad_per_tick,
-        "min_tick": table.min_tick,
-        "max_tick": table.max_tick,
-        "rad_s_per_tick": table.rad_s_per_tick,
-        "max_speed_tick": table.max_speed_tick,
-        "effort_per_tick": table.effort_per_tick,
-        "effort_unit": table.effort_unit,
-        "max_speed": table.max_speed,
-        "stall_torque": table.stall_torque or None,
-        "stall_current": table.stall_current or None,
-        "nominal_voltage": table.nominal_voltage or None,
-        "gear_ratio": table.gear_ratio or None,
-        "simulated_motor": _motor_json(table),
-        "capabilities": sorted(table.capabilities),
-        "baud_rates": dict(table.baud_rates),
-    }
-    if items:
-        value["items"] = [asdict(item) for item in table.items.values()]
-    return value
+    about = _known(table, "model aliases model_number protocol firmware rad_per_tick min_tick max_tick")
+    about |= _known(table, "rad_s_per_tick max_speed_tick effort_per_tick effort_unit max_speed")
+    rated = _known(table, "stall_torque stall_current nominal_voltage gear_ratio")
+    about |= {name: value or None for name, value in rated.items()}
+    return {"kind": "servo", **about, "simulated_motor": _motor_json(table), **_ends(table, items=items)}
+
+
+def _known(table: ControlTable | DeviceTable, names: str) -> dict[str, object]:
+    return {name: getattr(table, name) for name in names.split()}
+
+
+def _ends(table: ControlTable | DeviceTable, *, items: bool) -> dict[str, object]:
+    """Return what the JSON of a table ends with."""
+    known = {"capabilities": sorted(table.capabilities), "baud_rates": dict(table.baud_rates)}
+    return {**known, "items": [asdict(item) for item in table.items.values()]} if items else {**known}
 
 
 # Tables
