@@ -320,6 +320,10 @@ def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(watcher, phase, co
     assert made._ending(code) == ending
 
 
+def test_the_guardian_runs_one_priority_above_the_loop(watcher):
+    assert watcher[0]._job.priority == 32  # the loop of `pair` has 31
+
+
 def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(watcher):
     made, _, page = watcher
     page.enter(Phase.LOADING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import mmap
 import os
@@ -264,6 +265,24 @@ def message_channel(
     """Return our end, and the other one to be inherited by a child (close it here after the start)."""
     ours, theirs = socket.socketpair()
     return MessageChannel(ours, received), theirs
+
+
+Job = TypeVar("Job")
+_PR_SET_PDEATHSIG = 1
+
+
+def begun(job: type[Job], received: msgspec.json.Decoder[Received]) -> tuple[Job, MessageChannel[Received]]:
+    """Begin a process that is a `Child`, executed with `--job-fd N --control-fd M`: only the supervisor takes
+    Ctrl-C. Return what it is to do, and its end of the channel."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    found = msgspec.json.decode(whole(int(sys.argv[2])), type=job)
+    return found, MessageChannel(socket.socket(fileno=int(sys.argv[4])), received)
+
+
+def hold_foreign_code(number: signal.Signals) -> None:
+    """Bound what plug-ins print, and have Linux send this signal when the parent dies (prctl(2))."""
+    sys.stdout = sys.stderr = Printed(sys.stderr.fileno())
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 class Child(Generic[Received]):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import select
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.channels import process
@@ -134,12 +132,9 @@ class Recorder:
 
 def main() -> int:
     """Run the recorder's process: `--job-fd N --control-fd M`; return 1 when the log is not whole."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the supervisor takes Ctrl-C
     stop: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: stop.append(number))
-    job_descriptor, control_descriptor = int(sys.argv[2]), int(sys.argv[4])
-    job = msgspec.json.decode(process.whole(job_descriptor), type=RecorderJob)
-    supervisor = MessageChannel(socket.socket(fileno=control_descriptor), REQUESTS)
+    job, supervisor = process.begun(RecorderJob, REQUESTS)
     try:
         recorder = Recorder(job, supervisor)
     except OSError as error:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -378,10 +377,7 @@ def _manner(code: int | None) -> str:
 
 def main() -> None:
     """Run the guardian's process: `--job-fd N --control-fd M`."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    job_descriptor, control_descriptor = int(sys.argv[2]), int(sys.argv[4])
-    job = msgspec.json.decode(process.whole(job_descriptor), type=GuardianJob)
-    control = MessageChannel(socket.socket(fileno=control_descriptor), _REQUESTS)
+    job, control = process.begun(GuardianJob, _REQUESTS)
     try:
         Guardian(job, control).run()
     except PortError as error:

@@ -6,7 +6,6 @@ by SIGTERM, which the guardian sends, or the Linux kernel when the guardian is g
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import socket
@@ -45,8 +44,6 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.guardian import LoopJob
-
-_PR_SET_PDEATHSIG = 1
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):
@@ -208,8 +205,7 @@ def _prepare(  # noqa: PLR0917  what a loop's process has
 def main() -> None:
     """Run the loop's process: `--job JSON`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    process.hold_foreign_code(signal.SIGTERM)
     job = msgspec.json.decode(sys.argv[2], type=LoopJob)
     _keep_to_this_process((*job.memory.of_loop, *job.ports, job.channel))
     clock = MonotonicClock()

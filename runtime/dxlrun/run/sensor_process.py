@@ -5,11 +5,8 @@ Executed afresh, in a session of its own; it ends by SIGTERM, or with the superv
 
 from __future__ import annotations
 
-import argparse
-import ctypes
 import os
 import signal
-import socket
 import sys
 import time
 from contextlib import suppress
@@ -32,7 +29,6 @@ from dxlrun.simulation.motion.body import SimulatedBody
 
 END_S = 1.0
 """How long a sensor may take to close its device."""
-_PR_SET_PDEATHSIG = 1
 _SHORTEST_NAP_S = 0.001
 """A device that should wait for a sample and does not must not take a whole core."""
 
@@ -91,18 +87,11 @@ def _stop(*_: object) -> None:
 
 def main() -> int:
     """Run the process of a sensor: `--job-fd N --control-fd M`."""
-    parser = argparse.ArgumentParser(prog="dxlrun.run.sensor_process", description="The process of a sensor.")
-    parser.add_argument("--job-fd", type=int, required=True)
-    parser.add_argument("--control-fd", type=int, required=True)
-    options = parser.parse_args()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    job, channel = process.begun(SensorJob, msgspec.json.Decoder(msgspec.Struct))
     signal.signal(signal.SIGTERM, _stop)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
-    job = msgspec.json.decode(process.whole(options.job_fd), type=SensorJob)
+    process.hold_foreign_code(signal.SIGTERM)
     if os.getppid() != job.supervisor:
         return 1  # it was gone before its death could be signalled
-    channel = MessageChannel(socket.socket(fileno=options.control_fd), msgspec.json.Decoder(msgspec.Struct))
     try:
         with suppress(_Stop):
             return _run(job, channel)
