@@ -80,7 +80,7 @@ class Stage:
         return plays, done
 
 
-def commands_of(verb: str, page: str = "experiments.md", section: str = "") -> list[list[str]]:
+def commands_of(page: str, verb: str, section: str = "") -> list[list[str]]:
     """Return the words of the commands of a page in docs, or of a section of it."""
     text = (ROOT / "docs" / page).read_text()
     if section:

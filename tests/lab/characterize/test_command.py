@@ -28,7 +28,7 @@ def slow_bus(tmp_path: Path) -> Path:
 
 
 def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
-    virtual, real, running = commands_of("characterize", section="\n## characterize")
+    virtual, real, running = commands_of("experiments.md", "characterize", "\n## characterize")
     done = dxlrun(*virtual)
     assert (done.code, "smallest change that moves it" in done.out) == (0, True), done.err
     page = (tmp_path / "dead_band.html").read_text()

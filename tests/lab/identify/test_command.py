@@ -14,7 +14,7 @@ from dxlrun.description.joints.motor_file import read_motor
 
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 ROBOT = ROBOTS / "single_joint.yaml"
-OF_THE_PAGE = commands_of("identify", section="## Identify\n")
+OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")
 
 
 @pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])

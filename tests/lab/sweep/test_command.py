@@ -132,7 +132,7 @@ def test_the_score_is_drawn_as_a_map(sweep, no_workers, over):
 
 
 def test_the_commands_of_the_page_are_understood(no_workers, here, dxlrun):
-    for words in commands_of("sweep"):
+    for words in commands_of("experiments.md", "sweep"):
         said = dxlrun(*words)
         assert (said.code, "by " in said.out) == (0, True), words
 

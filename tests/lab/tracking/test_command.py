@@ -145,7 +145,7 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun, runs, pretend):
 def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeypatch, page):
     monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
     monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
-    for words in commands_of("experiment tracking", page):
+    for words in commands_of(page, "experiment tracking"):
         plans = pretend([summary(0, log_of(runs, one)) for one in SETUPS])
         named = words[words.index("--setups") + 1].split(",") if "--setups" in words else SETUPS
         assert dxlrun(*words).code == 0
