@@ -267,10 +267,11 @@ class IlcController(JointTrajectoryController):
         if not self._to_servos:
             np.add(self._desired.velocity, added, out=speed)
             return
-        own = np.abs(added + self._desired.velocity if self._moving else added)
-        self._sent_speed = np.minimum(
-            own if self._moving else np.maximum(own, self._closing), self._speed_limit
-        )
+        if self._moving:
+            wanted = np.abs(added + self._desired.velocity)
+        else:
+            wanted = np.maximum(np.abs(added), self._closing)
+        self._sent_speed = np.minimum(wanted, self._speed_limit)
         np.copyto(speed, self._sent_speed)
 
     def _record(self) -> None:

@@ -261,23 +261,19 @@ class SamplePlayer(Controller[SampleParameters]):
     def _breach(self) -> tuple[int, str] | None:
         """Return the first joint that is beyond a bound, and how; None: none is."""
         states, valid = self.context.states, self.context.states.valid
-        outside = ((states.position < self._lower) | (states.position > self._upper)) & valid
-        if outside.any():
-            row = int(outside.argmax())
-            bounds = f"{self._lower[row]:.4g} to {self._upper[row]:.4g} rad"
+        lower, upper, most, effort = self._lower, self._upper, self._strongest, np.abs(states.effort)
+        if (beyond := ((states.position < lower) | (states.position > self._upper)) & valid).any():
+            row = int(beyond.argmax())
+            bounds = f"{lower[row]:.4g} to {upper[row]:.4g} rad"
             return row, f"is at {states.position[row]:.4g} rad, outside of its range of {bounds}"
-        hot = states.temperature > self._hottest
-        if hot.any():
-            row = int(hot.argmax())
+        if (beyond := states.temperature > self._hottest).any():
+            row = int(beyond.argmax())
             return row, f"has {states.temperature[row]:g} deg C, more than {self._hottest:g}"
-        effort = np.abs(states.effort)
-        strong = (effort > self._strongest) & valid
-        if strong.any():
-            row = int(strong.argmax())
-            return row, f"exerts {effort[row]:.4g}, more than {self._strongest[row]:.4g}"
-        old = states.age_ns > self._oldest_ns
-        if old.any():
-            row = int(old.argmax())
+        if (beyond := (effort > most) & valid).any():
+            row = int(beyond.argmax())
+            return row, f"exerts {effort[row]:.4g}, more than {most[row]:.4g}"
+        if (beyond := states.age_ns > self._oldest_ns).any():
+            row = int(beyond.argmax())
             return row, f"has not answered for {states.age_ns[row] * 1e-6:.0f} ms"
         return None
 
