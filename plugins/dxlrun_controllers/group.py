@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dxlrun import CommandModel, Controller, Floats, Interfaces
+from dxlrun import CommandModel, Controller, Interfaces
 from dxlrun_controllers.joints import JointsParameters, hold
 
 
@@ -78,19 +78,15 @@ class _GroupController(Controller[GroupParameters]):
         if "position" in self.claimed:
             hold(self.context)
         else:
-            self._commands(0).fill(0.0)
+            getattr(self.context.commands, self.claimed[0]).fill(0.0)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new values."""
-        for index, values in enumerate(data.reshape(len(self.claimed), -1)):
-            np.copyto(self._commands(index), values)
+        for name, values in zip(self.claimed, data.reshape(len(self.claimed), -1), strict=True):
+            np.copyto(getattr(self.context.commands, name), values)
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Keep the last command: the manager takes the arrays as they are."""
-
-    def _commands(self, index: int) -> Floats:
-        array: Floats = getattr(self.context.commands, self.claimed[index])
-        return array
 
 
 class JointGroupPositionController(_GroupController):
