@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import tomllib
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -74,17 +75,33 @@ def listings(protocol: float) -> tuple[Listing, ...]:
     Raises ValueError or KeyError when a data file is broken.
     """
     folder = _TABLES / f"protocol{protocol:.0f}"
-    entries = {path.stem: tomllib.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.toml"))}
-    return tuple(_listing(resolve(name, entries)) for name in entries)
+    texts = {path.stem: path.read_text("utf-8") for path in sorted(folder.glob("*.toml"))}
+    heads = {name: tomllib.loads(text.partition("\n[")[0]) for name, text in texts.items()}
+    return tuple(_listing(name, heads, texts) for name in texts)
 
 
-def _listing(data: Entry) -> Listing:
+def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) -> Listing:
+    """Return a model by the heads of the files; those that it needs are read when its table is built."""
+    chain = _chain(name, heads)
+    head = dict(ChainMap(*(dict(heads[each]) for each in chain)))
     return Listing(
-        names=(str(data["model"]), *words(data["aliases"])),
-        model_number=whole(data, "model_number"),
-        firmware=whole(data, "firmware") if "firmware" in data else 0,
-        build=functools.cache(lambda: build_table(data)),
+        names=(str(head["model"]), *words(head["aliases"])),
+        model_number=whole(head, "model_number"),
+        firmware=whole(head, "firmware") if "firmware" in head else 0,
+        build=functools.cache(
+            lambda: build_table(resolve(name, {each: tomllib.loads(texts[each]) for each in chain}))
+        ),
     )
+
+
+def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
+    """Return a model and those that it extends, one after the other."""
+    chain = [name]
+    while (parent := entries[chain[-1]].get("extends")) is not None:
+        if not isinstance(parent, str) or parent not in entries or parent in chain:
+            raise ValueError(f"{chain[-1]}: it cannot extend {parent!r}")
+        chain.append(parent)
+    return chain
 
 
 def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
@@ -94,14 +111,9 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
     over as a whole. Raises ValueError when the chain leads nowhere or in a circle, KeyError when an item
     that is to be left out is not there.
     """
-    chain = [name]
-    while (parent := entries[chain[-1]].get("extends")) is not None:
-        if not isinstance(parent, str) or parent not in entries or parent in chain:
-            raise ValueError(f"{chain[-1]}: it cannot extend {parent!r}")
-        chain.append(parent)
     merged: dict[str, object] = {}
     items: dict[str, dict[str, object]] = {}
-    for each in reversed(chain):
+    for each in reversed(_chain(name, entries)):
         entry = entries[each]
         for left_out in words(entry.get("left_out", [])):
             del items[left_out]
