@@ -73,19 +73,16 @@ def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int]
     return times - (5_000 + PERIOD)
 
 
-def test_each_wake_up_has_its_deadline_on_the_grid():
-    times = measured([100, 0, 2_500])
-    assert times.tolist() == [[0, 100], [PERIOD, PERIOD], [2 * PERIOD, 2 * PERIOD + 2_500]]
-
-
-def test_deadlines_that_passed_are_skipped_and_the_phase_stays():
+def test_each_wake_up_has_its_deadline_on_the_grid_and_those_that_passed_are_skipped():
+    assert measured([100, 0, 2_500]).tolist() == [
+        [0, 100],
+        [PERIOD, PERIOD],
+        [2 * PERIOD, 2 * PERIOD + 2_500],
+    ]
     times = measured([PERIOD + 1, 0, 3 * PERIOD, 0])
     assert (times[:, 0] // PERIOD).tolist() == [0, 2, 3, 6]
-    assert ((times[:, 1] - times[:, 0]).tolist()) == [PERIOD + 1, 0, 3 * PERIOD, 0]
-
-
-def test_the_measurement_ends_after_a_whole_wake_up_when_it_is_asked_to():
-    assert len(measured([7, 7, 7], stop_after=1)) == 1
+    assert (times[:, 1] - times[:, 0]).tolist() == [PERIOD + 1, 0, 3 * PERIOD, 0]
+    assert len(measured([7, 7, 7], stop_after=1)) == 1, "a whole wake-up after it was asked to end"
 
 
 def test_the_buffer_can_be_read_while_it_is_filled():

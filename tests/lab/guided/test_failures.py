@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -31,15 +31,17 @@ def happen(rig: Any, fault: str) -> None:
     script.add(parse_fault(fault), rig.robot.simulated.clock.now_ns())
 
 
+def in_half_a_second(rig: Any, act: Callable[[], object]) -> None:
+    rig.robot.simulated.buses[0].at(rig.robot.simulated.clock.now_ns() + 500_000_000, act)
+
+
 def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage):
     """The runtime holds controllers of lost joints, so the player itself cannot end its goal."""
     rig = stage.rig(stage.arm)
 
     def segments(joint):
         yield stage.sine(joint, 400)
-        rig.robot.simulated.buses[0].at(
-            rig.robot.simulated.clock.now_ns() + 500_000_000, lambda: happen(rig, "silence servo=2 for=3s")
-        )
+        in_half_a_second(rig, lambda: happen(rig, "silence servo=2 for=3s"))
         yield stage.sine(joint, 400, 3.0)
         raise AssertionError("nothing follows")
 
@@ -75,7 +77,7 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage):
         rig.robot.simulated.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
 
     def segments(joint):
-        rig.robot.simulated.buses[0].at(rig.robot.simulated.clock.now_ns() + 500_000_000, off)
+        in_half_a_second(rig, off)
         yield stage.sine(joint, 400, 3.0)
 
     plays = stage.Plays(segments)
@@ -132,9 +134,7 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage):
 
     def segments(joint):
         yield stage.sine(joint, 400)
-        rig.robot.simulated.buses[0].at(
-            rig.robot.simulated.clock.now_ns() + 500_000_000, rig.robot.simulated.stop.request
-        )
+        in_half_a_second(rig, rig.robot.simulated.stop.request)
         yield stage.sine(joint, 400, 3.0)
 
     done = perform(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,17 +105,10 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig, stage):
         assert np.isin(got.of_cycles("cycle"), log.cycles["cycle"]).all()
         moved = got.position[:, 0]
         assert moved.max() - moved.min() > 0.15
-        ends = [event for event in log.events if event.name in ("goal_accepted", "goal_ended")]
-        assert [
-            n
-            for n, one in enumerate(ends)
-            if got.of_cycles("woken_ns")[0] <= one.t_ns <= got.of_cycles("written_ns")[0]
-        ]
-        assert [
-            n
-            for n, one in enumerate(ends)
-            if got.of_cycles("woken_ns")[-1] <= one.t_ns <= got.of_cycles("written_ns")[-1]
-        ]
+        woken_ns, written_ns = got.of_cycles("woken_ns"), got.of_cycles("written_ns")
+        for cycle, name in ((0, "goal_accepted"), (-1, "goal_ended")):
+            times = [event.t_ns for event in log.events if event.name == name]
+            assert any(woken_ns[cycle] <= t_ns <= written_ns[cycle] for t_ns in times)
 
 
 def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig):
@@ -152,31 +145,21 @@ def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot, stage)
     rig.unload("experiment_position")
 
 
-def test_a_robot_without_a_log_is_refused():
-    class Silent:
-        name = "pair"
+def logging_to(log: Path | None) -> Any:
+    """Return as much of a running robot as a rig looks at first."""
+    return SimpleNamespace(name="pair", info=lambda: {"log": log and str(log)})
 
-        def info(self):
-            return {"log": None}
 
+def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys):
+    """One that records none; one that deletes parts and runs, and one that would have to be started."""
     with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
-        live_rig(Silent())
-
-
-def test_a_robot_that_deletes_parts_of_its_log_is_refused(tmp_path, monkeypatch, capsys):
-    """One that runs, and one that would have to be started."""
+        live_rig(logging_to(None))
     file = tmp_path / "robot.yaml"
     file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")
     VirtualRobot(plan_of(file, duration_s=0.1), log=tmp_path / "log").run()
 
-    class Running:
-        name = "pair"
-
-        def info(self):
-            return {"log": str(tmp_path / "log")}
-
     with pytest.raises(InputError, match="pair deletes the oldest parts of its log"):
-        live_rig(Running())
+        live_rig(logging_to(tmp_path / "log"))
     monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
     assert main(["identify", str(file), "pan", "--yes"]) == 2
     assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err

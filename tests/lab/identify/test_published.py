@@ -36,18 +36,8 @@ TICK = math.tau / 4096
 MASS, LENGTH, G = 0.49, 0.1, 9.80665
 
 
-@dataclasses.dataclass(frozen=True)
-class Published:
-    """Parameters of bam/params/mx64, kept to four digits."""
-
-    kt: float
-    resistance: float
-    armature: float
-    base: float
-    viscous: float
-
-
-M1 = Published(1.6225, 3.9494, 0.011951, 0.09039, 0.011692)
+KT, RESISTANCE, ARMATURE, BASE, VISCOUS = 1.6225, 3.9494, 0.011951, 0.09039, 0.011692
+"""Parameters of bam/params/mx64, M1, kept to four digits."""
 
 
 def cycles_of(columns: dict[str, NDArray[np.float64]], time_s: NDArray[np.float64]) -> NDArray[np.void]:
@@ -61,9 +51,9 @@ def cycles_of(columns: dict[str, NDArray[np.float64]], time_s: NDArray[np.float6
     return cycles
 
 
-def moved(motor: Published, goals: NDArray[np.float64], rate: int) -> NDArray[np.void]:
+def moved(goals: NDArray[np.float64], rate: int) -> NDArray[np.void]:
     """Return what an MX-64 at P gain 32 and 12 V does with a weight, in steps of 0.2 ms, read in ticks."""
-    dt, inertia = 2e-4, motor.armature + MASS * LENGTH**2
+    dt, inertia = 2e-4, ARMATURE + MASS * LENGTH**2
     q = w = duty = 0.0
     rows = []
     for goal in goals.tolist():
@@ -71,9 +61,9 @@ def moved(motor: Published, goals: NDArray[np.float64], rate: int) -> NDArray[np
         sent = round(goal / TICK) * TICK
         for _ in range(round(1 / rate / dt)):
             duty = max(-1.0, min(1.0, 0.158 * 32 * (sent - q)))
-            torque = motor.kt * (duty * 12.0 - motor.kt * w) / motor.resistance
+            torque = KT * (duty * 12.0 - KT * w) / RESISTANCE
             weight = -MASS * G * LENGTH * math.sin(q)
-            most = motor.base + motor.viscous * abs(w)
+            most = BASE + VISCOUS * abs(w)
             stop = inertia / dt * w + torque + weight
             w += (torque + weight - math.copysign(min(abs(stop), most), stop)) / inertia * dt
             q += w * dt
@@ -92,22 +82,19 @@ def result_of(cycles: NDArray[np.void], servo: Servo) -> Identified:
 
 def test_an_mx_64_with_published_parameters():
     """M1, whose friction does not grow with the load: the simulated servos of other tests have M3."""
-    motor = M1
     rate = 200
     parts = excitation(Room(-0.6, 0.6), 14.0, 1 / rate, start=0.0)
-    cycles = moved(motor, np.concatenate([part.goals for part in parts]), rate)
+    cycles = moved(np.concatenate([part.goals for part in parts]), rate)
     found = result_of(cycles, Servo("elbow", control_table("MX-64", 1.0), math.pi, 1))
     assert (found.scale, found.friction_model) == ("load", "m1")
     assert found.motor.load.gravity == pytest.approx(MASS * G * LENGTH)
-    damping = motor.kt**2 / motor.resistance
+    damping = KT**2 / RESISTANCE
     # viscous friction is in it, as no current is measured
-    constant = motor.kt * (1 + motor.viscous / damping)
+    constant = KT * (1 + VISCOUS / damping)
     assert found.motor.torque_constant == pytest.approx(constant, rel=0.02)
-    assert found.motor.torque_constant / found.motor.resistance == pytest.approx(
-        motor.kt / motor.resistance, rel=0.03
-    )
-    assert found.motor.inertia == pytest.approx(motor.armature, rel=0.05)
-    assert found.motor.friction == pytest.approx(motor.base, rel=0.05)
+    assert found.motor.torque_constant / found.motor.resistance == pytest.approx(KT / RESISTANCE, rel=0.03)
+    assert found.motor.inertia == pytest.approx(ARMATURE, rel=0.05)
+    assert found.motor.friction == pytest.approx(BASE, rel=0.05)
     assert found.motor.position_gain == pytest.approx(0.158, rel=0.03)
 
 
