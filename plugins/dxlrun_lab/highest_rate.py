@@ -21,9 +21,10 @@ from rich.console import Console
 from dxlrun.compile import compile_robot
 from dxlrun.description import Description
 from dxlrun.errors import ProcessFault
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.reader import read_log
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import read_ledger
@@ -122,7 +123,9 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
         )
     cycle_us = (log.cycles["written_ns"] - log.cycles["scheduled_ns"]).astype(float) / 1e3
     overruns = int((log.cycles["skipped"] > 0).sum())
-    simulated = min(overruns, _by_simulation(log, path)) if overruns else 0
+    ledger, simulated = ledger_of(path), 0
+    if overruns and ledger.is_file():
+        simulated = min(overruns, overruns_by_servos(log, read_ledger(ledger)))
     return Tried(
         rate_hz=rate,
         cycles=len(cycle_us),
@@ -132,9 +135,3 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
         p999_us=round(float(np.quantile(cycle_us, 0.999)), 1),
         kept=overruns - simulated <= ALLOWED * len(cycle_us),
     )
-
-
-def _by_simulation(log: Log, path: Path) -> int:
-    """Return how many overruns the simulated servos caused; 0 without a ledger."""
-    ledger = path.with_suffix(".ledger.jsonl")
-    return overruns_by_servos(log, read_ledger(ledger)) if ledger.is_file() else 0

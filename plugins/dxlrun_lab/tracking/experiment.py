@@ -14,6 +14,7 @@ from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import read_ledger
@@ -73,7 +74,7 @@ def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, conso
         remarks = stress.ended()
     experiment.interrupted = summary.exit_code == _INTERRUPTED
     if summary.log is not None:
-        log, path = read_log(summary.log), Path(summary.log).with_suffix(".ledger.jsonl")
+        log, path = read_log(summary.log), ledger_of(Path(summary.log))
         ledger = read_ledger(path) if path.is_file() else None
         found = measure(log, setup, experiment.motion, ledger, (*_refused(log), *remarks))
         if found is not None:
