@@ -19,7 +19,7 @@ from dxlrun.compile import Compiled
 from dxlrun.compile.motions import LEAD_NS, TRAJECTORY, samples_of
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample
-from dxlrun.description import MotionDescription
+from dxlrun.description.motion import MotionDescription
 from dxlrun.plan.robot_plan import MotionPart
 from dxlrun_controllers.laws.spline import solve
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from dxlrun.compile import compile_robot
-from dxlrun.description import Description
+from dxlrun.description.reading import Description
 from dxlrun.errors import ProcessFault
 from dxlrun.log.reader import read_log
 from dxlrun.plan.recording_plan import RecordingPlan

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dxlrun.compile import compile_robot
-from dxlrun.description import read_motion, read_robot
 from dxlrun.description.frames.tree import FrameTree
+from dxlrun.description.motion import read_motion
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan

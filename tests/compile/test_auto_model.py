@@ -7,7 +7,7 @@ from dxlrun.compile import compile_robot
 from dxlrun.compile.joints.joints import compile_joints
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description import read_robot
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
 
 

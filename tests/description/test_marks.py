@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dxlrun.description import Marks
+from dxlrun.description.document import Marks
 from dxlrun.errors import Mark
 
 MARKS = Marks(

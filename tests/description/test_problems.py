@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from dxlrun.description import Marks, problems_of
-from dxlrun.description.document import grow, literal, parse
+from dxlrun.description.document import Marks, grow, literal, parse
+from dxlrun.description.problems import problems_of
 from dxlrun.description.units import Angle
 from dxlrun.errors import near, suggestion
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.description import KeyPath, Replacement, survey_robot
+from dxlrun.description.document import KeyPath
+from dxlrun.description.reading import Replacement, survey_robot
 
 TEXT = """name: one
 arguments:

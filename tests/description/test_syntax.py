@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from tests.kit import desk
 from tests.kit.desk import TORSO
 
-from dxlrun.description import document, read_robot
+from dxlrun.description import document
 from dxlrun.description.document import grow, literal, plain_value
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, Mark
 
 WRONG = [

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from tests.kit.robots import robot_text
 
-from dxlrun.description import MotionDescription, Survey, read_motion, survey_robot
-from dxlrun.description.reading import Description, read_robot
+from dxlrun.description.motion import MotionDescription, read_motion
+from dxlrun.description.reading import Description, Survey, read_robot, survey_robot
 from dxlrun.errors import InputError
 
 TORSO = robot_text("torso")

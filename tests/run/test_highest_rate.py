@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.description import read_robot
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import ProcessFault
 from dxlrun.output.json import json_text
 from dxlrun.plan.simulation_plan import AdapterConfig

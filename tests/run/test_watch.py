@@ -23,7 +23,7 @@ from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.loop import StopFlag
-from dxlrun.description import read_robot
+from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines

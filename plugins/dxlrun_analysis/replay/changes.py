@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from dxlrun.compile import compile_robot
 from dxlrun.control.controllers.plugins import PlugIns, mismatches
-from dxlrun.description import read_robot
 from dxlrun.description.problems import sentences_of
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan
 from dxlrun_analysis.replay.recorded import RecordedPlan

@@ -49,7 +49,7 @@ def bench_rate(
         raise InputError(f"there is no robot file {robot}; check the path")
     if not 0.1 <= seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: give from 0.1 to 3600")
-    from dxlrun.description import read_robot
+    from dxlrun.description.reading import read_robot
     from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
 
     description = read_robot(robot, parse_assignments(assignments))

@@ -11,9 +11,10 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from dxlrun.compile import Compiled, compile_files
-from dxlrun.description import Description, Replacement, read_motion, survey_robot
 from dxlrun.description.arguments import COMMAND_LINE
 from dxlrun.description.document import text_of
+from dxlrun.description.motion import read_motion
+from dxlrun.description.reading import Description, Replacement, survey_robot
 from dxlrun.errors import InputError, Mark, Problem
 from dxlrun.run.virtual_run import require_simulated
 from dxlrun_lab.desired import DesiredPath, desired_paths, motion_samples

@@ -7,8 +7,10 @@ from contextlib import suppress
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.description import Description, KeyPath, Robot
+from dxlrun.description.document import KeyPath
 from dxlrun.description.problems import keys_at, path_text
+from dxlrun.description.reading import Description
+from dxlrun.description.robot import Robot
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import suggestion
 

@@ -15,7 +15,8 @@ from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.description import MotionDescription, Robot
+    from dxlrun.description.motion import MotionDescription
+    from dxlrun.description.robot import Robot
 
 _HERE = Path("robots")
 _SCHEMAS = ("robot.schema.json", "motions/motion.schema.json", "motors/motor.schema.json")
@@ -104,7 +105,8 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
 
 
 def _example(path: Path) -> Example:
-    from dxlrun.description import read_motion, read_robot
+    from dxlrun.description.motion import read_motion
+    from dxlrun.description.reading import read_robot
 
     description = read_robot(path, {})
     robot, source = description.robot, path.parent

@@ -15,9 +15,9 @@ from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description import Description
 from dxlrun.description.bus import SIMULATED
 from dxlrun.description.modes import Mode
+from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items

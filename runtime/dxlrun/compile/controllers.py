@@ -18,9 +18,11 @@ from dxlrun.contract.controller import Interfaces
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
-from dxlrun.description import Description, KeyPath, problems_of
+from dxlrun.description.document import KeyPath
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
+from dxlrun.description.problems import problems_of
+from dxlrun.description.reading import Description
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan

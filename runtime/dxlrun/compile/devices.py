@@ -10,9 +10,10 @@ from msgspec.structs import replace
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description import Description, KeyPath
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
+from dxlrun.description.document import KeyPath
+from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table.device_table import read_device_table
 from dxlrun.dynamixel.control_table.devices import (
     DeviceItem,

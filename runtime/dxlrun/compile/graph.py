@@ -14,7 +14,7 @@ import msgspec
 
 from dxlrun.control.controllers.claims import Conflict, Standing, conflicts, conflicts_text
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
-from dxlrun.description import KeyPath
+from dxlrun.description.document import KeyPath
 from dxlrun.errors import suggestion
 from dxlrun.output.graph import Edge, Graph, Node, listed
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan

@@ -33,8 +33,7 @@ from dxlrun.compile.samples import (
     listed_samples,
 )
 from dxlrun.contract.controller import Controller
-from dxlrun.description import MotionDescription
-from dxlrun.description.motion import FormulaPart, PointsPart
+from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
 from dxlrun.description.problems import sentences_of
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand

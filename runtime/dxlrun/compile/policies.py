@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_text
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description import KeyPath
+from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import BusPlan

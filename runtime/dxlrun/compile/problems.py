@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 
-from dxlrun.description import Description, KeyPath
+from dxlrun.description.document import KeyPath
 from dxlrun.description.joints.joints import ServoJoint
+from dxlrun.description.reading import Description
 from dxlrun.errors import InputError, Mark, Problem, told_once
 
 

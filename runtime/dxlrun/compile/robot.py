@@ -40,7 +40,7 @@ from dxlrun.plan.robot_plan import MotionPart, Plan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import Row
-    from dxlrun.description import MotionDescription
+    from dxlrun.description.motion import MotionDescription
     from dxlrun.output.graph import Graph
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]

@@ -18,8 +18,7 @@ from simpleeval import (  # type: ignore[import-untyped]  # no type information 
 )
 
 from dxlrun.compile.problems import Problems
-from dxlrun.description import MotionDescription
-from dxlrun.description.motion import Formula, FormulaPart, PointsPart
+from dxlrun.description.motion import Formula, FormulaPart, MotionDescription, PointsPart
 from dxlrun.description.units import plain
 from dxlrun.errors import Mark
 

@@ -10,8 +10,8 @@ from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.sensors.offer import names_breach
-from dxlrun.description import Description
 from dxlrun.description.bus import SIMULATED
+from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 

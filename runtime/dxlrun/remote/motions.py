@@ -28,7 +28,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.steering import Play
-from dxlrun.description import MotionDescription
+from dxlrun.description.motion import MotionDescription
 from dxlrun.errors import InputError, Problem, suggestion
 from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
 

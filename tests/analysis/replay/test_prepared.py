@@ -16,7 +16,7 @@ from tests.kit.stories import differing
 
 from dxlrun.channels.commands import Command, decode_command, encode_command
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.description import read_motion
+from dxlrun.description.motion import read_motion
 from dxlrun.log.reader import read_log
 from dxlrun.remote.motions import Running, play
 from dxlrun.remote.preparation import Preparation

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulation import simulated_buses
-from dxlrun.description import Description, read_robot
+from dxlrun.description.reading import Description, read_robot
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation import BusConfig
 

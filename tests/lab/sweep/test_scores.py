@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dxlrun.compile import compile_files
-from dxlrun.description import read_motion
+from dxlrun.description.motion import read_motion
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.run.virtual_run import VirtualRobot

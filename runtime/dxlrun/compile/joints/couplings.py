@@ -10,7 +10,7 @@ import msgspec
 from dxlrun.compile.joints.limits import Interval, degrees, position_text
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems, RobotFile
-from dxlrun.description import KeyPath
+from dxlrun.description.document import KeyPath
 from dxlrun.description.joints.joints import ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import (
     LEAST_RATIO,

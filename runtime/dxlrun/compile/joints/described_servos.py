@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 
 import msgspec
 
-from dxlrun.description import Description, KeyPath
-from dxlrun.description.document import Marks
+from dxlrun.description.document import KeyPath, Marks
 from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import Register
+from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.plan.bus_plan import ServoPlan
 

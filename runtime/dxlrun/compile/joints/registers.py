@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description import Description
+from dxlrun.description.reading import Description
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import DeviceTable
