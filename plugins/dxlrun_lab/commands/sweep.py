@@ -7,7 +7,7 @@ import shlex
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -23,6 +23,7 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.errors import InputError, Mark, Problem, counted
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
+from dxlrun_lab.sweep import By
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from dxlrun_lab.sweep.sweep import Sweep
 
 Ranges = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)]
-By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
 DIRECTORY = Path("sweeps")
 """Where results are written without --output, from the working directory."""
 _INTERRUPTED = 130

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from dxlrun_lab.sweep import By
 from dxlrun_lab.sweep.ranges import Value
-from dxlrun_lab.sweep.ranking import By, ranked, score, unit
+from dxlrun_lab.sweep.ranking import ranked, score, unit
 from dxlrun_lab.sweep.results import Row, SweepHeader
 
 _MOST_TICKS = 10

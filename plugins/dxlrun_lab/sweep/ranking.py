@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Literal
 
 from dxlrun.errors import counted
 from dxlrun.output.table import Column, Part, Sentence, Table
+from dxlrun_lab.sweep import By
 from dxlrun_lab.sweep.results import ParameterColumn, Row
 
-By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
 _FIELDS: Mapping[By, tuple[str, str]] = {
     "rms": ("rms_rad", "rad"),
     "worst": ("worst_rad", "rad"),
