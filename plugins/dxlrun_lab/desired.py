@@ -15,9 +15,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.compile import Compiled
 from dxlrun.compile.motions import LEAD_NS, TRAJECTORY, samples_of
 from dxlrun.compile.problems import Problems
+from dxlrun.compile.robot import Compiled
 from dxlrun.compile.samples import Quantity, Sample
 from dxlrun.description.motion import MotionDescription
 from dxlrun.plan.robot_plan import MotionPart

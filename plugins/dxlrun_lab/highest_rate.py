@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 from rich.console import Console
 
-from dxlrun.compile import compile_robot
+from dxlrun.compile.robot import compile_robot
 from dxlrun.description.reading import Description
 from dxlrun.errors import ProcessFault
 from dxlrun.log.reader import read_log

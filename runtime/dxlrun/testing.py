@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from dxlrun.compile import compile_robot
+from dxlrun.compile.robot import compile_robot
 from dxlrun.description.frames.tree import FrameTree
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot

@@ -7,7 +7,7 @@ import re
 import shlex
 from pathlib import Path
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.simulation import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript

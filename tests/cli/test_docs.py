@@ -24,7 +24,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.cli import verbs
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.remote.preparation import Preparation

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli import examples
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 NAMES = sorted(path.stem for path in ROBOTS.glob("*.yaml"))

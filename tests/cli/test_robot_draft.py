@@ -9,7 +9,7 @@ import pytest
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
 from dxlrun.cli.tools.scan import draft, draft_file
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault

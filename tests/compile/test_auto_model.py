@@ -3,10 +3,10 @@ from pathlib import Path
 import pytest
 from tests.kit.robots import PAIR, compile_text
 
-from dxlrun.compile import compile_robot
 from dxlrun.compile.joints.joints import compile_joints
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
+from dxlrun.compile.robot import compile_robot
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
 

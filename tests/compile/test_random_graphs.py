@@ -25,7 +25,7 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import given as given_
 from hypothesis import strategies as st
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.claims import Standing
 from dxlrun.control.controllers.graph import above
 from dxlrun.errors import InputError

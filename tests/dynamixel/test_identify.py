@@ -4,7 +4,7 @@ import pytest
 from tests.kit.rigs import make_plan
 
 from dxlrun.clock import VirtualClock
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig

@@ -14,7 +14,7 @@ from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.clock import MonotonicClock
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from textwrap import dedent
 
-from dxlrun.compile import Compiled, compile_files
+from dxlrun.compile.robot import Compiled, compile_files
 from dxlrun.errors import InputError, Problem
 
 MISTAKES = Path(__file__).parents[1] / "compile" / "mistakes"

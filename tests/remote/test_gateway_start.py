@@ -14,7 +14,7 @@ from dxlrun.channels.heartbeat import Heartbeat, Phase, create
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.process import Failed, Listening, Stop
 from dxlrun.channels.ring import RingWriter
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link

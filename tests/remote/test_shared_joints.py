@@ -7,7 +7,7 @@ import json
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.joints import (

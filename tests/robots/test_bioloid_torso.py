@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.compile import Compiled, compile_files
+from dxlrun.compile.robot import Compiled, compile_files
 from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
 ROBOTS = Path(__file__).parents[2] / "robots"

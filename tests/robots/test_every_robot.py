@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.kit.clients import command_of, played
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 MOTIONS = sorted(ROBOTS.glob("motions/*.yaml"))

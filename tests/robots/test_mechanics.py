@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from dxlrun.channels.answers import Done, Refusal
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log

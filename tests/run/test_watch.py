@@ -20,7 +20,7 @@ from dxlrun.channels.packets import NoPackets
 from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
-from dxlrun.compile import compile_robot
+from dxlrun.compile.robot import compile_robot
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.reading import read_robot

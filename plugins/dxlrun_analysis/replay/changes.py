@@ -12,7 +12,7 @@ import yaml
 from msgspec.structs import replace
 from pydantic import ValidationError
 
-from dxlrun.compile import compile_robot
+from dxlrun.compile.robot import compile_robot
 from dxlrun.control.controllers.plugins import PlugIns, mismatches
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.reading import read_robot

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from dxlrun.compile import Compiled, compile_files
+from dxlrun.compile.robot import Compiled, compile_files
 from dxlrun.description.arguments import COMMAND_LINE
 from dxlrun.description.document import text_of
 from dxlrun.description.motion import read_motion

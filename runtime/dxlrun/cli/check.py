@@ -18,8 +18,8 @@ from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.compile import Compiled
     from dxlrun.compile.report import PolicyRow, Row
+    from dxlrun.compile.robot import Compiled
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cyclopts import Token
 
     from dxlrun.channels.packets import PacketSink
-    from dxlrun.compile import Ask, Compiled
+    from dxlrun.compile.robot import Ask, Compiled
     from dxlrun.plan.bus_plan import BusPlan
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
@@ -74,7 +74,7 @@ def compiled(
                 f"give a number of seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
             )
         duration_ns = round(duration * 1e9)
-    from dxlrun.compile import compile_files  # not above: a wrong word needs neither numpy nor pydantic
+    from dxlrun.compile.robot import compile_files  # not above: a wrong word needs neither numpy nor pydantic
 
     return compile_files(robot, arguments, play, duration_ns, ask)
 

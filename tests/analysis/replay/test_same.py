@@ -13,7 +13,7 @@ import pytest
 from tests.kit.anew import command, edited
 from tests.kit.stories import differing, replayed, silence
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlrun.testing import plan_of, simulated_robot

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.testing import VirtualRobot

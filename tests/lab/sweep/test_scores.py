@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.description.motion import read_motion
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan, to_json

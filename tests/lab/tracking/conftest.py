@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation import LedgerEntry

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.errors import InputError
 from dxlrun_lab.tracking import measurement
 from dxlrun_lab.tracking.measurement import measure

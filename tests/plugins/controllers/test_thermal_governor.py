@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from tests.kit.stages import Stage
 
 from dxlrun import MotorModel, ServoModel
-from dxlrun.compile import compile_files
+from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import InputError
 from dxlrun.remote.preparation import Preparation, RefusedRequest

@@ -234,7 +234,7 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
             "brings one to another rate, two protocols need two ports; or scan one of them alone by "
             "--protocol and --baud"
         )
-    from dxlrun.compile import compile_files
+    from dxlrun.compile.robot import compile_files
 
     text = _text(stem, port, known, latency_ns, rate=1)
     with tempfile.TemporaryDirectory() as folder:
