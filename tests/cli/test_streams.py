@@ -61,3 +61,11 @@ def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path: Path, torso: Pat
 
     assert said.stderr == ""
     assert "Traceback" not in said.stdout
+
+
+def test_a_terminal_that_knows_ascii_alone_gets_tables_and_graphs_in_it(tmp_path: Path, torso: Path):
+    said = shell(
+        f"export PYTHONIOENCODING=ascii; dxlrun check {torso} --graph && dxlrun check {torso}", tmp_path
+    )
+    assert (said.returncode, said.stdout.isascii()) == (0, True), said.stderr
+    assert "\n" + "-" * 80 in said.stdout

@@ -42,6 +42,7 @@ _LONGEST_WORD = 40
 _LIVE = 77
 """Columns of a line that changes: a terminal of 80 breaks none, the spinner included."""
 _REFRESH_S = 0.25
+_ASCII = str.maketrans({"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{HORIZONTAL ELLIPSIS}": "~"})
 
 
 def out(pipe: int = _PIPE) -> Console:
@@ -60,9 +61,10 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
     Lines are not broken, so that a command in them can be copied, unless they are to be `folded`.
     """
     console = console or out()
+    plain = ascii_only(console)
     for part in parts:
         for line in _lines(part, console, folded=folded):
-            _print(line, console)
+            _print([(text.translate(_ASCII), style) for text, style in line] if plain else line, console)
     console.file.flush()  # a reader behind a pipe waits for it
 
 
