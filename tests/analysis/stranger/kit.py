@@ -14,6 +14,7 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -450,12 +451,10 @@ class Story:
         """Let a register show something else from a time on; `show` gets a function of what it would show."""
 
         def begin() -> None:
-            servo = self.servo(joint)
-            names = [name for name in (item, item.replace("velocity", "speed")) if name in servo._live]
-            before = servo._live[names[0]]
-            servo._live[names[0]] = lambda: show(before)
-            servo._windows.clear()
-            servo.registers.version += 1
+            registers = self.servo(joint).registers
+            live = registers._live
+            name = next(name for name in (item, item.replace("velocity", "speed")) if name in live)
+            registers.show_live({**live, name: partial(show, live[name])})
             self.evidence[f"{item} replaced"] += 1
 
         self.at(since_s, begin, joint)
