@@ -112,6 +112,7 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     Of a simulated part there is nothing to check or to exchange, whatever its rule proposes for a real one.
     """
     part = finding.code in _REPLIES or finding.subject not in _NO_PARTS
+    part &= finding.code != "goal_swings"  # its commands are real
     if not finding.remedy or not part or not totals.plan.is_simulated(finding.subject):
         return finding.remedy
     if finding.code in _OF_TIME and not totals.virtual:

@@ -30,7 +30,7 @@ FAULT = TIME >= 5.0
 SWING = 0.8 * np.sin(3.5 * TIME)
 LOAD = 0.2 + 0.1 * np.sin(7 * TIME)
 TICK = 0.005
-FIELDS = ("position", "velocity", "effort", "goal_effort")
+FIELDS = ("position", "velocity", "effort", "goal_effort", "goal_position")
 
 
 def behind(way: Floats, cycles: int = 2, gain: float = 1.0) -> Floats:
@@ -64,6 +64,7 @@ def findings(*joints: Joint, name: str = "j") -> list[Finding]:
         cycles["position"][:, row] = np.round(joint.position / tick) * tick
         cycles["velocity"][:, row] = joint.velocity * np.gradient(joint.position, DT)
         cycles["effort"][:, row], cycles["torque"][:, row] = joint.load, joint.torque
+        cycles["goal_position"][:, row] = joint.way
         facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
         planned.append(PlannedJoint(f"{name}{row}", **facts))
     movement = Movement(planned, int(cycles["read_ns"][0]))
@@ -117,6 +118,14 @@ def test_a_joint_that_turns_again_and_again_shakes(swing: float, shakes: bool) -
     assert [(one.code, one.subject) for one in found] == [("joint_shakes", "j0")] * shakes
     assert all("times a second around its goal" in one.sentence for one in found)
     assert findings(Joint(way=shaking, position=behind(shaking, 1)), Joint(), Joint()) == []  # as it is told
+
+
+@pytest.mark.parametrize(("away", "told"), [(0.15, True), (0.05, False)])
+def test_a_joint_that_is_sent_to_and_fro_faster_than_it_can_is_told_so(away: float, told: bool) -> None:
+    goals = np.where(FAULT, 0.15 * np.sign(np.cos(2 * math.pi * 8.0 * TIME + 0.1)), 0.0)
+    found = findings(Joint(way=goals, position=(1 - away / 0.15) * goals), Joint(), Joint())
+    assert [(one.code, one.subject, one.rank) for one in found] == [("goal_swings", "j0", Rank.CAUSE)] * told
+    assert all("is sent to and fro 8 times a second by its commands" in one.sentence for one in found)
 
 
 def test_a_short_standstill_is_told_and_the_run_good() -> None:

@@ -19,6 +19,7 @@ from dxlrun_analysis.page.findings import finding_plots
 from dxlrun_analysis.plan import LoggedBus, LoggedPlan, LoggedServo
 from dxlrun_analysis.servos.exchanges import Pairing
 from dxlrun_analysis.servos.joint_states import JointStates, Places
+from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
@@ -215,6 +216,23 @@ def test_replies_that_were_given_up_count_at_their_angles() -> None:
         lambda servo, cycle: 4000 * (servo == 2 and IN_RANGE[cycle]), chained=False, given_up=True
     )
     assert (finding.subject, "between 20 and 40 deg" in finding.sentence) == ("j2", True)
+
+
+@pytest.mark.parametrize(("took", "named"), [(4000, ["slow_servo"]), (DELAY, [])])
+def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: int, named: list[str]) -> None:
+    """The line may have lost bytes before it."""
+    line = Line()
+    for cycle in range(CYCLES):
+        line.now = cycle * PERIOD
+        for servo in IDS:
+            given_up = servo == 2 and cycle % 10 == 0
+            line.exchange(cycle, ask(servo), [servo], [took if given_up else DELAY])
+            if given_up:
+                line.packets[-1] = replace(line.packets[-1], kind=PacketKind.LATE)
+    columns = replace(PacketColumns.of(line.packets), cycle=np.array(line.cycles, np.int64))
+    replies, none = LateReplies(), np.zeros(0, np.int64)
+    replies.take(Pairing().pair(columns, (BUS,)), none, none)
+    assert [one.code for one in replies.findings(0, BUS)] == named
 
 
 def test_a_servo_that_is_late_when_hot_is_named_with_the_temperature() -> None:

@@ -13,6 +13,7 @@ has torque and controls a position, in bins of 0.1 s or more:
   at which it was before, and not much faster. Not at fault is a joint whose load grew as much as its error:
   it carries more. Where most joints get worse together, it is none of them.
 - *shakes*: its error swings by 2 deg or more, a dozen times a second more than its trajectory does.
+- *goal swings*: a dozen times a second, which the joint cannot follow.
 
 A joint that never followed well, or that is nowhere it was before, is compared with nothing.
 """
@@ -28,9 +29,9 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.joints.planned import PlannedJoint
 
-ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS = range(7)
+ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS, GOALS = range(8)
 """Quantities: signed error, trajectory, position, the trajectory's speed, load, the error that counts, and
-swings of the error, 1/s, less those of the trajectory."""
+swings of the error, 1/s, less those of the trajectory; and swings of the goal, 1/s."""
 STILL_RAD = 0.01
 _STILL_S = 0.5
 MOVED_RAD = 0.16
@@ -192,10 +193,16 @@ def _at_limit(values: Floats, most: float, step: float) -> bool:
 
 
 def _shakes(one: Windows) -> Failing | None:
-    """Return the time in which a joint shakes around its trajectory."""
+    """Return the time in which a joint shakes around its trajectory, or is sent to and fro."""
     shakes = one.mean[SWINGS] >= _SHAKES_HZ
     seconds = float(shakes.sum()) * one.length_s
-    return Failing("joint_shakes", shakes, seconds, ~shakes) if seconds >= BAD_S else None
+    if seconds >= BAD_S:
+        return Failing("joint_shakes", shakes, seconds, ~shakes)
+    told = one.mean[GOALS] >= _SHAKES_HZ
+    seconds = float(told.sum()) * one.length_s
+    if seconds < BAD_S or not one.typical(AWAY, told) >= AWAY_RAD * one.joint.share:
+        return None
+    return Failing("goal_swings", told, seconds, ~told)
 
 
 def _worse(one: Windows) -> Failing | None:

@@ -21,6 +21,7 @@ from dxlrun_analysis.joints.failing import (
     AWAY_RAD,
     BAD_S,
     ERROR,
+    GOALS,
     LOAD,
     MOVED_RAD,
     POSITION,
@@ -78,7 +79,7 @@ class Movement:
         self._joints = joints
         self._fastest = np.zeros(len(joints))
         self._jumps = [_Jumps() for _ in joints]
-        self.bins = Bins(7, len(joints), begin_ns)
+        self.bins = Bins(8, len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
         """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
@@ -115,6 +116,7 @@ class Movement:
             np.where(unknown, np.nan, np.abs(cycles["effort"])),
             np.where(hurries, 0.0, np.abs(error)),
             np.where(unknown, np.nan, self._swings(cycles, error) - self._swings(cycles, way)),
+            np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
         ]
         self.bins.take(cycles["read_ns"], np.array(values))
 
@@ -125,7 +127,9 @@ class Movement:
         for row, joint in enumerate(self._joints):
             known = np.flatnonzero(np.isfinite(values[:, row]))
             mine = values[known, row]
-            turns = np.flatnonzero(np.diff(mine[1:]) * np.diff(mine[:-1]) < 0) + 1
+            new = np.flatnonzero(np.diff(mine, prepend=math.nan) != 0)  # goals are held between commands
+            steps = np.diff(mine[new])
+            turns = new[np.flatnonzero(steps[1:] * steps[:-1] < 0) + 1]
             far = np.abs(np.diff(mine[turns])) >= _SWING_RAD * joint.share
             swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]  # none was missed between
             found[known[swings], row] = rate
@@ -179,6 +183,7 @@ _REMEDIES = {
     "far_from_goal": "Look for what holds it back: an obstacle, friction, too heavy a load, low gains or "
     "limits (`dxlrun servo PORT ID get`).",
     "joint_shakes": "Look for play in gears and horn; lower its gains, or its load's inertia.",
+    "goal_swings": "See which clients and controllers command it (`/commands` in the log), and let only one.",
     "error_grew": "Compare its gains and limits with the model's (`dxlrun servo PORT ID get`), and turn it "
     "by hand: a horn or a gear may slip.",
 }
@@ -190,8 +195,8 @@ _MAY_BE = {
 }
 _SHARED = ("error_grew", "far_from_goal", "speed_limit", "torque_limit")
 """What a joint that is not at fault may show too, where others do."""
-_RANKS = {"jammed_joint": Rank.SERVO_CAUSE}
-"""It may pull down the supply, or shut itself down."""
+_RANKS = {"jammed_joint": Rank.SERVO_CAUSE, "goal_swings": Rank.CAUSE}
+"""A blocked one may pull down the supply, or shut itself down; commands are the matter of their sender."""
 
 
 def _finding(one: Windows, failing: Failing, peers: float) -> Finding:
@@ -220,6 +225,10 @@ def _finding(one: Windows, failing: Failing, peers: float) -> Finding:
             f"followed {worse} than before: {_text(joint, error)} away (before: {_text(joint, before)}{rest})"
         )
         what += f", {part}"
+    elif code == "goal_swings":
+        hertz = one.typical(GOALS, when) / 2
+        what = f"is sent to and fro {hertz:.0f} times a second by its commands, and is {_text(joint, error)}"
+        what, exerted = f"{what} from them on average", ""
     elif code == "joint_shakes":
         hertz = one.typical(SWINGS, when) / 2
         what = f"shakes {hertz:.0f} times a second around its goal, {_text(joint, error)} on average"
@@ -232,13 +241,13 @@ def _finding(one: Windows, failing: Failing, peers: float) -> Finding:
         }.get(code, "")
         most = np.nanmax(np.abs([one.least[ERROR, when], one.most[ERROR, when]]))
         what = f"{did} for {failing.seconds:.1f} s although its goal was up to {_text(joint, most)} away"
+    name = joint.name if code == "goal_swings" else f"{joint.name} ({joint.servos})"
     away = when & (one.mean[AWAY] > AWAY_RAD * joint.share)  # it may have stood where it was to stand
     since_s = float(np.flatnonzero(away if away.any() else when)[0]) * one.length_s
     return Finding(
         code,
         joint.name,
-        f"{joint.name} ({joint.servos}) {what}{exerted}; from {since_s:.1f} s of the run on"
-        f"{_MAY_BE.get(code, '')}.",
+        f"{name} {what}{exerted}; from {since_s:.1f} s of the run on{_MAY_BE.get(code, '')}.",
         _REMEDIES[code],
         Rank.CAUSE if failing.seconds < BAD_S else _RANKS.get(code, Rank.SERVO),
         3.0,

@@ -12,7 +12,7 @@ import numpy as np
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import Exchanges, Numbers
+from dxlrun_analysis.servos.exchanges import Exchanges, Flags, Numbers
 
 _IDS = 256
 _FEWEST = 5
@@ -43,14 +43,17 @@ class LateReplies:
             self._given_up = np.zeros(count * _IDS, np.int64)
             self._longest_ns, self._exchanges = np.zeros((2, count), np.int64)
         self._exchanges += np.bincount(exchanges.bus[exchanges.request > 0], minlength=count)
-        self._given_up += np.bincount(late.bus * _IDS + late.servo_id, minlength=count * _IDS)
-        np.maximum.at(self._longest_ns, late.bus, late.late_ns)
+        came_late = ~_in_time(exchanges)
+        late_bus, late_at_ns = late.bus[came_late], late.at_ns[came_late]
+        keys = late_bus * _IDS + late.servo_id[came_late]
+        self._given_up += np.bincount(keys, minlength=count * _IDS)
+        np.maximum.at(self._longest_ns, late_bus, late.late_ns[came_late])
         # without a rate it is not known when they are due
         known = np.array([bool(bus.baud_rate) for bus in exchanges.buses])
         rows, at_ns = rows[known[exchanges.bus[rows]]], at_ns[known[exchanges.bus[rows]]]
         np.maximum.at(self._longest_ns, exchanges.bus[rows], at_ns - exchanges.sent_ns[rows])
-        times = np.concatenate([late.at_ns, at_ns])
-        buses = np.concatenate([late.bus, exchanges.bus[rows]])
+        times = np.concatenate([late_at_ns, at_ns])
+        buses = np.concatenate([late_bus, exchanges.bus[rows]])
         order = np.argsort(times, kind="stable")
         begins = np.flatnonzero(np.diff(times[order], prepend=-(1 << 62)) > _MOMENT_NS)
         if len(begins):
@@ -121,3 +124,17 @@ class LateReplies:
 
     def _ms(self, index: int) -> int:
         return round(int(self._longest_ns[index]) / 1e6)
+
+
+def _in_time(exchanges: Exchanges) -> Flags:
+    """Return which late replies came no later than others were awaited to the same request.
+
+    They were given up for another reason, such as bytes that the line lost before them.
+    """
+    replies, late = exchanges.replies, exchanges.late
+    of = replies.exchange[replies.answers]
+    longest_ns = np.zeros(len(exchanges.requests), np.int64)
+    took_ns = replies.last_ns[replies.answers] - exchanges.sent_ns[of]
+    np.maximum.at(longest_ns, exchanges.request[of], took_ns)
+    known = late.exchange >= 0
+    return known & (late.late_ns <= longest_ns[exchanges.request[late.exchange]])
