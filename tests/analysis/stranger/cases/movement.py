@@ -259,7 +259,7 @@ def joint_shakes(story: Story) -> None:
         servo = story.servo("right_elbow")
         plant = servo.shaft.mechanics.plant
         plant.velocity[servo.shaft.index] += 3.0 * (1 if int(t_s * 25) % 2 else -1)
-        servo.shaft.mechanics._disturb()
+        servo.shaft.mechanics._wake()
         story.evidence["kick"] += 1
 
     story.every(0.008, kick, "right_elbow", since_s=2.4)
