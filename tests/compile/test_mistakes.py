@@ -15,4 +15,6 @@ CASES = [
 @pytest.mark.usefixtures("part_plugins")
 @pytest.mark.parametrize("case", CASES)
 def test_each_mistake_is_named_where_it_stands(case: Case) -> None:
+    if any("mujoco" in change for change in case.changes):
+        pytest.importorskip("mujoco")
     case.check()

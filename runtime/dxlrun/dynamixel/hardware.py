@@ -364,8 +364,10 @@ class DynamixelHardware:
         return False
 
     def _report_failures(self) -> None:
-        if self._lines.failure is not None:
-            report_failures(self._lines, self._servos)
+        for bus in self._buses:
+            if bus.failure is not None:
+                report_failures(self._lines, self._servos)
+                return
 
     def _report_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):
