@@ -10,13 +10,14 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.analysis.stranger.cases import innocents, line, movement, workshop
+from tests.analysis.stranger.cases import innocents, line, movement, programs, servos, wires, workshop
 from tests.analysis.stranger.cases import robot as robots
 from tests.analysis.stranger.expectation import Judged, judged
 
 from dxlrun.errors import DxlrunError
 
-CASES = (*line.CASES, *robots.CASES, *movement.CASES, *innocents.CASES, *workshop.CASES)
+FILES = (line, robots, movement, innocents, workshop, servos, wires, programs)
+CASES = tuple(case for file in FILES for case in file.CASES)
 PAIRS = [(case, robot) for case in CASES for robot in case.robots]
 
 

@@ -16,7 +16,8 @@ from tests.analysis.stranger.kit import JOINTS, ROBOTS, Spec, Story
 from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
-HARDWARE = (*JOINTS, "bus:left_knee", "bus:right_knee", "bus:head_yaw", "hardware")
+BUSES = ("bus:left_knee", "bus:right_knee", "bus:head_yaw")
+HARDWARE = (*JOINTS, *BUSES, "hardware")
 """All joints, all buses, and whatever a remedy could have a person check or exchange."""
 
 BROKEN = (
@@ -31,7 +32,28 @@ SOFT = r"gain|follow|error|lag|behind|weak|soft|compliant|\boff\b|away from|from
 MACHINE = r"machine|processor|\bcores?\b|\bCPU|busy|scheduler|other (program|process)|starved|waited for"
 SILENT = r"silent|not answer|no repl|lost|miss|did not repl|stopped"
 SHARED = r"together|same (time|moment|cycle)|at once|shared?|common|behind"
+FOLLOWS = SOFT + r"|reach|short of|sag|sink|sank|fell|fall|droop|distance|differ|apart|out of place"
+LOAD = r"load|effort|torque|current|weight|heav|force|press|push|strain"
+VOLTS = r"volt|batter|suppl|power|brown|\bV\b"
+HEAT = r"\bhot\b|heat|warm|temperature|thermal|°\s?C|deg(rees)? ?C|cool"
+LOST = SILENT + r"|contact|answer|repl(y|ies)|gone|absent|vanish|drop"
+CABLE = r"cable|plug|contact|connect|wire|wiring|loose|chain|intermittent"
+GARBLED = (
+    r"nois|disturb|interfer|corrupt|garb|damaged|broken|checksum|CRC|unexpected|stray|spurious|rubbish|junk"
+    r"|bit error|flipp|incomplet|truncat|not (be )?(parsed|understood)|unreadable|distort|EMI|spoil|intact"
+)
+REBOOTS = r"re-?boot|re-?start|start(ed|s)? again|power|brown|reset|lost its (power|torque)|limp"
 """Words with which a sentence may name such a cause."""
+
+
+def others(*joints: str) -> tuple[str, ...]:
+    """Return all joints but some."""
+    return tuple(name for name in JOINTS if name not in joints)
+
+
+def together(names: tuple[str, ...], what: str) -> str:
+    """Return a pattern for a sentence that has one of some names, and one of some words."""
+    return rf"(?=.*({'|'.join(names)}))(?=.*({what}))"
 
 
 @dataclass(frozen=True)

@@ -41,16 +41,10 @@ from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import simulated_robot
 
 MS, S = 1_000_000, 1_000_000_000
-JOINTS = (
-    "head_yaw",
-    "head_pitch",
-    "left_shoulder",
-    "left_elbow",
-    "left_knee",
-    "right_shoulder",
-    "right_elbow",
-    "right_knee",
-)
+HEAD = ("head_yaw", "head_pitch")
+LEFT = ("left_shoulder", "left_elbow", "left_knee")
+RIGHT = ("right_shoulder", "right_elbow", "right_knee")
+JOINTS = (*HEAD, *LEFT, *RIGHT)
 Spec = dict[str, Any]
 Broken = Any
 """A controller that is made to fail."""
@@ -115,31 +109,28 @@ class Robot:
         }
 
 
-_HEAD = ("head_yaw", "head_pitch")
-_LEFT = ("left_shoulder", "left_elbow", "left_knee")
-_RIGHT = ("right_shoulder", "right_elbow", "right_knee")
 ROBOTS = {
     robot.name: robot
     for robot in (
-        Robot("mx_bulk", 1.0, 100, ("MX-28", "MX-64"), {"main": (*_HEAD, *_LEFT, *_RIGHT)}),
+        Robot("mx_bulk", 1.0, 100, ("MX-28", "MX-64"), {"main": (*HEAD, *LEFT, *RIGHT)}),
         Robot(
             "mx_two",
             1.0,
             125,
             ("MX-28", "MX-64"),
-            {"left": (*_LEFT, "head_yaw"), "right": (*_RIGHT, "head_pitch")},
+            {"left": (*LEFT, "head_yaw"), "right": (*RIGHT, "head_pitch")},
         ),
-        Robot("ax_single", 1.0, 50, ("AX-12A", "AX-12A"), {"main": (*_LEFT, *_RIGHT, *_HEAD)}, 1, "100 us"),
-        Robot("x_fast", 2.0, 100, ("XM430-W350", "XM540-W270"), {"main": (*_RIGHT, *_HEAD, *_LEFT)}, 11),
+        Robot("ax_single", 1.0, 50, ("AX-12A", "AX-12A"), {"main": (*LEFT, *RIGHT, *HEAD)}, 1, "100 us"),
+        Robot("x_fast", 2.0, 100, ("XM430-W350", "XM540-W270"), {"main": (*RIGHT, *HEAD, *LEFT)}, 11),
         Robot(
             "x_three",
             2.0,
             200,
             ("XM430-W350", "XM430-W350"),
-            {"head": _HEAD, "left_leg": _LEFT, "right_leg": _RIGHT},
+            {"head": HEAD, "left_leg": LEFT, "right_leg": RIGHT},
             21,
         ),
-        Robot("x_sync", 2.0, 80, ("2XL430-W250", "2XL430-W250"), {"main": (*_LEFT, *_HEAD, *_RIGHT)}, 31),
+        Robot("x_sync", 2.0, 80, ("2XL430-W250", "2XL430-W250"), {"main": (*LEFT, *HEAD, *RIGHT)}, 31),
     )
 }
 """MX read by bulk reads, on one and two buses; AX by single reads; X by fast sync reads, on one and three
@@ -149,18 +140,21 @@ buses; 2XL by plain sync reads, as they know no fast ones."""
 class Client(QueueInbox):
     """Sends what a client would send, each at its time of the run, through the gateway's checks."""
 
-    def __init__(self, robot: VirtualRobot, asks: Sequence[tuple[float, str, str, Spec]]) -> None:
+    def __init__(
+        self, robot: VirtualRobot, asks: Sequence[tuple[float, str, str, Spec]], names: Sequence[str]
+    ) -> None:
         super().__init__()
         loop = robot.plan.loop
         preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
         plans = {plan.name: plan for plan in loop.controllers}
         self._clock = robot.clock
         self._asks: deque[tuple[float, Command]] = deque()
+        name = itertools.cycle(names)
         for number, (at_s, controller, kind, what) in enumerate(sorted(asks, key=lambda ask: ask[0]), 1):
             data = json.dumps(what).encode()
             if controller:
                 data = preparation.command(plans[controller], kind, data).data
-            self._asks.append((at_s, Command(number, controller, kind, data, "a client")))
+            self._asks.append((at_s, Command(number, controller, kind, data, next(name))))
 
     def take(self) -> Sequence[Command]:
         while self._asks and self._asks[0][0] * S <= self._clock.now_ns():
@@ -179,6 +173,8 @@ class Story:
         self.duration_s = 6.0
         self.asks: list[tuple[float, str, str, Spec]] = []
         """When (s of the run), controller or "" for the loop, kind, and the command."""
+        self.clients: tuple[str, ...] = ("a client",)
+        """Which ask it: of several each in its turn."""
         self.evidence: Counter[str] = Counter()
         """What really happened, by kind; a case that left nothing here is worthless."""
         self.checks: list[Callable[[Log], None]] = []
@@ -295,6 +291,11 @@ class Story:
         names = list(self.spec["buses"])
         name = names[joint] if isinstance(joint, int) else self.joint(joint)["bus"]
         return next(bus for bus in self.virtual.buses if bus.name == name)
+
+    @property
+    def buses(self) -> range:
+        """The numbers of the buses."""
+        return range(len(self.spec["buses"]))
 
     def id(self, joint: str) -> int:
         """Return a joint's ID."""
@@ -552,7 +553,7 @@ class Story:
             self.virtual = simulated_robot(
                 file, play=played, duration_s=self.duration_s, log=log, arguments={"port": "sim"}
             )
-        self.virtual.robot.loop.steering.inbox = Client(self.virtual, self.asks)
+        self.virtual.robot.loop.steering.inbox = Client(self.virtual, self.asks, self.clients)
         for plan in self.prepared:
             plan()
         self.virtual.run()

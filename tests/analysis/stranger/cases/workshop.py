@@ -3,29 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from tests.analysis.stranger.expectation import HOST, Case, collector
-from tests.analysis.stranger.kit import JOINTS, S, Story
-
-from dxlrun.log.reader import Log
+from tests.analysis.stranger.expectation import HOST, Case, collector, others
+from tests.analysis.stranger.kit import JOINTS, Story
+from tests.analysis.stranger.proof import lags
 
 CASES: list[Case] = []
 case = collector(CASES)
-
-
-def lags(story: Story, joint: str, since_s: float, deg: float) -> None:
-    """Prove by the log that a joint is away from its goal at least once."""
-
-    def check(log: Log) -> None:
-        row = log.header.joints.index(joint)
-        later = log.cycles[log.cycles["scheduled_ns"] > since_s * S]
-        off = np.nanmax(np.abs(later["goal_position"][:, row] - later["position"][:, row]))
-        assert np.degrees(off) > deg, f"only {np.degrees(off):.1f} deg"
-
-    story.checks.append(check)
-
-
-def others(*names: str) -> tuple[str, ...]:
-    return tuple(joint for joint in JOINTS if joint not in names)
 
 
 # Faults
@@ -96,7 +79,7 @@ def profile_velocity_left_by_a_tool(story: Story) -> None:
         story.evidence["profile set"] += 1
 
     story.every(0.0005, set_it, "right_elbow", 1.5)
-    lags(story, "right_elbow", 1.6, 5.0)
+    lags(story, "right_elbow", 0.09, 1.6)
 
 
 @case(
@@ -116,7 +99,7 @@ def torque_limit_of_a_bench_test(story: Story) -> None:
         story.evidence["limit set"] += 1
 
     story.at(1.5, set_it, "left_shoulder")
-    lags(story, "left_shoulder", 1.6, 4.0)
+    lags(story, "left_shoulder", 0.07, 1.6)
 
 
 @case(
@@ -139,7 +122,7 @@ def cable_tie_stops_the_elbow(story: Story) -> None:
 
     story.evidence["stopped"] += 0
     story.every(0.002, hold, "left_elbow", 1.0)
-    lags(story, "left_elbow", 1.0, 5.0)
+    lags(story, "left_elbow", 0.09)
 
 
 @case(

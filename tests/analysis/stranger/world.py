@@ -1,0 +1,121 @@
+"""What acts on a robot from outside: hands and obstacles, weights, supplies, tools, and what an IMU sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from tests.analysis.stranger.kit import S, Story
+
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+
+
+def shove(story: Story, joint: str, torque: Callable[[float, float, float], float], kind: str) -> None:
+    """Let a torque (Nm of the joint) act on a joint, by time (s), angle (rad) and velocity (rad/s)."""
+
+    def plan() -> None:
+        shaft = story.servo(joint).shaft
+        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
+        plant = mechanics.plant
+        step = plant.step
+
+        def shoved(drive: Any, damping: Any, dt_s: float) -> None:
+            t_s, velocity = mechanics.grid_ns / S, sign * float(plant.velocity[index])
+            outside = torque(t_s, story.q(joint), velocity)
+            if outside:
+                story.evidence[kind] += 1
+                drive = drive.copy()
+                drive[index] += sign * outside
+            step(drive, damping, dt_s)
+
+        plant.step = shoved  # type: ignore[method-assign]
+
+    story.prepared.append(plan)
+    # without a goal that changes the mechanics would rest
+    story.every(0.02, lambda t_s: story.servo(joint).shaft.mechanics._wake(), joint)
+
+
+def hard_stop(story: Story, joint: str, highest: float) -> None:
+    """Let something stand in the way of a joint above an angle (rad); the other way is free."""
+
+    def plan() -> None:
+        shaft, sign = story.servo(joint).shaft, story.joint(joint)["direction"]
+        plant, index = shaft.mechanics.plant, shaft.index
+        step = plant.step
+
+        def stopped(drive: Any, damping: Any, dt_s: float) -> None:
+            step(drive, damping, dt_s)
+            beyond = story.q(joint) - highest
+            if beyond > 0.0:
+                story.evidence["stopped"] += 1
+                plant.angle[index] -= sign * beyond
+                plant.velocity[index] = 0.0
+
+        plant.step = stopped  # type: ignore[method-assign]
+
+    story.prepared.append(plan)
+
+
+def carry(story: Story, joint: str, torque_nm: float) -> None:
+    """Let a joint carry a weight from now on, or none."""
+    shaft = story.servo(joint).shaft
+    shaft.mechanics.plant._gravity[shaft.index] = torque_nm
+    shaft.mechanics.plant._has_gravity = True
+    shaft.mechanics._wake()
+    story.evidence["weight changed"] += 1
+
+
+def poke(story: Story, joint: str, **items: int) -> None:
+    """Set those of some registers that a joint's servo has, as a tool would, now."""
+    servo = story.servo(joint)
+    for name, value in items.items():
+        if name in servo.registers:
+            servo.poke(name, value)
+            story.evidence["registers changed"] += 1
+
+
+def set_before(story: Story, joint: str, **items: int) -> None:
+    """Set those of some registers that a joint's servo has, before the program connects to it."""
+    story.prepared.append(lambda: poke(story, joint, **items))
+
+
+def supply(
+    story: Story, joint: str | int, volts: Callable[[float, SimulatedServo], float | None], kind: str
+) -> None:
+    """Give the servos of a joint's bus another voltage (V), by time (s) and servo; None: as it is."""
+
+    def give(t_s: float) -> None:
+        for servo in story.bus(joint).servos:
+            given = volts(t_s, servo)
+            if given is not None:
+                story.evidence[kind] += 1
+                servo.voltage = given
+                servo.protect()
+
+    story.every(0.02, give, joint, 0.9)
+
+
+def noisy_imu(story: Story) -> None:
+    """Give the IMU the noise that a real one has."""
+    story.spec["sensors"]["gyro"] |= {
+        "gyroscope": {"noise_density": 1.0e-3},
+        "accelerometer": {"noise_density": 3.0e-3},
+    }
+
+
+def imu_gives(story: Story, change: Callable[[float, np.ndarray[Any, Any]], None]) -> None:
+    """Change what the IMU gives, in place, by the time (s)."""
+
+    def plan() -> None:
+        sensor = story.virtual.sensors["gyro"]
+        read = sensor.read
+
+        def changed(values: Any) -> int:
+            t_ns = read(values)
+            change(story.now_s(), values)
+            return t_ns
+
+        sensor.read = changed  # type: ignore[method-assign]
+
+    story.prepared.append(plan)
