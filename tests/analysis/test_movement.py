@@ -120,6 +120,12 @@ def test_a_joint_that_turns_again_and_again_shakes(swing: float, shakes: bool) -
     assert findings(Joint(way=shaking, position=behind(shaking, 1)), Joint(), Joint()) == []  # as it is told
 
 
+def test_a_joint_that_is_sent_in_steps_does_not_shake() -> None:
+    """A client that sends a goal seven times a second: the joint waits at each."""
+    stairs = np.repeat(SWING[::7], 7)[: len(TIME)]
+    assert findings(Joint(way=stairs, position=behind(stairs)), Joint(), Joint()) == []
+
+
 @pytest.mark.parametrize(("away", "told"), [(0.15, True), (0.05, False)])
 def test_a_joint_that_is_sent_to_and_fro_faster_than_it_can_is_told_so(away: float, told: bool) -> None:
     goals = np.where(FAULT, 0.15 * np.sign(np.cos(2 * math.pi * 8.0 * TIME + 0.1)), 0.0)

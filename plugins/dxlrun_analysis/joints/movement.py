@@ -115,7 +115,7 @@ class Movement:
             np.where(unknown, np.nan, speed),
             np.where(unknown, np.nan, np.abs(cycles["effort"])),
             np.where(hurries, 0.0, np.abs(error)),
-            np.where(unknown, np.nan, self._swings(cycles, error) - self._swings(cycles, way)),
+            np.where(unknown, np.nan, self._swings(cycles, error) - self._told(cycles, way)),
             np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
         ]
         self.bins.take(cycles["read_ns"], np.array(values))
@@ -134,6 +134,14 @@ class Movement:
             swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]  # none was missed between
             found[known[swings], row] = rate
         return found
+
+    def _told(self, cycles: NDArray[np.void], way: Floats) -> Floats:
+        """Return where the error swings as it is told: the way does, or a goal steps after it was held."""
+        steps = np.abs(np.diff(cycles["goal_position"], axis=0, prepend=np.nan))
+        begins = steps >= _SWING_RAD * np.array([joint.share for joint in self._joints])
+        begins[1:] &= steps[:-1] == 0.0
+        rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
+        return np.maximum(self._swings(cycles, way), np.where(begins, 2.0 * rate, 0.0))
 
     def findings(self) -> Iterable[Finding]:
         """Name joints that stand still, are blocked or weak, or follow worse than before."""
