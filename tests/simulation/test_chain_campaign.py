@@ -287,7 +287,8 @@ def test_a_storm_breaks_no_chain(storm, tmp_path):
     log = read_log(tmp_path / "run.mcap")
     entries, (bus,) = robot.ledger.entries, robot.plan.buses
     sent, (witness,) = list(storms.instructions(entries, bus)), trial.witnesses
-    storms.goals_are_within_limits(sent, bus, robot)
+    halted_ns = [event.t_ns for event in log.events if event.text.startswith("halt ")]
+    storms.goals_are_within_limits(sent, bus, robot, halted_ns)
     storms.samples_are_what_was_sent(list(storms.states(entries, bus)), witness, bus, log)
     log_has_every_byte(log, entries)
     storms.everybody_who_hears_is_limp(robot, 0, robot.failures)
