@@ -55,11 +55,11 @@ def unread(story: Story, joint: str, least: int) -> None:
     story.checks.append(check)
 
 
-def said(story: Story, words: str) -> None:
-    """Prove that an event has some words."""
+def said(story: Story, words: str, least: int = 1) -> None:
+    """Prove that so many events have some words."""
 
     def check(log: Log) -> None:
-        story.evidence[words] += sum(words in event.text for event in log.events)
+        story.evidence[words] += sum(words in event.text for event in log.events) >= least
 
     story.checks.append(check)
 

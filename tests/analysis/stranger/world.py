@@ -81,7 +81,11 @@ def set_before(story: Story, joint: str, **items: int) -> None:
 
 
 def supply(
-    story: Story, joint: str | int, volts: Callable[[float, SimulatedServo], float | None], kind: str
+    story: Story,
+    joint: str | int,
+    volts: Callable[[float, SimulatedServo], float | None],
+    kind: str,
+    since_s: float = 0.9,
 ) -> None:
     """Give the servos of a joint's bus another voltage (V), by time (s) and servo; None: as it is."""
 
@@ -93,7 +97,24 @@ def supply(
                 servo.voltage = given
                 servo.protect()
 
-    story.every(0.02, give, joint, 0.9)
+    story.every(0.02, give, joint, since_s)
+
+
+def voltages_often(story: Story) -> None:
+    """Let the voltages be read ten times a second."""
+    item = "present_voltage" if story.kind.protocol == 1.0 else "present_input_voltage"
+    for bus in story.spec["buses"].values():
+        bus["slow_registers"] = {"rate": 10, "items": [item]}
+
+
+def late_wakes(story: Story, from_s: float, to_s: float, share: float, late_s: tuple[float, float]) -> None:
+    """Let a share of the loop's wakes in a part of the run be late, by a time (s) between two."""
+
+    def by_s(number: int) -> float:
+        late = story.virtual.clock.now_ns() < to_s * S and story.random.random() < share
+        return story.random.uniform(*late_s) if late else 0.0
+
+    story.stall(by_s, from_s)
 
 
 def noisy_imu(story: Story) -> None:

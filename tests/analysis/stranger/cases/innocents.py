@@ -8,6 +8,8 @@ from functools import partial
 from tests.analysis.stranger.expectation import HARDWARE, LATE, MACHINE, SILENT, STUCK, Case, collector
 from tests.analysis.stranger.kit import JOINTS, MS, Story
 from tests.analysis.stranger.live import compile_jobs, hog_on_the_core_of_the_loop, stop_for_moments
+from tests.analysis.stranger.proof import said
+from tests.analysis.stranger.world import late_wakes, supply, voltages_often
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -259,3 +261,58 @@ def compiler_beside(story: Story) -> None:
 def simulation_is_starved(story: Story) -> None:
     """The process of the simulated servos gets no processor for 120 ms, again and again."""
     story.disturb = partial(stop_for_moments, what="dxlrun.simulation", for_s=0.12, every_s=0.7)
+
+
+@case(
+    "machine",
+    "ax_single x_fast",
+    cause=MACHINE + r"|wak|woke|late|sched|deadline|jitter|clock|overrun|skipp",
+    innocents=HARDWARE,
+)
+def slow_core_in_motion(story: Story) -> None:
+    """The machine saves power: its core is so slow while more has to be computed, that is while the motion
+    plays, that a quarter of the wakes come late; before and behind it all is in time."""
+    story.duration_s = 7.0
+    story.motion = story.swing()
+    story.motion["motions"][0]["duration"] = "2.5 s"
+    period_s = 1 / story.kind.rate
+    late_wakes(story, 2.0, 4.5, 0.25, (0.4 * period_s, 1.3 * period_s))
+
+
+@case("fine", "mx_two x_fast", innocents=(*JOINTS, "hardware"))
+def paused_in_a_motion(story: Story) -> None:
+    """A client pauses the run in the middle of a motion, and lets it go on after a second."""
+    story.duration_s = 8.0
+    story.motion = story.swing()
+    story.motion["motions"][0]["duration"] = "4 s"
+    story.asks += [(3.1, "", "pause", {}), (4.1, "", "resume", {})]
+    said(story, "resume")
+
+
+@case("fine", "mx_bulk x_three", innocents=(*JOINTS, "hardware"))
+def half_the_rate(story: Story) -> None:
+    """A client lets the loop run at half its rate for a while."""
+    rate = story.kind.rate
+    story.asks += [(2.6, "", "rate", {"rate": rate / 2}), (4.0, "", "rate", {"rate": rate})]
+    story.checks.append(lambda log: story.evidence.update(slower=int(len(log.cycles) < 5.5 * rate)))
+
+
+@case("fine", "ax_single x_sync", innocents=(*JOINTS, "hardware"))
+def taught_by_hand(story: Story) -> None:
+    """A joint without torque, as the robot file asks for it, is turned by a hand, there and back, while the
+    others play a motion."""
+    story.joint("right_elbow")["torque"] = False
+    story.spec["controllers"]["body"]["joints"].remove("right_elbow")
+    story.motion = story.swing()
+    story.fault("turn servo={id} by=35deg for=900ms at=2300ms", "right_elbow")
+    story.fault("turn servo={id} by=-25deg for=700ms at=3600ms", "right_elbow")
+    story.at_end(lambda: abs(story.q("right_elbow")) > 0.1, "turned")
+
+
+@case("fine", "mx_two x_sync", innocents=(*JOINTS, "hardware"))
+def from_battery_to_mains(story: Story) -> None:
+    """The robot is taken from its battery to a power supply while it moves: 11.3 V, then at once 12.4 V, each
+    of them good."""
+    voltages_often(story)
+    for number in story.buses:
+        supply(story, number, lambda t_s, servo: 11.3 if t_s < 3.2 else 12.4, "supplied", since_s=0.1)

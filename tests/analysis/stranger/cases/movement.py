@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from tests.analysis.stranger.expectation import LATE, SOFT, STUCK, Case, collector
-from tests.analysis.stranger.kit import Story, freeze
+from tests.analysis.stranger.kit import S, Story, freeze
+from tests.analysis.stranger.proof import column, lags
+from tests.analysis.stranger.world import late_wakes, poke, shove, voltages_often
+
+from dxlrun.log.reader import Log
 
 CASES: list[Case] = []
 case = collector(CASES)
+
+OPPOSED = (
+    rf"{SOFT}|{STUCK}|load|force|effort|current|pull|push|friction|stiff|heav|drag|resist|spring|contact|outside|"
+    r"strain|overload|torque"
+)
+"""Something works against the joint, or it does not get where it should."""
 
 
 @case("movement", "mx_bulk x_fast ax_single", subject=("left_elbow",), cause=STUCK, good=False)
@@ -23,11 +34,7 @@ def encoder_frozen(story: Story) -> None:
 @case("movement", "mx_bulk x_fast", subject=("left_knee",), cause=r"volt|supply|sag|power|brown")
 def own_supply_sags(story: Story) -> None:
     """The power plug of one knee has corroded: its own voltage falls with its load, that of no other does."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {
-            "rate": 10,
-            "items": ["present_voltage" if story.kind.protocol == 1 else "present_input_voltage"],
-        }
+    voltages_often(story)
     story.joint("left_knee")["simulation"].update(gravity="1.3 Nm", gravity_angle="-90 deg")
 
     def sag(t_s: float) -> None:
@@ -282,3 +289,103 @@ def encoder_has_a_dead_spot(story: Story) -> None:
         return real + 680
 
     story.shown("head_pitch", "present_position", scratched, 2.0)
+
+
+@case(
+    "movement",
+    "mx_two x_fast",
+    subject=("right_elbow",),
+    cause=SOFT + r"|slow|late|acceler|profile|ramp|speed|limit",
+)
+def acceleration_tiny(story: Story) -> None:
+    """Another program leaves an elbow an acceleration so small that it reaches each turning point late and
+    swings beyond it."""
+    story.motion = story.swing(0.5, 0.6)
+    story.joint("right_elbow")["limits"]["velocity"] = "3 rad/s"
+    story.at(
+        2.3, lambda: poke(story, "right_elbow", goal_acceleration=6, profile_acceleration=3), "right_elbow"
+    )
+    lags(story, "right_elbow", 0.08, 2.8)
+
+
+@case(
+    "movement",
+    "mx_bulk x_sync",
+    subject=("right_knee",),
+    cause=OPPOSED + r"|slip|jerk|jump|sudden|twitch|disturb|shak|osc",
+)
+def foot_slips(story: Story) -> None:
+    """The leg carries weight; its foot slips again and again: for some 60 ms the load of the knee is gone,
+    then it is back with a blow."""
+    slips = [2.45 + 0.37 * number + story.random.uniform(0.0, 0.1) for number in range(7)]
+    weight = 1.5 if story.kind.protocol == 1.0 else 0.35
+
+    def load(t_s: float, q: float, dq: float) -> float:
+        since = [t_s - at_s for at_s in slips if 0.0 <= t_s - at_s < 0.12]
+        story.evidence["slips"] += bool(since)
+        if t_s < 0.6 or (since and since[0] < 0.06):
+            return 0.0
+        return 2.2 * weight if since else weight
+
+    shove(story, "right_knee", load, "loaded")
+
+
+@case("movement", "ax_single x_three", subject=("left_elbow",), cause=OPPOSED)
+def rubber_band(story: Story) -> None:
+    """A rubber band is caught at an arm: from 5 degrees of the elbow on it pulls back, the more the further;
+    on the other side nothing."""
+    most = 1.3 if story.kind.protocol == 1.0 else 1.9
+    story.motion = story.swing(0.6, 0.45)
+
+    def pull(t_s: float, q: float, dq: float) -> float:
+        return -most * max(0.0, q - 0.09) / 0.5 if t_s > 2.0 else 0.0
+
+    shove(story, "left_elbow", pull, "pulls")
+    lags(story, "left_elbow", 0.05, 2.2)
+
+
+@case(
+    "movement",
+    "mx_bulk x_fast",
+    subject=("right_shoulder",),
+    cause=r"backlash|\bplay\b|slack|hystere|dead ?(band|zone)|loose|revers|lost motion|" + SOFT + "|" + STUCK,
+)
+def play_in_the_gear(story: Story) -> None:
+    """The last gear has 6 degrees of play: after each reversal the output, and the encoder on it, stands
+    still until the play is through."""
+    half = 34
+    at: list[int] = []
+
+    def behind(show: Callable[[], int]) -> int:
+        now = show()
+        at[:] = [min(now + half, max(now - half, at[0] if at else now))]
+        story.evidence["behind"] += at[0] != now
+        return at[0]
+
+    story.motion = story.swing(0.4, 0.6)
+    story.shown("right_shoulder", "present_position", behind, 1.6)
+
+
+@case("movement", "mx_bulk x_fast", subject=("left_shoulder",), cause=OPPOSED, first=2)
+def dry_bearing_on_a_busy_machine(story: Story) -> None:
+    """The bearing of a shoulder runs dry: from second to second it takes more torque to turn it. Beside that
+    the machine now and then wakes the loop a little late, with no skipped period."""
+    story.motion = story.swing(0.5, 0.5)
+    stall_nm = 2.5 if story.kind.protocol == 1.0 else 3.8
+
+    def rub(t_s: float) -> None:
+        shaft = story.servo("left_shoulder").shaft
+        shaft.mechanics.plant._friction[shaft.index] = 0.05 + 0.16 * stall_nm * (t_s - 1.6)
+        shaft.mechanics._wake()
+
+    story.every(0.02, rub, "left_shoulder", since_s=1.7)
+    story.never_overloads("left_shoulder")
+    late_wakes(story, 2.5, 5.0, 0.03, (0.001, 0.003))
+
+    def check(log: Log) -> None:
+        times = log.cycles["scheduled_ns"] / S
+        off = np.abs(column(log, "goal_position", "left_shoulder") - column(log, "position", "left_shoulder"))
+        before = off[(times >= 2.0) & (times < 3.0)].mean()
+        story.evidence["rubs"] += off[(times >= 4.0) & (times < 5.0)].mean() > 1.5 * before
+
+    story.checks.append(check)

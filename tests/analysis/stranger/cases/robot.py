@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from tests.analysis.stranger.expectation import Case, collector
-from tests.analysis.stranger.kit import JOINTS, Broken, Story
+import math
+
+import numpy as np
+from msgspec.structs import replace
+from tests.analysis.stranger.expectation import SOFT, Case, collector, others
+from tests.analysis.stranger.kit import JOINTS, MS, Broken, Story
+from tests.analysis.stranger.proof import column, said
+
+from dxlrun.log.reader import Log
 
 CASES: list[Case] = []
 case = collector(CASES)
+ARMS = tuple(name for name in JOINTS if name.endswith(("shoulder", "elbow")))
 
 
 @case("robot", "mx_bulk x_fast", cause=r"(swing|motion|body|trajector).*\d deg", good=True, first=0)
@@ -242,3 +250,112 @@ def reboots_by_itself(story: Story) -> None:
 def controller_is_slow(story: Story) -> None:
     """The controller's update needs several periods now and then: it plans its next step in it."""
     story.slow_controller("body", 1.5, lambda number: 0.025 if number % 25 == 0 else 0.0)
+
+
+@case(
+    "robot",
+    "x_fast x_three",
+    subject=("right_elbow",),
+    cause=r"oscillat|vibrat|\bring|swing|gain|unstable|instab|trembl|overshoot|limit cycle|hunt|shak|chatter"
+    r"|back and forth|" + SOFT,
+)
+def own_gain_too_high(story: Story) -> None:
+    """The controller of an elbow by current has a gain far too high and no damping: the elbow swings about
+    its goal by itself."""
+    controllers = story.spec["controllers"]
+    controllers["body"]["joints"].remove("right_elbow")
+    controllers["elbow"] = {
+        "type": "joint_trajectory_controller",
+        "joints": ["right_elbow"],
+        "into": ["elbow_pid"],
+    }
+    controllers["elbow_pid"] = {
+        "type": "pid_controller",
+        "joints": ["right_elbow"],
+        "reference": "position",
+        "command_interface": "effort",
+        "gains": {"p": 20.0, "i": 150.0, "d": 0.0},
+        "integral_limit": 0.8,
+    }
+    story.joint("right_elbow")["limits"]["effort"] = "1.2 A"
+    story.joint("right_elbow")["simulation"]["inertia"] = "0.01 kg m^2"
+    story.play(*story.swing()["motions"], *story.swing(0.2, controller="elbow")["motions"])
+
+    def check(log: Log) -> None:
+        speed = column(log, "velocity", "right_elbow", 2.5)
+        signs = speed[np.abs(speed) > 0.3] > 0
+        story.evidence["swings"] += np.count_nonzero(signs[1:] != signs[:-1]) > 8
+
+    story.checks.append(check)
+
+
+@case(
+    "robot",
+    "mx_two x_sync",
+    cause=r"switch|take[ -]?over|took over|activat|hand(ed|s|ing)?[ -]?(over|back)|flap|alternat"
+    r"|back and forth|controllers?\b[^.]*\b(times|client)|client",
+    innocents=(*JOINTS, "hardware"),
+)
+def controllers_flap(story: Story) -> None:
+    """Two programs that do not know of each other each claim the arms for their controller, three times a
+    second, in turns; the motion never gets on."""
+    controllers = story.spec["controllers"]
+    controllers["body"]["joints"] = list(others(*ARMS))
+    controllers["arms"] = {"type": "joint_trajectory_controller", "joints": list(ARMS)}
+    controllers["carry"] = {"type": "joint_group_position_controller", "joints": list(ARMS), "active": False}
+    story.play(*story.swing()["motions"], *story.swing(controller="arms")["motions"])
+    for number in range(8):
+        on, off = ("carry", "arms") if number % 2 == 0 else ("arms", "carry")
+        story.asks.append((2.4 + 0.31 * number, "", "switch", {"activate": [on], "deactivate": [off]}))
+    said(story, "carry", 6)
+
+
+@case(
+    "robot",
+    "mx_two x_fast",
+    cause=r"\bstream|\blease|set-?points?|client|stale|no (new )?commands?|without (a )?command"
+    r"|commands? .*(stop|late|miss|gap|end)",
+    innocents=(*JOINTS, "hardware"),
+)
+def stream_gasps(story: Story) -> None:
+    """The program that streams goals to the arms collects its garbage: three times it sends nothing for
+    0.4 s, though its lease is 0.2 s; each time the arms stop dead, and jump on after it."""
+    controllers = story.spec["controllers"]
+    controllers["body"]["joints"] = list(others(*ARMS))
+    controllers["arms"] = {"type": "joint_group_position_controller", "joints": list(ARMS)}
+    story.motion = story.swing()
+    for t_s in np.arange(0.5, 5.2, 0.03).tolist():
+        if not any(at_s < t_s < at_s + 0.4 for at_s in (2.4, 3.3, 4.1)):
+            goal = [(0.35 + 0.1 * place) * math.sin(2.4 * (t_s - 0.5)) for place in range(len(ARMS))]
+            story.asks.append((t_s, "arms", "positions", {"positions": goal}))
+
+    def lease() -> None:
+        asks = story.virtual.robot.loop.steering.inbox._asks
+        for place, (at_s, command) in enumerate(asks):
+            asks[place] = (at_s, replace(command, lease_ns=200 * MS))
+
+    story.prepared.append(lease)
+    said(story, "stream", 3)
+
+
+@case(
+    "log",
+    "mx_bulk x_three",
+    cause=r"\b(logs?|record\w*|files?)\b.*(\bcut|incomplete|truncat|miss|without|broken|damag|ends?\b|stops?"
+    r"|gone|lost|not? (properly )?(closed|complete|finish|whole|footer|summary|index|end))"
+    r"|(\bcut|incomplete|truncat|unfinished|lost|missing)\b.*\b(log|record|file)",
+    innocents=(*JOINTS, "hardware"),
+    good=False,
+)
+def log_cut(story: Story) -> None:
+    """The battery of the computer comes off: of the log the last third is not there, in the middle of a
+    chunk."""
+
+    def cut(log: Log) -> None:
+        path = story.directory / "run.mcap"
+        size = path.stat().st_size
+        with path.open("r+b") as file:
+            file.truncate(size * 2 // 3 - 7)
+        story.evidence["cut"] += path.stat().st_size < size
+
+    story.checks.append(cut)

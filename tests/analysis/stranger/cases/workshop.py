@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
-from tests.analysis.stranger.expectation import HOST, Case, collector, others
-from tests.analysis.stranger.kit import JOINTS, Story
-from tests.analysis.stranger.proof import lags
+from tests.analysis.stranger.expectation import HOST, LATE, STUCK, Case, collector, others
+from tests.analysis.stranger.kit import JOINTS, S, Spec, Story
+from tests.analysis.stranger.proof import lags, seen
+from tests.analysis.stranger.world import poke, supply, voltages_often
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -223,6 +226,91 @@ def servo_cooks_in_its_shell(story: Story) -> None:
 
     story.every(0.25, warm, "right_shoulder", 0.5)
     story.at_end(lambda: not story.servo("right_shoulder").torque_on, "shut down")
+
+
+@case(
+    "setting",
+    "mx_two x_three",
+    innocents=others("left_knee", "head_yaw"),
+    cause=r"baud|\btool|wrote|writ(es|ten|ing)|unrequested|unasked|" + HOST,
+    good=False,
+)
+def baud_rate_written(story: Story) -> None:
+    """A setup tool on the same line takes the torque of a knee and sets its baud rate to 57600; then the
+    knee hears nothing of the line."""
+    value = 34 if story.kind.protocol == 1.0 else 1
+
+    def plan() -> None:
+        for t_s, item, wire in ((2.6012, "torque_enable", 0), (2.6512, "baud_rate", value)):
+            packet = story.write(story.id("left_knee"), item, wire)
+            story.bus("left_knee").other_host(packet, round(t_s * S))
+
+    story.prepared.append(plan)
+    story.at_end(lambda: story.servo("left_knee").baud_rate < 60_000, "listens at another rate")
+
+
+@case(
+    "setting",
+    "ax_single x_sync",
+    subject=("right_elbow",),
+    cause=LATE + r"|return delay|longer|later",
+)
+def return_delay_at_factory(story: Story) -> None:
+    """The Return Delay Time of an elbow goes back to the 500 us of the factory, while the robot moves."""
+    story.at(2.5, lambda: poke(story, "right_elbow", return_delay_time=250), "right_elbow")
+
+
+@case(
+    "device",
+    "mx_bulk x_fast",
+    subject=("foot",),
+    cause=STUCK
+    + r"|constant|no longer chang|not chang|unchang|same (value|reading|number)|hang|hung|dead|repeat|flat",
+)
+def foot_board_hangs(story: Story) -> None:
+    """The board in a foot answers every read, but its converter has hung: all its forces, which trembled by
+    some steps before, are the same to the bit from then on."""
+    if story.kind.protocol == 1.0:
+        model, middle, noise = "OP-FSR", 4.0, 0.02
+        cells = [f"force.{number}" for number in range(1, 5)]
+    else:
+        model, middle, noise = "bitbots-foot", 80_000.0, 400.0
+        cells = [f"pressure.{side}_{end}" for side in ("left", "right") for end in ("front", "back")]
+    forces: Spec = {
+        "values": {cell: middle * (1 + 0.1 * place) for place, cell in enumerate(cells)},
+        "noise": dict.fromkeys(cells, noise),
+    }
+    story.spec["devices"] = {"foot": {"bus": "main", "id": 101, "model": model, "simulation": forces}}
+
+    def hang() -> None:
+        registers = story.bus(0).device(101).registers
+        kept = {name: show() for name, show in registers._live.items()}
+        registers.show_live({name: partial(int, wire) for name, wire in kept.items()})
+        story.evidence["hangs"] += 1
+
+    story.at(2.6, hang)
+
+
+@case(
+    "adapter",
+    "mx_two x_three",
+    subject=("bus:left_knee",),
+    cause=r"latency|adapter|timer|USB|held back|holds? back|hands? (it |them )?over|burst|FTDI|buffer|"
+    + LATE,
+    good=False,
+    first=2,
+    innocents=("left_shoulder", "left_elbow", "left_knee"),
+)
+def timer_and_charger(story: Story) -> None:
+    """Two at once. Another program that opens the adapter of the left side sets its latency timer back to
+    16 ms midway; and a charger for a battery of more cells lets the voltage of the right side creep up to
+    more than its servos may have."""
+    voltages_often(story)
+    story.fault("timer at=2700ms by=16ms", "left_knee")
+    supply(
+        story, "right_knee", lambda t_s, servo: min(17.0, 12.0 + 2.0 * (t_s - 2.2)), "charged", since_s=2.2
+    )
+    seen(story, "voltage", "right_knee", lambda values: np.nanmax(values) > 16.5)
 
 
 # What only looks odd
