@@ -35,9 +35,9 @@ SHORT_RUN_NS = 2_000_000_000
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 _MOST = 3
 _LOSSES = {
-    EventCode.PORT_LOST: "was lost",
+    EventCode.PORT_LOST: "lost",
     EventCode.SERVO_LIMP: "went limp",
-    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_LOST: "lost",
     EventCode.SERVO_REBOOTED: "rebooted",
 }
 _LINE_S = 5.0
@@ -122,7 +122,8 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     for code, what in _LOSSES.items():
         if of := [one for one in errors if one.code == code]:
             after_s = max(min(one.t_ns for one in of) - events.started_ns, 0) / 1e9
-            happened.append(f"{named(one.source for one in of)} {what} at {after_s:.1f} s")
+            verb = "" if what != "lost" else "was " if len({one.source for one in of}) == 1 else "were "
+            happened.append(f"{named(one.source for one in of)} {verb}{what} at {after_s:.1f} s")
     if fell_back:
         happened.append(f"{named(one.source for one in fell_back)} failed and fell back")
     for one in taken_over:
