@@ -76,14 +76,20 @@ class KernelHook(BuildHookInterface[Any]):
     """Puts the compiled kernel into the wheel, which then is one for this architecture and any Python 3."""
 
     PLUGIN_NAME = "custom"
+    made = ""
+    """The folder of a kernel that was compiled for a wheel."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and name the wheel's platform."""
         if self.target_name != "wheel" or not sys.platform.startswith("linux"):
             return
         root = Path(self.root)
-        target = root / FOLDER / "libkernel.so"
-        target.unlink(missing_ok=True)
+        if version == "editable":
+            target = root / FOLDER / "libkernel.so"
+            target.unlink(missing_ok=True)
+        else:  # elsewhere: other builds may go on in this tree
+            self.made = tempfile.mkdtemp()
+            target = Path(self.made, "libkernel.so")
         compiler = system_compiler(root)
         if not compiler and find_spec("ziglang"):
             compiler = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
@@ -91,7 +97,13 @@ class KernelHook(BuildHookInterface[Any]):
             raise RuntimeError(
                 f"the exchange's kernel was not compiled; install a C compiler (sudo apt install gcc):\n{why}"
             )
+        if self.made:
+            build_data["force_include"][str(target)] = "dxlrun/dynamixel/exchange/libkernel.so"
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"py3-none-{platform}"
         build_data["pure_python"] = False
-        build_data["artifacts"].append(str(FOLDER / "libkernel.so"))
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Remove what was compiled for a wheel, which has it now."""
+        if self.made:
+            shutil.rmtree(self.made, ignore_errors=True)
