@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket, PacketKind
+from dxlrun.messages.cdr_columns import pieces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,8 +72,7 @@ class PacketColumns(Sequence[LoggedPacket]):
     def compact(self) -> PacketColumns:
         """Return the same packets with no bytes but their own."""
         start = np.cumsum(self.length) - self.length
-        place = np.repeat(self.start - start, self.length) + np.arange(int(self.length.sum()))
-        return replace(self, start=start, data=self.data[place])
+        return replace(self, start=start, data=pieces(self.data, self.start, self.length))
 
     def byte(self, index: int) -> NDArray[np.uint8]:
         """Return the byte at an index of each packet, shape (packets,); 0 where a packet is shorter."""

@@ -84,13 +84,10 @@ class Messages(msgspec.Struct, frozen=True, eq=False):
 
     def bodies(self, rows: NDArray[np.int64]) -> list[bytes]:
         """Return the bytes of some messages."""
-        return [bytes(view) for view in self.views(rows)]
-
-    def views(self, rows: NDArray[np.int64], skip: int = 0) -> list[memoryview]:
-        """Return the bytes of some messages behind the first `skip`, without a copy."""
-        data = self.data.data
-        start, end = self.start[rows] + skip, self.start[rows] + self.size[rows]
-        return [data[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True)]
+        data, start = self.data.data, self.start[rows]
+        return [
+            bytes(data[a:b]) for a, b in zip(start.tolist(), (start + self.size[rows]).tolist(), strict=True)
+        ]
 
 
 def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:

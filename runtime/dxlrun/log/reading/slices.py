@@ -25,6 +25,7 @@ from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
+from dxlrun.messages.cdr_columns import pieces
 from dxlrun.messages.definition import MessageType
 
 _FOR_OTHERS = frozenset(
@@ -142,7 +143,7 @@ class Slicer:
     def take(self, messages: Messages) -> Log:
         """Return what is whole with the next messages. Raises ValueError where they cannot be read."""
         bodies: dict[str, list[bytes]] = {}
-        cycle_views: list[memoryview] = []
+        cycle_rows = np.zeros(0, np.int64)
         topics: dict[str, LoggedTopic] = {}
         buses: dict[int, int] = {}
         for channel in np.unique(messages.channel).tolist():
@@ -157,7 +158,7 @@ class Slicer:
                 continue
             rows = np.flatnonzero(messages.channel == channel)
             if topic == schemas.CYCLE_TOPIC:
-                cycle_views += messages.views(rows, len(ENCAPSULATION))
+                cycle_rows = np.append(cycle_rows, rows)
             elif topic in _OWN:
                 bodies.setdefault(topic, []).extend(messages.bodies(rows))
             elif not topic.startswith(schemas.BUS_PREFIX):
@@ -167,9 +168,12 @@ class Slicer:
         packets = self._read_packets(messages, buses) if self._with_packets else _NO_PACKETS
         activation = None
         if self._activation is None and schemas.ACTIVATION_TOPIC in bodies:
-            message = memoryview(bodies[schemas.ACTIVATION_TOPIC][0])
-            activation = self._activation = _cycles(self._layout, (message[len(ENCAPSULATION) :],))
-        cycles = _cycles(self._layout, cycle_views, self._cycles)
+            message = np.frombuffer(bodies[schemas.ACTIVATION_TOPIC][0], np.uint8)
+            activation = self._activation = _cycles(
+                self._layout, message, np.zeros(1, np.int64), np.array([len(message)])
+            )
+        cycles = _cycles(self._layout, messages.data, messages.start[cycle_rows], messages.size[cycle_rows])
+        cycles = joined_cycles([self._cycles, cycles])
         return replace(
             self._slice(cycles, packets, last=not self._with_packets),
             activation=activation,
@@ -316,17 +320,13 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
 
 
 def _cycles(
-    layout: CycleLayout, messages: Sequence[memoryview], before: NDArray[np.void] | None = None
+    layout: CycleLayout, data: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Return cycles of their messages' bodies, behind some that are known; read-only."""
-    size = layout.size
-    parts: list[bytes | memoryview] = [*messages]
-    if any(len(part) != size for part in parts):
+    """Return the cycles of messages that lie in `data`."""
+    if (size != len(ENCAPSULATION) + layout.size).any():
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
-    if before is not None and len(before):
-        parts.insert(0, before.view(_bytes(before.dtype)).tobytes())
-    bodies = b"".join(parts)
-    array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
+    bodies = pieces(data, start + len(ENCAPSULATION), size - len(ENCAPSULATION))
+    array: NDArray[np.void] = bodies.view(layout.dtype)
     unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
     if len(unknown):
         raise ValueError(f"cycle {array['cycle'][unknown[0]]} has a mode of a servo that is not known")
