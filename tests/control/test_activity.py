@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 
 import pytest
 from tests.kit.loops import Scripted, on_update
@@ -17,6 +18,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, create
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
+from dxlrun.errors import ControllerFault
 
 CALLS = {
     "activate": "on_activate",
@@ -110,6 +112,19 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
     assert (result.reason, result.detail) == ("stopped", "")
 
 
+NEVER = "in update: while the robot runs that would stop the loop; start a process in on_configure instead"
+
+
+def breach(activity, call, method=ControllerMethod.UPDATE):
+    """Return which rule a call of the controller arm broke."""
+    activity.name_controller(0, "arm")
+    try:
+        activity.call(0, method, "", call)
+    except ControllerFault as fault:
+        return str(fault).removeprefix("controller arm ")
+    return ""
+
+
 @pytest.fixture
 def page():
     descriptor = create()
@@ -128,10 +143,8 @@ def test_a_thread_that_no_hook_sees_is_counted_once_and_only_while_the_robot_run
         (ControllerMethod.UPDATE, 4),
         (ControllerMethod.UPDATE, 3),
     ):
-        activity.begin(0, step)
-        threads[0] = count
-        started.append(activity.end())
-    assert started == ["", "", "started 2 threads", ""]
+        started.append(breach(activity, partial(threads.__setitem__, 0, count), step))
+    assert started == ["", "", f"started 2 threads {NEVER}", ""]
 
 
 @pytest.fixture
@@ -150,20 +163,21 @@ def test_the_count_sees_a_thread_of_foreign_machine_code(page, no_thread_ends):
     body = run(lambda _: go.wait() and None)
     handle = ctypes.c_ulong()
     activity = Activity(page, realtime.thread_count)
-    activity.begin(0, ControllerMethod.UPDATE)
-    assert libc.pthread_create(ctypes.byref(handle), None, body, None) == 0
-    assert activity.end() == "started 1 thread"
+    begin = partial(libc.pthread_create, ctypes.byref(handle), None, body, None)
+    assert breach(activity, begin) == f"started 1 thread {NEVER}"
     go.set()
     libc.pthread_join(handle, None)
 
 
 def test_after_a_call_everything_can_be_started_again(page):
     activity = Activity(page)
-    activity.begin(0, ControllerMethod.UPDATE)
-    with pytest.raises(RuntimeError, match="a controller cannot start a thread while the robot runs"):
-        thread()
-    assert activity.end() == "tried to start a thread"
-    assert activity.end() == ""
+
+    def act():
+        with pytest.raises(RuntimeError, match="a controller cannot start a thread while the robot runs"):
+            thread()
+
+    assert breach(activity, act) == f"tried to start a thread {NEVER}"
+    assert breach(activity, int) == ""
     thread()
     _thread.start_new_thread(int, ())
 
@@ -175,9 +189,7 @@ def test_the_page_names_what_is_called_until_it_returns(page):
         activity.name_controller(place, name)
     for place in (0, 62):
         for step in tuple(ControllerMethod)[1:]:
-            activity.begin(place, step)
-            seen.append(page.activity)
-            activity.end()
+            activity.call(place, step, "", lambda: seen.append(page.activity))
             assert not page.activity
     calls = ["__init__", "on_configure", "on_activate", "update", "on_command", "on_deactivate"]
     calls += ["on_goal", "on_cancel", "on_parameters"]

@@ -33,7 +33,7 @@ def test_a_plug_in_decides_before_the_robot_file(robot):
     asked = []
     hook = OverrunHook("mine", lambda *times: asked.append(times) or "catch_up")
     assert ran(robot, "skip", hook) == CAUGHT_UP
-    start_ns = robot.loop.schedule.start_ns
+    start_ns = robot.column("scheduled_ns")[0]
     late_ns = start_ns + int(3.5 * PERIOD_NS)
     assert asked == [(cycle, start_ns + cycle * PERIOD_NS, late_ns) for cycle in (2, 3)]
 

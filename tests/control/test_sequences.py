@@ -152,7 +152,7 @@ def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_comman
     assert len(answered) + len(run.robot.inbox.waiting) == asked
     cycles = run.robot.sink.cycles
     assert result.cycles == len(cycles)
-    assert result.cycles + result.skipped == run.robot.loop._cycle
+    assert result.cycles + result.skipped == run.robot.loop.schedule.cycle
     assert not run.wrong, "time went back"
     due = [cycle["scheduled_ns"] for cycle in cycles]
     assert due == sorted(set(due))

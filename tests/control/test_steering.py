@@ -335,7 +335,6 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again()
     assert manager.switching.switch(("extra",), (), 0) is None
     for failed, stands_in in (("extra", "left"), ("left", "extra")):
         robot.breaks(failed)()
-        manager.begin()
         manager.update(0, 0)
         assert manager.active == (stands_in,)
         if stands_in == "left":

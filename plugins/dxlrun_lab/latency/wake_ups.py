@@ -52,9 +52,8 @@ def measure(clock: Clock, schedule: Schedule, iterations: int, buffer: Buffer) -
     done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
     place = int(Place.WAKE_UPS)
     schedule.start(clock.now_ns())
-    cycle = 0
     for number in range(1, iterations + 1):
-        deadline_ns = schedule.deadline_ns(cycle)
+        deadline_ns = schedule.due_ns
         woken_ns = clock.wait_until(deadline_ns)
         words[place] = deadline_ns
         words[place + 1] = woken_ns
@@ -62,7 +61,7 @@ def measure(clock: Clock, schedule: Schedule, iterations: int, buffer: Buffer) -
         words[done] = number
         if words[stop]:
             return
-        cycle = schedule.following(cycle, clock.now_ns(), "skip")
+        schedule.advance(schedule.following(clock.now_ns(), "skip"))
 
 
 def run(job: Job) -> None:

@@ -110,7 +110,6 @@ class Loop:
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
     _overruns: Overruns = field(init=False)
-    _cycle: int = field(default=0, init=False)
     _paused_cycles: int = field(default=0, init=False)
     _time_ns: int = field(default=0, init=False)
     """The controllers' time in the last cycle."""
@@ -171,7 +170,7 @@ class Loop:
         finally:
             # behind the last cycle of a pause, the period until the next one is left out already
             now_ns = self.clock.now_ns()
-            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self._cycle, now_ns)))
+            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(now_ns)))
             self.steering.end()
         if reason != "fault" and self.manager.switching.fault is not None:
             reason, detail = "fault", self.manager.switching.fault
@@ -206,31 +205,35 @@ class Loop:
         """Run cycles; return why they ended, and a sentence for a fault."""
         end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.switching.fault is None:
-            cycle = self._cycle
-            deadline_ns = schedule.deadline_ns(cycle)
-            if end_ns is not None and schedule.time_ns(cycle, deadline_ns) >= end_ns:
+            if end_ns is not None and schedule.grid_ns >= end_ns:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
             if self._given_up:
                 return "fault", self._given_up[1]
-            self._one(cycle, deadline_ns)
+            self._one()
             if self._next():
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
         return "fault", self.manager.switching.fault
 
-    def _one(self, cycle: int, deadline_ns: int) -> None:
-        """Wait for a deadline, then read, take commands, update, gate and write."""
+    def _one(self) -> None:
+        """Wait for the deadline, then read, take commands, update, gate and write."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
+        cycle, deadline_ns = schedule.cycle, schedule.due_ns
         self.hardware.idle(deadline_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
-        time_ns = schedule.begin(cycle, woken_ns)
+        time_ns = schedule.begin(woken_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
         self.sink.wake(cycle)
-        self.steering.stood = self.steering.paused_until_ns > 0
-        self.manager.begin()
+        steering, manager = self.steering, self.manager
+        steering.stood = steering.paused_until_ns > 0
+        if not manager.switching.modes_requested:
+            manager.switching.request_modes()
+        record.renew()
+        for provided in manager.providers:
+            provided.grow_old(dt_ns)
         if self._motion:
             self._motion.begin()
         self.hardware.read()
@@ -241,23 +244,12 @@ class Loop:
         valid = record.states.valid
         all_valid = valid.tobytes() == self._all_valid
         if self._motion:
-            self.steering.refuse()
+            steering.refuse()
             self._motion.command()
         else:
             if not (all_valid and self._lost.none) and self._lost.look(record.states):
                 self._miss()
-            # it never goes back: a cycle that was late when a pause began catches up
-            schedule.paused_ns -= max(0, self._time_ns - time_ns)
-            self._time_ns = max(self._time_ns, time_ns)
-            if self._needed:
-                self._look_at_needed_sensors()
-            record.command_count = self.steering.take(self._time_ns)
-            if self.steering.paused_until_ns:
-                record.commands.clear()
-            else:
-                self.manager.update(cycle - self._paused_cycles, self._time_ns)
-            if self.manager.switching.ended:
-                self.steering.answer_late()
+            self._update(cycle, time_ns)
         self.gate.apply(record.commands, record.goals, dt_ns)
         updated_ns = now_ns()
         self.hardware.write()
@@ -267,6 +259,24 @@ class Loop:
         if not all_valid:
             self._invalid += ~valid & (record.states.torque != Torque.REBOOTING)
         self.beat()
+
+    def _update(self, cycle: int, time_ns: int) -> None:
+        """Take commands, and update the controllers unless the loop is paused."""
+        record, steering, manager = self.record, self.steering, self.manager
+        # it never goes back: a cycle that was late when a pause began catches up
+        self.schedule.grid_ns += max(0, self._time_ns - time_ns)
+        self._time_ns = max(self._time_ns, time_ns)
+        if self._needed:
+            self._look_at_needed_sensors()
+        commands = steering.inbox.take()
+        if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
+            record.command_count = steering.take(commands, self._time_ns)
+        if steering.paused_until_ns:
+            record.commands.clear()
+        else:
+            manager.update(cycle - self._paused_cycles, self._time_ns)
+        if manager.switching.ended:
+            steering.answer_late()
 
     def _miss(self) -> None:
         """Apply the policies: other servos are lost than in the cycle before."""
@@ -308,7 +318,7 @@ class Loop:
             self._motion = motion
             try:
                 while not motion.over:
-                    self._one(self._cycle, self.schedule.deadline_ns(self._cycle))
+                    self._one()
                     self._next()
             except PortError as error:
                 motion.give_up(str(error))
@@ -322,36 +332,37 @@ class Loop:
     def _log_policy(self, name: PolicyName, text: str) -> None:
         self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
         data = f'{{"policy":"{name}"}}'.encode()
-        begun = TakenCommand(self.record.woken_ns, self._cycle, -1, LOOP, "policy", "loop", data)
+        begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)
         self.commands.take(begun)
 
     def _next(self) -> bool:
         """Go to the next cycle, past those that are declared skipped; return whether that ends the run."""
-        cycle, schedule = self._cycle, self.schedule
-        now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, schedule.deadline_ns(cycle + 1)
+        schedule, cycle, due_ns = self.schedule, self.schedule.cycle, self.schedule.due_ns
+        now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, due_ns + schedule.period_ns
         if self.steering.stood:
             policy = "skip" if policy == "stop" else policy  # a pause may take its time
         elif now_ns <= next_ns:
-            self._cycle, self.record.skipped, self._late = cycle + 1, 0, False
+            schedule.advance(cycle + 1)
+            self.record.skipped, self._late = 0, False
             return False
         else:
             policy = self._overruns.decide(cycle + 1, next_ns, now_ns)
-        following = schedule.following(cycle, now_ns, policy)
+        following = schedule.following(now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self.steering.stood:
             # nothing is skipped behind the end
-            left_ns = self.plan.end_ns - schedule.time_ns(cycle, schedule.deadline_ns(cycle))
+            left_ns = self.plan.end_ns - schedule.grid_ns
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
         if self.steering.stood:
             still = following - cycle if self.steering.paused_until_ns else skipped
             self._paused_cycles += still
-            schedule.paused_ns += still * schedule.period_ns
-        self._cycle = following
+            schedule.grid_ns -= still * schedule.period_ns
+        schedule.advance(following)
         self.record.skipped = skipped
         self._skipped += skipped
         late = bool(skipped) or (policy == "catch_up" and now_ns > next_ns)
         if late and not self._late:
-            late_ms = (now_ns - schedule.deadline_ns(cycle)) / 1e6
+            late_ms = (now_ns - due_ns) / 1e6
             self.events.emit(
                 EventCode.OVERRUN,
                 Severity.WARNING,
@@ -366,7 +377,7 @@ class Loop:
     def _log_start(self) -> None:
         record = self.record
         record.cycle = -1
-        record.scheduled_ns = self.schedule.start_ns
+        record.scheduled_ns = self.schedule.due_ns
         record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
         record.woken_ns = self._woken_ns  # from which the first deadline is: a replay knows it
         self.sink.begin(record)

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy
 
@@ -17,103 +17,57 @@ MOST_CAUGHT_UP = 5
 
 @dataclass(slots=True)
 class Schedule:
-    """t_d[i] = t_0 + i * T: a grid that keeps its phase, however late a cycle begins.
+    """When the next cycle is due, and the controllers' time then; a cycle is numbered by its period.
 
-    Cycle n is due at origin + (n - first) * period, and controllers see the time of its wake-up. A change of
-    the period begins a new grid at a deadline of the old one.
+    Absolute, t_d[i] = t_0 + i * T: a grid that keeps its phase, however late a cycle begins; controllers see
+    the time of the wake-up. Sequential, t_d[i+1] = t[i] + T: a cycle is due one period after the one before
+    it *began*, so delays add up; controllers see the number of the cycle times the period, whatever the clock
+    says, so a motion is sent pose after pose, by number: no cycle is left out, a late end goes unnoticed.
+    A change of `period_ns` counts from the cycle on that is due now.
     """
 
     period_ns: int
-    start_ns: int = 0
-    """The first deadline."""
-    paused_ns: int = 0
-    """For how long the controllers' time stood still."""
-    _origin_ns: int = field(default=0, init=False)
-    _first: int = field(default=0, init=False)
+    sequential: bool = False
+    cycle: int = 0
+    due_ns: int = 0
+    """When `cycle` is due, if all before it begin on time."""
+    grid_ns: int = 0
+    """The controllers' time in `cycle`, if that begins on time: since the first deadline, pauses left out."""
 
     def start(self, now_ns: int) -> None:
         """Make the first deadline one period from now."""
-        self.start_ns = self._origin_ns = now_ns + self.period_ns
-        self._first = 0
-        self.paused_ns = 0
+        self.cycle = self.grid_ns = 0
+        self.due_ns = now_ns + self.period_ns
 
-    def deadline_ns(self, cycle: int) -> int:
-        """Return when a cycle is due."""
-        return self._origin_ns + (cycle - self._first) * self.period_ns
+    def begin(self, woken_ns: int) -> int:
+        """Begin the cycle that is due; return the controllers' time in it."""
+        if self.sequential:
+            self.due_ns = woken_ns
+        return self.grid_ns + woken_ns - self.due_ns
 
-    def begin(self, cycle: int, woken_ns: int) -> int:
-        """Begin a cycle; return the controllers' time in it. A late one moves no deadline."""
-        return woken_ns - self.start_ns - self.paused_ns
+    def time_ns(self, now_ns: int) -> int:
+        """Return the controllers' time."""
+        return self.grid_ns if self.sequential else self.grid_ns + now_ns - self.due_ns
 
-    def time_ns(self, cycle: int, now_ns: int) -> int:
-        """Return the controllers' time: since the first deadline, pauses left out."""
-        return now_ns - self.start_ns - self.paused_ns
+    def advance(self, cycle: int) -> None:
+        """Go to a later cycle."""
+        passed_ns = (cycle - self.cycle) * self.period_ns
+        self.cycle = cycle
+        self.due_ns += passed_ns
+        self.grid_ns += passed_ns
 
-    def change(self, cycle: int, period_ns: int) -> None:
-        """Let the cycles after `cycle` follow in another period, from its deadline on."""
-        self._origin_ns = self.deadline_ns(cycle)
-        self._first = cycle
-        self.period_ns = period_ns
-
-    def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the cycle to run after `cycle` that ended at `now_ns`.
+    def following(self, now_ns: int, policy: OverrunPolicy) -> int:
+        """Return the cycle to run after the one that ended now.
 
         `skip`: the first whose deadline has not passed, so that two cycles never follow each other in a
         burst. `catch_up`: the next one, as long as at most MOST_CAUGHT_UP are due. `stop`: as `skip`.
         """
-        passed = now_ns - self._origin_ns
-        first = self._first + -(-passed // self.period_ns)
+        first = self.cycle - (self.due_ns - now_ns) // self.period_ns
         if policy == "catch_up":
             first -= MOST_CAUGHT_UP
-        return max(cycle + 1, first)
-
-
-@dataclass(slots=True)
-class SequentialSchedule(Schedule):
-    """t_d[i+1] = t[i] + T: a cycle is due one period after the one before it *began*, so delays add up.
-
-    Controllers see the number of the cycle times the period, whatever the clock says, so a motion is sent
-    pose after pose, by number. No cycle is left out; a late end goes unnoticed.
-    """
-
-    _begun: int = field(default=-1, init=False)
-    """The cycle that began last, and when; before the first, one period before its deadline."""
-    _begun_ns: int = field(default=0, init=False)
-    _first_time_ns: int = field(default=0, init=False)
-    """The controllers' time in `_first`, the cycle from which the period holds."""
-
-    def start(self, now_ns: int) -> None:
-        """Make the first deadline one period from now."""
-        self.start_ns = now_ns + self.period_ns
-        self._begun, self._begun_ns = -1, now_ns
-        self._first = self._first_time_ns = 0
-        self.paused_ns = 0
-
-    def deadline_ns(self, cycle: int) -> int:
-        """Return when a cycle is due, if all between begin on time."""
-        return self._begun_ns + (cycle - self._begun) * self.period_ns
-
-    def begin(self, cycle: int, woken_ns: int) -> int:
-        """Count the next deadline from here; return the controllers' time."""
-        self._begun, self._begun_ns = cycle, woken_ns
-        return self.time_ns(cycle, woken_ns)
-
-    def time_ns(self, cycle: int, now_ns: int) -> int:
-        """Return the controllers' time: as many periods as cycles, pauses left out."""
-        return self._first_time_ns + (cycle - self._first) * self.period_ns - self.paused_ns
-
-    def change(self, cycle: int, period_ns: int) -> None:
-        """Let the cycles after `cycle` follow in another period."""
-        self._first_time_ns += (cycle - self._first) * self.period_ns
-        self._first = cycle
-        self.period_ns = period_ns
-
-    def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the next one: no pose is left out."""
-        return cycle + 1
+        return self.cycle + 1 if self.sequential else max(self.cycle + 1, first)
 
 
 def schedule_of(plan: LoopPlan) -> Schedule:
     """Return the schedule that a plan has."""
-    kind = SequentialSchedule if plan.schedule == "sequential" else Schedule
-    return kind(plan.period_ns)
+    return Schedule(plan.period_ns, plan.schedule == "sequential")

@@ -6,7 +6,7 @@ does, with the rate of the loop and its pauses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -138,8 +138,8 @@ class Steering:
     stood: bool = False
     """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
 
-    def take(self, time_ns: int) -> int:
-        """Execute what has come, and end streams and pauses whose lease ran out.
+    def take(self, commands: Sequence[Command], time_ns: int) -> int:
+        """Execute what has come, and end streams and pauses whose lease ran out; called where anything may.
 
         Returns the number of commands for controllers.
         """
@@ -147,7 +147,7 @@ class Steering:
         record, manager = self.record, self.manager
         if self.halt.waiting:
             self.halt.watch()
-        for place, command in enumerate(self.inbox.take(), 1):
+        for place, command in enumerate(commands, 1):
             self._log(command)
             for_loop = command.controller == LOOP
             answer = self._for_loop(command, time_ns) if for_loop else self._hand(command, time_ns)
@@ -210,7 +210,7 @@ class Steering:
             return Refusal(Code.RATE_UNDER_EXIT, {"lowest": 1e9 / ending_ns})
         if refusal := self.manager.change_period(period_ns):
             return refusal
-        self.schedule.change(self.record.cycle, period_ns)
+        self.schedule.period_ns = period_ns
         self._set_cycle_limit()
         self.pace(period_ns)
         return None

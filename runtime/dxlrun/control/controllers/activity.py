@@ -13,13 +13,16 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable
 from functools import cache
-from typing import ClassVar
+from typing import ClassVar, ParamSpec
 
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat
-from dxlrun.errors import counted
+from dxlrun.errors import ControllerFault, counted
 
+_TRACEBACK = 6000
+P = ParamSpec("P")
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
 """The last method before the robot runs."""
 # found at once, twice a call
@@ -49,6 +52,7 @@ class Activity:
         self._count_threads = count_threads
         self._threads = count_threads() if count_threads else 0
         self._process = _process()
+        self._names: dict[int, str] = {}
         self.thread = 0
         """Which thread calls the controller."""
         self.refused = ""
@@ -57,35 +61,73 @@ class Activity:
 
     def name_controller(self, place: int, name: str) -> None:
         """Name the controller in this place, before anything of it is called."""
+        self._names[place] = name
         if self._page is not None:
             self._page.name_controller(place, name)
 
-    def begin(self, place: int, method: ControllerMethod) -> None:
-        """Show what is called next; while the robot runs, refuse what it must not start."""
+    def show(self, place: int, method: ControllerMethod) -> None:
+        """Show what is called next of the controller in this place."""
         if self._page is not None:
             self._page.call(place, method)
+
+    def call(
+        self,
+        place: int,
+        method: ControllerMethod,
+        kind: str,
+        call: Callable[P, object],
+        *arguments: P.args,
+        **named: P.kwargs,
+    ) -> None:
+        """Call a method of the controller in this place; `kind` is that of the command it is given.
+
+        Raises ControllerFault for what it raises, and for what it starts while the robot runs. A child that
+        it forked and that came back from the call ends here: there is one loop only.
+        """
+        page = self._page
+        if page is not None:
+            page.call(place, method)
         if method > _LOADING:
             self.thread = _ident()
             Activity.guarded = self
+        raised: BaseException | None = None
+        try:
+            call(*arguments, **named)
+        except BaseException as error:  # foreign code: it must not take the loop along
+            if is_interrupt(error):
+                raise
+            raised = error
+        finally:
+            if _process() != self._process:
+                os._exit(0)
+            Activity.guarded = None
+            if page is not None:
+                page.call(0, 0)
+        started = ""
+        if self._count_threads is not None and (more := self._count_threads() - self._threads) > 0:
+            self._threads += more
+            started = f"started {counted(more, 'thread', 'threads')}" if method > _LOADING else ""
+        if self.refused:
+            started, self.refused = f"tried to start {self.refused}", ""
+        if raised is not None or started:
+            raise self._fault(
+                place, f"{method} ({kind})" if kind else f"{method}", started, raised
+            ) from raised
 
-    def end(self) -> str:
-        """Show that it returned, or raised; return which rule it broke, empty for none.
-
-        A child that a controller forked and that came back from the call ends here: there is one loop only.
-        """
-        if _process() != self._process:
-            os._exit(0)
-        watched, Activity.guarded = Activity.guarded is self, None
-        if self._page is not None:
-            self._page.call(0, 0)
-        refused, self.refused = self.refused, ""
-        if self._count_threads is not None:
-            more = self._count_threads() - self._threads
-            if more > 0:
-                self._threads += more
-                if watched and not refused:
-                    return f"started {counted(more, 'thread', 'threads')}"
-        return f"tried to start {refused}" if refused else ""
+    def _fault(self, place: int, what: str, started: str, raised: BaseException | None) -> ControllerFault:
+        if started:
+            text = (
+                f"{started} in {what}: while the robot runs that would stop the loop; "
+                "start a process in on_configure instead"
+            )
+        elif isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
+            text = str(raised)
+        else:
+            text = f"raised in {what}: {' '.join(f'{type(raised).__name__}: {raised}'.split())}"
+        fault = ControllerFault(f"controller {self._names[place]} {text}")
+        if raised is not None:
+            fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
+        return fault
 
 
 _STARTS = {

@@ -14,38 +14,34 @@ else; what drives it is `switching.py`.
 from __future__ import annotations
 
 import math
-import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum, unique
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple, ParamSpec
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Commands, CycleRecord, Floats
+from dxlrun.channels.cycle import CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
-from dxlrun.control.controllers.activity import Activity, is_interrupt
+from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.goals import RunningGoal
 from dxlrun.control.controllers.graph import Plans
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims
+from dxlrun.control.controllers.wiring import Inputs, Outputs, Provided
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
 PERIOD_CAP = 5
 """A controller never gets a period longer than this many nominal ones: a law that integrates would jump.
 The guardian ends a loop that stops for as long."""
-
-_TRACEBACK = 6000
-P = ParamSpec("P")
 
 
 @unique
@@ -157,7 +153,9 @@ class Managed:
         """Rows of its joints in the robot's arrays."""
         self._record = record
         self._activity = activity
+        self._call: Callable[..., None] = partial(activity.call, place)
         self._inputs = Inputs(plan, record, self.rows)
+        self._outputs = Outputs(plan, record, self.rows)
         self.provided = Provided(plan, record) if plan.provides else None
         """The states that it provides; None: it provides none."""
         self._topics = topics.of_controller(plan.name, self._bit)
@@ -166,8 +164,6 @@ class Managed:
         self._requests = requests
         self._last_ns = -1
         self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
-        context = self._context
-        self._claims = tuple(claims(plan, context.commands, context.device_commands, record, self.rows))
 
     def _new_context(self, joints: Sequence[JointPlan], events: EventSink, urdf: str | None) -> Context:
         plan = self.plan
@@ -184,7 +180,7 @@ class Managed:
             ),
             states=self._inputs.states,
             goals=self._inputs.goals,
-            commands=Commands.empty(len(joints)),
+            commands=self._outputs.commands,
             # none of them knows this object: a circle would stay when the controller is unloaded
             say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
             warn=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
@@ -197,7 +193,7 @@ class Managed:
             servos=tuple(joint.servo_model for joint in joints),
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
-            device_commands=np.full(len(plan.device_commands), np.nan),
+            device_commands=self._outputs.devices,
             take_over=partial(_take_over, self._requests, plan),
             end_run=partial(_end_run, self._requests, plan),
         )
@@ -211,27 +207,17 @@ class Managed:
         """
         name = self.plan.name
         self._activity.name_controller(self.place, name)
-        self._activity.begin(self.place, ControllerMethod.INIT)
+        self._activity.show(self.place, ControllerMethod.INIT)
         try:
             self.controller = plugins.built(self.plan)
         finally:
-            self._activity.end()
+            self._activity.show(0, ControllerMethod.NONE)
         topics = self.controller.topics(self.controller.parameters)
         self._topics.open(topics, self.plan.distribution, self.plan.joints)
         if type(self.controller).keeps:
             kept, keep = keeping.open(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
-        self._activity.begin(self.place, ControllerMethod.ON_CONFIGURE)
-        try:
-            self.controller.on_configure(self._context)
-        except BaseException as error:  # foreign code: one sentence instead of its traceback
-            if is_interrupt(error):
-                raise
-            raise ControllerFault(
-                f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
-            ) from error
-        finally:
-            self._activity.end()
+        self._call(ControllerMethod.ON_CONFIGURE, "", self.controller.on_configure, self._context)
         plugins.after_each(f"of controller {name}")
 
     def on(self, event: Event) -> None:
@@ -240,7 +226,7 @@ class Managed:
         self.state = TRANSITIONS[self.state][event]
         self.failed |= event is Event.FAULT
         if before and self.state is not State.ACTIVE:  # else the arrays that it claims may be another's
-            self._withdraw()
+            self._outputs.withdraw()
         if self.active:
             self._record.active |= self._bit
         else:
@@ -255,8 +241,7 @@ class Managed:
 
     def activate(self, time_ns: int) -> None:
         """Let the controller take over its joints. Raises ControllerFault."""
-        for claim in self._claims:
-            claim.forget()
+        self._outputs.forget()
         self._inputs.gather()
         self._call(ControllerMethod.ON_ACTIVATE, "", self.controller.on_activate, time_ns)
         self._last_ns = -1
@@ -278,10 +263,6 @@ class Managed:
             goal.end(Outcome.ABORTED, why)
         self.on(event)
 
-    def _withdraw(self) -> None:
-        for claim in self._claims:
-            claim.withdraw()
-
     # In a cycle
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
@@ -290,7 +271,7 @@ class Managed:
         self.on(Event.COMMAND)
         self.until_ns = until_ns
         self._inputs.gather()
-        self._call(ControllerMethod.ON_COMMAND, f" ({kind})", self.controller.on_command, kind, data, time_ns)
+        self._call(ControllerMethod.ON_COMMAND, kind, self.controller.on_command, kind, data, time_ns)
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -310,7 +291,7 @@ class Managed:
         self._goal = goal
         self._inputs.gather()
         on_goal = self.controller.on_goal
-        self._call(ControllerMethod.ON_GOAL, f" ({goal.kind})", on_goal, goal, data, time_ns)
+        self._call(ControllerMethod.ON_GOAL, goal.kind, on_goal, goal, data, time_ns)
 
     def cancel(self, goal: RunningGoal, time_ns: int) -> None:
         """Let the controller bring its goal to an end. Raises ControllerFault.
@@ -351,12 +332,12 @@ class Managed:
 
         Returns whether that changed anything for the robot.
         """
-        waiting = bool(self._claims) and (below or any(row in lost for row in self.rows.tolist()))
+        waiting = bool(self._outputs.parts) and (below or any(row in lost for row in self.rows.tolist()))
         changed = waiting != self.waiting
         self.waiting = waiting
         self.runs = self.state is State.ACTIVE and not waiting
         if waiting and self.active:
-            self._withdraw()
+            self._outputs.withdraw()
         return changed and self.active
 
     def change_period(self, period_ns: int) -> None:
@@ -374,46 +355,13 @@ class Managed:
             self._inputs.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
         self._call(ControllerMethod.UPDATE, "", self.controller.update, time_ns, capped_ns)
-        for claim in [*filter(Claim.check, self._claims)]:  # all are checked before one counts
-            claim.merge()
+        outputs = self._outputs
+        if outputs.own.tobytes() != outputs.taken:
+            outputs.check()
+        for own, merged, place in outputs.parts:
+            merged[place] = own
         if self.provided is not None:
             self.provided.take()
-
-    def _call(
-        self,
-        method: ControllerMethod,
-        what: str,
-        call: Callable[P, object],
-        *arguments: P.args,
-        **named: P.kwargs,
-    ) -> None:
-        """Call a method of the controller. Raises ControllerFault for what it raises and what it starts."""
-        self._activity.begin(self.place, method)
-        raised: BaseException | None = None
-        try:
-            call(*arguments, **named)
-        except BaseException as error:  # foreign code: it must not take the loop along
-            if is_interrupt(error):
-                raise
-            raised = error
-        finally:
-            breach = self._activity.end()
-        if breach:
-            text = (
-                f"{breach} in {method}{what}: while the robot runs that would stop the loop; "
-                "start a process in on_configure instead"
-            )
-        elif raised is None:
-            return
-        elif isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
-            text = str(raised)
-        else:
-            shown = " ".join(f"{type(raised).__name__}: {raised}".split())
-            text = f"raised in {method}{what}: {shown}"
-        fault = ControllerFault(f"controller {self.plan.name} {text}")
-        if raised is not None:
-            fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
-        raise fault from raised
 
 
 def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:

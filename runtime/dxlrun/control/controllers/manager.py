@@ -26,6 +26,7 @@ from dxlrun.control.controllers.managed import Managed, Request, State, rate_div
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import SetModes, Switching, fault_of
 from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.controllers.wiring import Provided
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
 
@@ -71,6 +72,10 @@ class Manager:
         self._named = self.switching.named
         self._order: tuple[Managed, ...] = ()
         """In the order of updates: those above in a chain before those below."""
+        self.streams: dict[int, Managed] = {}
+        """By place: those whose commands run out; one whose stream has ended leaves with the next look."""
+        self.providers: tuple[Provided, ...] = ()
+        """What controllers provide; all of it is older in each cycle."""
         self._requests: list[Request] = []
         """What controllers request of the run in this cycle."""
         self._next = 0  # of the plan's commands
@@ -96,15 +101,6 @@ class Manager:
 
     # In a cycle
 
-    def begin(self) -> None:
-        """Begin a cycle, before its states are read: request modes."""
-        if not self.switching.modes_requested:
-            self.switching.request_modes()
-        self._record.renew()
-        for managed in self._managed:
-            if managed.provided is not None:
-                managed.provided.grow_old(self._record.period_ns)
-
     def update(self, cycle: int, time_ns: int) -> None:
         """Hand over the commands that are due and update every active controller that is due.
 
@@ -120,32 +116,31 @@ class Manager:
             self._goals.settle()
         if self._motions:
             self._play_on(time_ns)
-        self._update_due(cycle, time_ns)
-        for _ in self._order:  # one that entered by a request may have one of its own
-            if not self._requests:
+        now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
+        for left in range(len(self._order), -1, -1):  # one that entered by a request may have one of its own
+            for managed in self._order:
+                if managed.runs and cycle >= managed.due_cycle:
+                    begin_ns = now_ns()
+                    try:
+                        managed.update(cycle, time_ns)
+                    except ControllerFault as fault:
+                        self.switching.end(managed, fault, time_ns)
+                    if managed.place < len(took_ns):
+                        took_ns[managed.place] = now_ns() - begin_ns
+            if not (left and self._requests):
                 break
-            # endings of the run behind the takeovers
-            requests = sorted(self._requests, key=lambda request: not request.takes_over)
-            self._requests.clear()
-            for request in requests:
-                requester = self._named.get(request.requester)
-                if requester is not None and requester.active:
-                    self.switching.execute(request, time_ns)
-            self._update_due(cycle, time_ns)
+            self._execute_requests(time_ns)
         if self._keeping.controllers:
             self._keeping.step()
 
-    def _update_due(self, cycle: int, time_ns: int) -> None:
-        now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
-        for managed in self._order:
-            if managed.runs and cycle >= managed.due_cycle:
-                begin_ns = now_ns()
-                try:
-                    managed.update(cycle, time_ns)
-                except ControllerFault as fault:
-                    self.switching.end(managed, fault, time_ns)
-                if managed.place < len(took_ns):
-                    took_ns[managed.place] = now_ns() - begin_ns
+    def _execute_requests(self, time_ns: int) -> None:
+        """Let controllers take over as others have requested it; endings of the run behind that."""
+        requests = sorted(self._requests, key=lambda request: not request.takes_over)
+        self._requests.clear()
+        for request in requests:
+            requester = self._named.get(request.requester)
+            if requester is not None and requester.active:
+                self.switching.execute(request, time_ns)
 
     def deactivate(self, time_ns: int) -> None:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`."""
@@ -180,6 +175,8 @@ class Manager:
         streaming = until_ns and managed.until_ns
         if refusal := self._attempt(managed, time_ns, managed.command, kind, data, time_ns, until_ns):
             return refusal
+        if until_ns:
+            self.streams[managed.place] = managed
         if not streaming:
             self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return 0
@@ -247,12 +244,12 @@ class Manager:
 
     def stale(self, now_ns: int) -> list[str]:
         """Return the controllers whose stream of commands has run out, each of them once."""
-        stale: list[str] = []
-        for managed in self._managed:
-            if 0 < managed.until_ns < now_ns:
-                managed.until_ns = 0
-                stale.append(managed.plan.name)
-        return stale
+        over = [managed for managed in self.streams.values() if managed.until_ns < now_ns]
+        stale = [managed for managed in over if managed.until_ns]  # others have no stream any more
+        for managed in over:
+            managed.until_ns = 0
+            del self.streams[managed.place]
+        return [managed.plan.name for managed in sorted(stale, key=lambda one: one.place)]
 
     def hold(self, controller: str) -> None:
         """Withdraw what a controller commands until it gets another command; it stays active."""
@@ -469,6 +466,7 @@ class Manager:
         return tuple(managed.plan for managed in self._managed)
 
     def _sort(self) -> None:
+        self.providers = tuple(one.provided for one in self._managed if one.provided is not None)
         loaded = [one for one in self._managed if self._named.get(one.plan.name) is one]
         self._order = tuple(self._named[name] for name in update_order([one.plan for one in loaded]))
 

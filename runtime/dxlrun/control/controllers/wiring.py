@@ -140,103 +140,82 @@ def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
         yield from ((name, begin + index) for index, name in enumerate(names))
 
 
-class Claim:
-    """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
+class Outputs:
+    """What a controller commands: its own arrays, where they go, and what of them was ever finite.
 
-    def __init__(  # noqa: PLR0917  what is wired together
-        self,
-        owner: str,
-        names: tuple[str, ...],
-        own: Floats,
-        merged: Floats,
-        rows: NDArray[np.intp],
-        clamped: NDArray[np.uint8] | None = None,
-    ) -> None:
-        """`clamped`: of the joints whose servos it commands; None: it commands references or devices."""
-        self._owner = owner
-        self._names = names
+    It commands the servos of its joints, or references of those that it is `into`, and devices. Raises
+    ControllerFault for a reference or a device that is not there.
+    """
+
+    def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
+        """`rows` are those of its joints."""
+        layout, count = record.layout, len(plan.joints)
+        own = np.full(len(COMMAND_INTERFACES) * count + len(plan.device_commands), np.nan)
+        devices = own.size - len(plan.device_commands)
+        self.own: Floats = own
+        """All that it writes, in one array."""
+        self.commands = Commands(own[:devices].reshape(len(COMMAND_INTERFACES), count))
+        self.devices: Floats = own[devices:]
+        self.taken = b""
+        """The bytes of `own` that were checked last."""
+        self.parts: list[tuple[Floats, Floats, Columns]] = []
+        """What goes into the robot's arrays: of `own`, where to, and its rows there."""
+        self._owner = plan.name
+        self._names = [""] * own.size
         """What its elements command: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
-        self._own = own
-        self._rows, self._clamped = rows, clamped
-        self._finite = np.zeros(len(own), dtype=np.bool_)
-        self._seen = np.zeros(len(own), dtype=np.bool_)
-        self._all_seen = False
-        self._merged = merged
-        self._place = place = _columns(rows)
-        self._shown = merged[place] if isinstance(place, slice) else None
-        """Where it goes, as a view; None: its elements are in no equal distances."""
-        self._taken = b""
-        """The bytes of `own` that were checked and merged last."""
+        self._rows: NDArray[np.intp] | None = None if plan.into else rows
+        """Rows of the joints whose servos it commands; None: it commands references."""
+        self._clamped = record.clamped
+        for interface in plan.command:
+            begin = COMMAND_INTERFACES.index(interface) * count
+            if plan.into:
+                names = [_reference(plan, joint, interface, layout) for joint in plan.joints]
+                self._send(begin, names, record.reference, _places(names, layout.references))
+            else:
+                names = [f"{joint}/{interface}" for joint in plan.joints]
+                self._send(begin, names, getattr(record.commands, interface), rows)
+        if missing := [name for name in plan.device_commands if name not in layout.device_commands]:
+            raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
+        places = _places(plan.device_commands, layout.device_commands)
+        self._send(devices, plan.device_commands, record.device_command, places)
+        self._claimed = np.array([name != "" for name in self._names], dtype=np.bool_)
+        self._finite, self._seen, self._wrong = np.zeros((3, own.size), dtype=np.bool_)
+
+    def _send(self, begin: int, names: Sequence[str], merged: Floats, rows: NDArray[np.intp]) -> None:
+        if names:
+            end = begin + len(names)
+            self._names[begin:end] = names
+            self.parts.append((self.own[begin:end], merged, _columns(rows)))
 
     def forget(self) -> None:
         """Begin anew: nothing was commanded yet."""
-        self._own.fill(np.nan)
+        self.own.fill(np.nan)
         self._seen.fill(False)
-        self._all_seen = False
-        self._taken = b""
+        self.taken = b""
 
-    def check(self) -> bool:
-        """Return whether there is something to merge; NaN is accepted where nothing was commanded yet.
+    def check(self) -> None:
+        """Check what the controller has written; NaN is accepted where nothing was commanded yet.
 
         Raises ControllerFault for what was finite and is not any more, and for infinity.
         """
-        own, shown, finite = self._own, self._shown, self._finite
-        taken = own.tobytes()
-        if taken == self._taken and shown is not None and shown.tobytes() == taken:
-            return False  # checked and merged before, and still there
-        np.isfinite(own, finite)
-        if np.count_nonzero(finite) == finite.size:  # a tenth of the time of all()
-            if not self._all_seen:
-                self._seen.fill(True)
-                self._all_seen = True
-            return True
-        wrong = ~finite & (self._seen | np.isinf(own))
-        if wrong.any():
-            if self._clamped is not None:
-                self._clamped[self._rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+        own, seen, wrong = self.own, self._seen, self._wrong
+        np.greater(self._claimed, np.isfinite(own, self._finite), wrong)
+        if np.count_nonzero(wrong) and (wrong := wrong & (seen | np.isinf(own))).any():
+            if self._rows is not None:
+                joints = wrong[: self.commands.values.size].reshape(self.commands.values.shape).any(axis=0)
+                self._clamped[self._rows[joints]] |= np.uint8(Clamp.NOT_FINITE)
             first = int(np.flatnonzero(wrong)[0])
-            after = " after a finite value" if self._seen[first] else ""
+            after = " after a finite value" if seen[first] else ""
             raise ControllerFault(
                 f"controller {self._owner} commanded {self._names[first]} = {own[first]}{after}"
             )
-        self._seen |= finite
-        return True
-
-    def merge(self) -> None:
-        """Put what was checked into the robot's commands."""
-        self._taken = self._own.tobytes()
-        if self._shown is None:
-            self._merged[self._place] = self._own
-        else:
-            self._shown[:] = self._own
+        np.logical_or(seen, self._finite, seen)
+        self.taken = own.tobytes()
 
     def withdraw(self) -> None:
         """Take it out of the robot's commands."""
-        self._merged[self._place] = np.nan
-
-
-def claims(
-    plan: ControllerPlan, own: Commands, devices: Floats, record: CycleRecord, rows: NDArray[np.intp]
-) -> Iterator[Claim]:
-    """Yield what a controller commands: the servos of its joints, or references of those that it is `into`,
-    and commands of devices; `own` and `devices` are its own arrays, `rows` those of its joints.
-
-    Raises ControllerFault for a reference or a device that is not there.
-    """
-    layout = record.layout
-    for interface in plan.command:
-        mine: Floats = getattr(own, interface)
-        if plan.into:
-            names = tuple(_reference(plan, joint, interface, layout) for joint in plan.joints)
-            yield Claim(plan.name, names, mine, record.reference, _places(names, layout.references))
-        else:
-            names = tuple(f"{joint}/{interface}" for joint in plan.joints)
-            yield Claim(plan.name, names, mine, getattr(record.commands, interface), rows, record.clamped)
-    if missing := [name for name in plan.device_commands if name not in layout.device_commands]:
-        raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
-    if plan.device_commands:
-        places = _places(plan.device_commands, layout.device_commands)
-        yield Claim(plan.name, plan.device_commands, devices, record.device_command, places)
+        for _, merged, place in self.parts:
+            merged[place] = np.nan
 
 
 def _reference(plan: ControllerPlan, joint: str, interface: str, layout: CycleLayout) -> str:
