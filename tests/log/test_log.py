@@ -176,7 +176,7 @@ def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-OTHER_FORMAT = "and this version reads format 7; use the version that made it"
+OTHER_FORMAT = "and this version reads format 7 and 8; use the version that made it"
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Rewritten:
         *(
             (
                 {"uncompressed_size": size},
-                f"it is {size} bytes long when decompressed, and a chunk has 67108864 at most",
+                f"it is {size} bytes long when decompressed, and 67108864 are read at most",
             )
             for size in (1 << 40, 2**64 - 1)
         ),
@@ -291,6 +291,23 @@ def test_a_file_becomes_only_so_many_times_as_long(
         chunk.uncompressed_crc = 0
 
     assert "becomes more than 0 times as long when decompressed" in read_log(rewritten(change)).damage[0]
+
+
+def test_a_long_attachment_is_compressed_and_comes_back(tmp_path: Path, header: LogHeader) -> None:
+    plan, path = json.dumps(list(range(20_000))).encode(), tmp_path / "run.mcap"
+    LogWriter(path, structs.replace(header, attachments={"plan.json": plan, "robot.yaml": b"r"})).close()
+    with path.open("rb") as stream:
+        attached = {one.name: (one.media_type, one.data) for one in make_reader(stream).iter_attachments()}
+    assert set(attached) == {"plan.json.zst", "robot.yaml", "header.json"}
+    media, data = attached["plan.json.zst"]
+    assert (media, zstandard.decompress(data)) == ("application/zstd", plan)
+    assert read_log(path).attachments["plan.json"] == plan
+
+    content = path.read_bytes()
+    for wrong in (zstandard.compress(bytes(65 << 20)), data[: len(data) // 2], b"no zstd"):
+        path.write_bytes(content.replace(data, wrong.ljust(len(data), b"\0")))
+        assert "plan.json" not in read_log(path).attachments
+        assert "a record of kind attachment cannot be read" in read_log(path).damage[0]
 
 
 @pytest.mark.parametrize("compression", ["lz4", ""])

@@ -10,17 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind, decode_packets
-from dxlrun.channels.ring import Handover
-from dxlrun.log import schemas
+from dxlrun.channels.ring import Handover, RecordKind
+from dxlrun.log import log_writer, schemas
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.bus_messages import pack_packets, read_packets
 from dxlrun.log.reader import read_log
-from dxlrun.log.schemas import LogHeader
+from dxlrun.log.schemas import LogHeader, to_metadata
 from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
 
 PACKETS = [
     (0, PacketKind.INSTRUCTION, 254, 1, 2, b"\xff\xff\xfe\x02\x01\xfe"),
@@ -29,7 +32,7 @@ PACKETS = [
 ]
 TIMES = st.integers(0, 2**63 - 1)
 BATCHED = st.tuples(
-    st.just(7),
+    st.integers(-1, 9),
     st.just(0),
     st.integers(1, 3),
     st.integers(0, 255),
@@ -60,10 +63,12 @@ def test_what_is_packed_is_read_again_wherever_it_lies_and_by_rosbags(
     found, wrong = read_packets(*laid(packed, front))
     assert wrong == 0
     assert shown(found) == [packet[2:] for one in messages for packet in one]
-    assert (found.cycle == 7).all()
+    assert found.cycle.tolist() == [packet[0] for one in messages for packet in one]
     assert (found.bus == 3).all()
     theirs: Any = typestore.deserialize_cdr(packed[0], schemas.BUS_PACKETS.name)
-    assert (theirs.cycle, bytes(theirs.kind)) == (7, bytes(packet[2] for packet in messages[0]))
+    assert np.cumsum(theirs.cycle_delta).tolist() == [packet[0] for packet in messages[0]]
+    assert np.cumsum(theirs.first_ns_delta).tolist() == [packet[4] for packet in messages[0]]
+    assert bytes(theirs.kind) == bytes(packet[2] for packet in messages[0])
     assert bytes(theirs.data) == b"".join(packet[-1] for packet in messages[0])
 
 
@@ -85,14 +90,14 @@ def test_a_message_that_is_damaged_is_left_out_and_counted_or_read(
         assert len(found) >= len(others)
 
 
-KIND_AT, LENGTH_AT, DATA_AT = 64, 80, 84
+KIND_AT, LENGTH_AT, DATA_AT = 80, 96, 100
 """Of the first kind, of the first length, of the number of bytes in a message of two packets."""
 
 
 @pytest.mark.parametrize("all_of_them", [False, True])
 @pytest.mark.parametrize(
     ("at", "value"),
-    [(0, 1), (1, 9), (12, 1), (KIND_AT, 0), (KIND_AT, 7), (LENGTH_AT, 2), (DATA_AT, 3)],
+    [(0, 1), (1, 9), (4, 1), (KIND_AT, 0), (KIND_AT, 7), (LENGTH_AT, 2), (DATA_AT, 3)],
     ids=["no CDR", "another CDR", "count", "kind 0", "kind 7", "length", "bytes"],
 )
 def test_what_contradicts_itself_is_left_out(at: int, value: int, all_of_them: bool) -> None:
@@ -106,12 +111,13 @@ def test_what_contradicts_itself_is_left_out(at: int, value: int, all_of_them: b
     assert shown(found) == ([] if all_of_them else [packet[2:] for packet in packets])
 
 
-def test_a_log_has_one_message_a_cycle_and_bus(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["as it is", "of format 7"])
+def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path, form: str) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
     batch = PacketBatch(Handover(log.take))
     batch.packet(*PACKETS[0])
     batch.commit()
-    for cycle in (0, 1, 4):
+    for cycle in (0, 1, 249, 251):
         batch.wake(cycle)
         for packet in PACKETS:
             batch.packet(*packet)
@@ -120,19 +126,71 @@ def test_a_log_has_one_message_a_cycle_and_bus(tmp_path: Path) -> None:
     batch.commit()
     log.close()
 
-    with (tmp_path / "run.mcap").open("rb") as stream:
+    path = tmp_path / "run.mcap"
+    with path.open("rb") as stream:
         written = [
-            (channel.topic, CODEC.unpack(message.data)["cycle"])
+            (channel.topic, len(set(np.cumsum(CODEC.unpack(message.data)["cycle_delta"]).tolist())))
             for _, channel, message in make_reader(stream).iter_messages(log_time_order=False)
         ]
-    assert sorted(written) == [("/bus/arm", n) for n in (0, 1, 4)] + [("/bus/main", n) for n in (-1, 0, 1, 4)]
-    packets = read_log(tmp_path / "run.mcap").packets
+    assert written == [("/bus/main", 4), ("/bus/arm", 2), ("/bus/main", 2), ("/bus/arm", 2)]
+    if form == "of format 7":
+        path = in_format_7(path)
+    packets = read_log(path).packets
     main = packets.take(packets.bus == 0)
     assert list(zip(main.cycle.tolist(), main.servo_id.tolist(), strict=True)) == [
         (-1, 254),
-        *((cycle, who) for cycle in (0, 1, 4) for who in (254, 255, 9)),
+        *((cycle, who) for cycle in (0, 1, 249, 251) for who in (254, 255, 9)),
     ]
-    assert packets.cycle[packets.bus == 1].tolist() == [0, 1, 4]
+    assert packets.cycle[packets.bus == 1].tolist() == [0, 1, 249, 251]
+    assert [one.first_ns for one in main] == [1, *(1, 5, 6) * 4]
+
+
+def test_a_chunk_has_the_packets_of_its_cycles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recorder that is killed leaves whole chunks, and no cycle in them whose packets are missing."""
+    monkeypatch.setattr(log_writer, "CHUNK_BYTES", 2000)
+    header = LogHeader("r", (), ("main",), (), 10**6, 0)
+    log, record = LogWriter(tmp_path / "run.mcap", header), CycleRecord(header.layout)
+    batch = PacketBatch(Handover(log.take))
+    for cycle in range(100):
+        batch.wake(cycle)
+        batch.packet(*PACKETS[0])
+        batch.commit()
+        record.cycle = cycle
+        log.take(RecordKind.CYCLE, record.raw)
+    read = read_log(tmp_path / "run.mcap")
+    assert 80 < len(read.cycles) < 100
+    assert not read.complete
+    assert read.packets.cycle.tolist() == read.cycles["cycle"].tolist()
+
+
+def in_format_7(path: Path) -> Path:
+    """Write a log again as version 7 did: the packets of a cycle in a message of their own."""
+    text = "int64 cycle\nint64[] first_ns\n" + schemas.BUS_PACKETS.text.partition("first_ns_delta\n")[2]
+    codec, older = Codec(MessageType(schemas.BUS_PACKETS.name, text)), path.with_name("older.mcap")
+    log = read_log(path)
+    with older.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(schemas.PROFILE)
+        writer.add_metadata(schemas.METADATA_NAME, to_metadata(log.header) | {"format": "7"})
+        schema = writer.register_schema(schemas.BUS_PACKETS.name, schemas.SCHEMA_ENCODING, text.encode())
+        for bus, name in enumerate(log.buses):
+            channel = writer.register_channel(schemas.bus_topic(name), schemas.ENCODING, schema)
+            for cycle in np.unique(log.packets.cycle[log.packets.bus == bus]):
+                some = list(log.packets.take((log.packets.bus == bus) & (log.packets.cycle == cycle)))
+                first = np.array([one.first_ns for one in some], np.int64)
+                took = np.array([one.last_ns for one in some], np.int64) - first
+                data = codec.pack(
+                    int(cycle),
+                    first,
+                    took,
+                    bytes(one.kind for one in some),
+                    bytes(one.servo_id for one in some),
+                    np.array([len(one.data) for one in some], np.uint16),
+                    b"".join(one.data for one in some),
+                )
+                writer.add_message(channel, 0, data, 0)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+    return older
 
 
 def test_a_kind_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,13 +12,14 @@ from typing import IO, TypeVar, cast
 
 import msgspec
 import numpy as np
+import zstandard
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from dxlrun.channels.commands import decode_taken_command
 from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, decode_event
 from dxlrun.channels.messages import decode_message, decode_topic
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, split_packets
+from dxlrun.channels.packets import BatchedPacket, split_packets
 from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
@@ -30,8 +32,11 @@ from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
 CHUNK_BYTES = 512 * 1024
-_MOST_PACKETS = 1000
-"""In one message: the start-up of a large robot, and noise, take several."""
+"""A chunk with so many bytes of messages is written."""
+_MOST_PACKETS, _MOST_CYCLES = 1000, 250
+"""In one message. The index has 16 bytes a message, and arrays of many cycles compress better."""
+_COMPRESSED_FROM = 16 * 1024
+"""Bytes: an attachment of so many is compressed, as the plan is; shorter ones stay as text to read."""
 _LIBRARY = "dxlrun"
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 JOINT_COMMANDS_NS = 10_000_000
@@ -64,8 +69,9 @@ class LogWriter:
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
         """Channels with one message, and what makes it of the time of the first record."""
         self._writer = Writer(
-            cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+            cast("IO[bytes]", self._file), chunk_size=sys.maxsize, compression=CompressionType.ZSTD
         )
+        self._chunk_bytes = 0
         self._sequences: dict[int, int] = {}
         self._known: dict[str, int] = {}
         """Schemas by the names of their messages."""
@@ -103,8 +109,12 @@ class LogWriter:
         own = {schemas.HEADER_ATTACHMENT: msgspec.json.format(msgspec.json.encode(to_metadata(header)))}
         for name, data in sorted({**header.attachments, **own}.items()):
             media = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+            attached = name, media, data
+            if len(data) >= _COMPRESSED_FROM:
+                packed = zstandard.compress(data)
+                attached = name + schemas.COMPRESSED_SUFFIX, schemas.COMPRESSED_TYPE, packed
             at_ns = max(0, header.epoch_offset_ns)
-            self._writer.add_attachment(at_ns, at_ns, name, media, data)
+            self._writer.add_attachment(at_ns, at_ns, *attached)
         self._cycle_channel = self._channel(schemas.CYCLE_TOPIC, schemas.CYCLE)
         self._activation_channel = self._channel(schemas.ACTIVATION_TOPIC, schemas.CYCLE)
         self._taken_channel = self._channel(schemas.COMMANDS_TOPIC, schemas.COMMAND)
@@ -116,10 +126,11 @@ class LogWriter:
         self._bus_channels = [
             self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
-        self._cycle_packets: list[list[BatchedPacket]] = [[] for _ in header.buses]
-        """Packets of one cycle that are not written yet, for each bus."""
+        self._waiting: list[list[BatchedPacket]] = [[] for _ in header.buses]
+        """Packets that are not in a message yet, for each bus."""
+        self._oldest: int | None = None
+        """Cycle of the first of them."""
         self._commands_slot: int | None = None
-        self._cycle_of_packets = BEFORE_FIRST_CYCLE
         self._publishers = [
             (
                 1 << index,
@@ -140,7 +151,7 @@ class LogWriter:
             if self._frames.any_still:
                 channel = self._channel(schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched)
                 self._firsts.append((channel, self._frames.still))
-        self._mark_whole()
+        self._end_chunk()
 
     def _channel(self, topic: str, message: MessageType, more: Mapping[str, str] | None = None) -> int:
         if message.name not in self._known:
@@ -166,26 +177,26 @@ class LogWriter:
         self._sequences[channel] = sequence + 1
         self._writer.add_message(channel, wall_ns, data, wall_ns, sequence & 0xFFFFFFFF)
         self._messages += 1
+        self._chunk_bytes += len(data)
         self._last_ns = max(self._last_ns, t_ns)
-        if self._file.tell() != self._whole_bytes:
-            self._mark_whole()
 
-    def _mark_whole(self) -> None:
+    def _end_chunk(self) -> None:
+        """Write the chunk, with the packets that belong to its cycles: what is behind it may be lost."""
+        self._write_packets()
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
+        self._chunk_bytes = 0
 
     def _guarded(self, write: Callable[[Written], None], what: Written) -> None:
         """Write something, or count it when nothing can be written any more."""
-        if self.error is not None:
-            self._unwritten += 1
-            return
-        try:
+        if self.error is None:
             write(what)
-        except OSError as error:
-            self._give_up(error)
+        else:
+            self._unwritten += 1
 
     def _give_up(self, error: OSError) -> None:
         self.error = f"writing the log stopped: {error.strerror or error}"
-        self._unwritten += self._messages - self._whole_messages + 1
+        self._unwritten += self._messages - self._whole_messages
         self._messages = self._whole_messages
         try:
             self._file.truncate(self._whole_bytes)
@@ -197,6 +208,8 @@ class LogWriter:
         if kind not in self._takers:
             raise ValueError(f"a record of kind {kind} does not belong into a log")
         self._guarded(self._takers[kind], payload)
+        if self._chunk_bytes > CHUNK_BYTES:
+            self.flush()
 
     def _cycle(self, payload: Payload) -> None:
         """Write a cycle: /cycle, the goals, the frames, and the states that controllers marked; before the
@@ -244,20 +257,19 @@ class LogWriter:
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
     def _packets(self, payload: Payload) -> None:
-        """Take one batch of packets; a cycle's are written when the first of the next one is here, because
-        those of its idle time come in the next batch."""
+        """Take one batch of packets; those of many cycles become one message, for a small index."""
         for packet in split_packets(payload):
-            if packet[0] != self._cycle_of_packets:
-                self._write_packets()
-                self._cycle_of_packets = packet[0]
-            packets = self._cycle_packets[packet[1]]
+            if self._oldest is None:
+                self._oldest = packet[0]
+            packets = self._waiting[packet[1]]
             packets.append(packet)
-            if len(packets) >= _MOST_PACKETS:
+            if len(packets) >= _MOST_PACKETS or packet[0] - self._oldest >= _MOST_CYCLES:
                 self._write_packets()
 
     def _write_packets(self) -> None:
         """Write the packets that wait, one message a bus, each at the time of its last packet."""
-        for channel, packets in zip(self._bus_channels, self._cycle_packets, strict=True):
+        self._oldest = None
+        for channel, packets in zip(self._bus_channels, self._waiting, strict=True):
             if packets:
                 data, t_ns = pack_packets(packets), packets[-1][5]
                 packets.clear()
@@ -337,9 +349,7 @@ class LogWriter:
         if self.error is not None:
             return
         try:
-            self._write_packets()
-            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
-            self._mark_whole()
+            self._end_chunk()
             if sync:
                 self._file.sync()
         except OSError as error:
@@ -365,9 +375,7 @@ class LogWriter:
         return self._summary
 
     def _finish(self) -> None:
-        self._write_packets()
-        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
-        self._mark_whole()
+        self._end_chunk()
         for name, record in sorted(self.late_metadata.items()):
             self._writer.add_metadata(name, dict(sorted(record.items())))
         self._writer.add_metadata(

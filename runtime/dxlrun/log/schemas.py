@@ -42,10 +42,14 @@ SUMMARY_NAME = "dxlrun_summary"
 FAILURES_NAME = "failures"
 """The metadata record with what failed in the run outside of the loop, one sentence each."""
 HEADER_ATTACHMENT = "header.json"
+COMPRESSED_SUFFIX, COMPRESSED_TYPE = ".zst", "application/zstd"
+"""Of an attachment that is compressed: its name has this at its end."""
 KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
-FORMAT = "7"
+FORMAT = "8"
 """Grows when a reader of the version before would misread a log."""
+READ_FORMATS = ("7", FORMAT)
+"""In 7, a message of /bus/NAME has the packets of one cycle, and no attachment is compressed."""
 
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
@@ -171,14 +175,15 @@ CYCLE = MessageType(
 
 BUS_PACKETS = MessageType(
     "dxlrun_msgs/msg/BusPackets",
-    """# Packets on a bus in the period of one cycle (-1: before the first), an element each, in order; a
-# cycle may have several of these messages. kind: 1 instruction, 2 status, 3 noise, 4 status that came too
-# late, 5 instruction of another host, 6 echo of an instruction. Times, ns of the run's clock: of an
-# instruction before its write(), and how long that took; else after the read() that brought the first
-# byte, and how long after it the last one came. data: the bytes of all packets, one behind the other;
-# length: how many are of each.
-int64 cycle
-int64[] first_ns
+    """# Packets on a bus, an element each, in order. cycle_delta, first_ns_delta: of the first packet the
+# value, of each other one the difference from the packet before; sum them up. cycle: in whose period it
+# was, -1: before the first one. kind: 1 instruction, 2 status, 3 noise, 4 status that came too late, 5
+# instruction of another host, 6 echo of an instruction. Times, ns of the run's clock: of an instruction
+# before its write(), and how long that took; else after the read() that brought the first byte, and how
+# long after it the last one came. data: the bytes of all packets, one behind the other; length: how many
+# are of each.
+int64[] cycle_delta
+int64[] first_ns_delta
 int64[] duration_ns
 uint8[] kind
 uint8[] servo_id
@@ -342,10 +347,10 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
 
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
-    if text.get("format") != FORMAT:
+    if text.get("format") not in READ_FORMATS:
         raise ValueError(
-            f"it has format {text.get('format', 'none')}, and this version reads format {FORMAT}; use the "
-            "version that made it"
+            f"it has format {text.get('format', 'none')}, and this version reads format "
+            f"{' and '.join(READ_FORMATS)}; use the version that made it"
         )
     try:
         values = {

@@ -1,4 +1,4 @@
-"""Messages of `/bus/NAME`: the packets of a bus in one cycle, as arrays; packing, and reading as columns."""
+"""Messages of `/bus/NAME`: packets of a bus as arrays; packing, and reading as columns."""
 
 from __future__ import annotations
 
@@ -12,44 +12,75 @@ from dxlrun.log.columns import PacketColumns
 from dxlrun.log.schemas import BUS_PACKETS
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import Column, ColumnReader
+from dxlrun.messages.definition import MessageType
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
-_FIELDS = ("first_ns", "duration_ns", "kind", "servo_id", "length", "data")
+_OF_ONE_CYCLE = ColumnReader(
+    MessageType(
+        BUS_PACKETS.name,
+        """int64 cycle
+int64[] first_ns
+int64[] duration_ns
+uint8[] kind
+uint8[] servo_id
+uint16[] length
+uint8[] data
+""",
+    )
+)
+"""Messages of format 7."""
+_FIELDS = ("cycle_delta", "first_ns_delta", "duration_ns", "kind", "servo_id", "length", "data")
 """Sequences; but for the last one with an element a packet."""
 
 
 def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
-    """Return the message of one cycle's packets on one bus, at least one."""
+    """Return the message of packets on one bus, at least one."""
     cycle, _, kind, servo_id, first_ns, last_ns, data = zip(*packets, strict=True)
     first = np.array(first_ns, np.int64)
-    took = np.array(last_ns, np.int64) - first  # short mostly: compressed, they take half of what times do
+    took = np.array(last_ns, np.int64) - first
     length = np.array([len(one) for one in data], np.uint16)
-    return _CODEC.pack(cycle[0], first, took, bytes(kind), bytes(servo_id), length, b"".join(data))
+    # differences repeat: compressed, they take a fifth of what times and cycles do
+    steps = (np.diff(np.array(each, np.int64), prepend=np.int64(0)) for each in (cycle, first))
+    return _CODEC.pack(*steps, took, bytes(kind), bytes(servo_id), length, b"".join(data))
 
 
 def read_packets(
-    data: NDArray[np.uint8], bus: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64]
+    data: NDArray[np.uint8],
+    bus: NDArray[np.uint8],
+    start: NDArray[np.int64],
+    size: NDArray[np.int64],
+    *,
+    of_one_cycle: bool = False,
 ) -> tuple[PacketColumns, int]:
     """Return the packets of messages that lie in `data`, and how many are not what their definition says.
 
-    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes.
+    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes;
+    `of_one_cycle`: they are those of format 7.
     """
     try:
-        whole, tree = _READER.read(data, start, size)
+        whole, tree = (_OF_ONE_CYCLE if of_one_cycle else _READER).read(data, start, size)
     except ValueError:  # none of them is a message
         return PacketColumns.of(()), len(start)
+    if of_one_cycle:
+        counts = tree.leaf("kind").flat[0]
+        cycle = np.repeat(tree.leaf("cycle").array(), counts)
+        tree.fields["cycle_delta"] = Column(counts=counts, elements=Column(values=cycle))
+        tree.fields["first_ns_delta"] = tree.leaf("first_ns")
     good = _consistent(tree)
     if not good.all():
         whole, tree = whole[good], tree.take(np.flatnonzero(good))
-    first_ns, took_ns, kind, servo_id, length, bodies = (tree.leaf(name).flat[1] for name in _FIELDS)
+    cycle, first, took_ns, kind, servo_id, length, bodies = (tree.leaf(name).flat[1] for name in _FIELDS)
     count, size = tree.leaf("kind").flat[0], length.astype(np.int64)
+    if not of_one_cycle:
+        cycle, first = _summed_up(count, cycle), _summed_up(count, first)
+    first_ns = first.astype(np.int64, copy=False)
     packets = PacketColumns(
-        cycle=np.repeat(tree.leaf("cycle").array().astype(np.int64), count),
+        cycle=cycle.astype(np.int64, copy=False),
         bus=np.repeat(bus[whole], count),
         kind=kind.astype(np.uint8, copy=False),
         servo_id=servo_id.astype(np.uint8, copy=False),
-        first_ns=first_ns.astype(np.int64, copy=False),
-        last_ns=first_ns.astype(np.int64) + took_ns.astype(np.int64, copy=False),
+        first_ns=first_ns,
+        last_ns=first_ns + took_ns.astype(np.int64, copy=False),
         start=np.cumsum(size) - size,
         length=size,
         data=bodies.astype(np.uint8, copy=False),
@@ -64,6 +95,14 @@ def _consistent(tree: Column) -> NDArray[np.bool_]:
     kinds, lengths = (tree.leaf(name).flat for name in ("kind", "length"))
     odd = ~np.isin(kinds[1], list(PacketKind))
     found: NDArray[np.bool_] = good & (_sums(kinds[0], odd) == 0) & (_sums(*lengths) == bytes_each)
+    return found
+
+
+def _summed_up(count: NDArray[np.int64], deltas: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Return the sums of differences, of which each message has `count`, from its first one on."""
+    sums = np.cumsum(deltas.astype(np.int64, copy=False))
+    before = np.concatenate([[0], sums])[np.cumsum(count) - count]
+    found: NDArray[np.int64] = sums - np.repeat(before, count)
     return found
 
 

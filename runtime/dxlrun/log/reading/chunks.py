@@ -24,6 +24,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistic
 from numpy.typing import NDArray
 
 from dxlrun.log.columns import numbers
+from dxlrun.log.schemas import COMPRESSED_SUFFIX, COMPRESSED_TYPE
 from dxlrun.messages.definition import MessageType
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -289,14 +290,9 @@ class McapFile:
     def _decompressed(self, chunk: Chunk) -> bytes:
         """Return the records of a chunk; EOFError when it contradicts its header, or is more than allowed."""
         size = chunk.uncompressed_size
-        if size > _LARGEST:
-            raise EOFError(f"it is {size} bytes long when decompressed, and a chunk has {_LARGEST} at most")
-        if size > self._room:
-            raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
-        self._room -= size
+        self._take_room(size)
         if chunk.compression == "zstd":
-            # not decompress(): it believes the length in the frame, not that of the chunk
-            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+            data = _of_zstd(chunk.data, size + 1)
         elif chunk.compression == "lz4":
             try:
                 data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
@@ -311,6 +307,14 @@ class McapFile:
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise EOFError("its bytes do not agree with their CRC")
         return data
+
+    def _take_room(self, size: int) -> None:
+        """Allow bytes that are to be decompressed. Raises EOFError where they are too many."""
+        if size > _LARGEST:
+            raise EOFError(f"it is {size} bytes long when decompressed, and {_LARGEST} are read at most")
+        if size > self._room:
+            raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
+        self._room -= size
 
     def _take_schema(self, body: ReadDataStream) -> None:
         schema = Schema.read(body)
@@ -334,7 +338,14 @@ class McapFile:
 
     def _take_attachment(self, body: ReadDataStream) -> None:
         attachment = Attachment.read(body)
-        self.attachments[attachment.name] = attachment.data
+        name, data = attachment.name, attachment.data
+        if attachment.media_type == COMPRESSED_TYPE and name.endswith(COMPRESSED_SUFFIX):
+            size = zstandard.get_frame_parameters(data).content_size
+            self._take_room(size)
+            name, data = name.removesuffix(COMPRESSED_SUFFIX), _of_zstd(data, size + 1)
+            if len(data) != size:
+                raise EOFError("it is not as long as it says")
+        self.attachments[name] = data
 
     def _take_metadata(self, body: ReadDataStream) -> None:
         record = Metadata.read(body)
@@ -354,6 +365,11 @@ _READ: dict[Opcode, Callable[[McapFile, ReadDataStream], None]] = {
     Opcode.STATISTICS: McapFile._take_statistics,
 }
 _OPENS = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
+
+
+def _of_zstd(data: bytes, most: int) -> bytes:
+    # not decompress(): it believes the length in the frame
+    return zstandard.ZstdDecompressor().stream_reader(data).read(most)
 
 
 def _next_chunk(stream: IO[bytes], begin: int, size: int) -> int | None:

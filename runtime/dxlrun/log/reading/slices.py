@@ -248,7 +248,10 @@ class Slicer:
         bus = [np.full(len(own), at, np.uint8) for at, own in zip(buses.values(), rows, strict=True)]
         all_rows = np.concatenate(rows)
         start, size = messages.start[all_rows], messages.size[all_rows]
-        packets, wrong = read_packets(messages.data, np.concatenate(bus), start, size)
+        definition = self._file.channels[next(iter(buses))].text
+        packets, wrong = read_packets(
+            messages.data, np.concatenate(bus), start, size, of_one_cycle="int64 cycle\n" in definition
+        )
         self.wrong += wrong
         return packets
 
