@@ -72,7 +72,7 @@ class Line:
 def findings(line: Line) -> list[Finding]:
     columns = replace(PacketColumns.of(line.packets), cycle=np.array(line.cycles, np.int64))
     times = ReplyTimes(JointStates())
-    times.take(Pairing().pair(columns, (BUS,)), Places())
+    times.take(Pairing((BUS,)).alone(columns), Places())
     return list(times.findings(0, BUS))
 
 
@@ -194,7 +194,7 @@ def somewhere(
     states.take(SimpleNamespace(cycles=cycles))  # type: ignore[arg-type]
     columns = replace(PacketColumns.of(line.packets), cycle=np.array(line.cycles, np.int64))
     times = ReplyTimes(states)
-    times.take(Pairing().pair(columns, (BUS,)), states.until(LONG))
+    times.take(Pairing((BUS,)).alone(columns), states.until(LONG))
     return list(times.somewhere(0, BUS))
 
 
@@ -231,7 +231,7 @@ def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: i
                 line.packets[-1] = replace(line.packets[-1], kind=PacketKind.LATE)
     columns = replace(PacketColumns.of(line.packets), cycle=np.array(line.cycles, np.int64))
     replies, none = LateReplies(), np.zeros(0, np.int64)
-    replies.take(Pairing().pair(columns, (BUS,)), none, none)
+    replies.take(Pairing((BUS,)).alone(columns), none, none)
     assert [one.code for one in replies.findings(0, BUS)] == named
 
 

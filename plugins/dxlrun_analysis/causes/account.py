@@ -24,10 +24,8 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.cycles.worst import CauseKind
-from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import Pairing, ordered
+from dxlrun_analysis.servos.exchanges import Exchanges, Pairing, ordered
 
-_BYTE_NS = 10_000_000_000
 _NEVER = np.iinfo(np.int64).max
 
 
@@ -74,15 +72,14 @@ class Account:
         cycle: np.void,
         before: np.void | None,
         packets: PacketColumns,
-        buses: tuple[LoggedBus, ...],
+        pairing: Pairing,
         controllers: Sequence[str],
     ) -> None:
         """Split a cycle; it and the one before it are rows of `causes.cycles_of`."""
-        self._cycle, self._buses = cycle, buses
+        self._cycle = cycle
         self.shares: Counter[CauseName] = Counter()
 
-        packets = ordered(packets)
-        self._exchanges = tuple(_exchanges(packets, buses)) if len(packets) else ()
+        self._exchanges = tuple(_exchanges(pairing.alone(ordered(packets))))
         late = int(cycle["late"])
         idle = self._idle(before, late) if before is not None else 0
         self.shares[CauseName("late wake-up")] += late - idle
@@ -165,29 +162,24 @@ class Account:
         return ns
 
 
-def _exchanges(packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Iterator[_Exchange]:
-    """Yield the exchanges of some packets that ask servos; `packets` bus by bus in order of time."""
-    found = Pairing().pair(packets, buses)
-    replies = found.replies
-    instructs = packets.kind == PacketKind.INSTRUCTION
-    rows, indices = np.flatnonzero(instructs), (np.cumsum(instructs) + packets.bus)[instructs]
-    for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
-        ids, bus = found.requests[found.request[index]].servo_ids, int(found.bus[index])
-        if not ids:
-            continue
-        rate, length = buses[bus].baud_rate, int(packets.length[row])
-        took = int(packets.last_ns[row] - packets.first_ns[row])
-        mine = np.flatnonzero((replies.exchange == index) & replies.answers)
-        lacking = [servo_id for servo_id in ids if servo_id not in replies.servo_id[mine]]
-        same_bus = index + 1 < len(found.bus) and found.bus[index + 1] == bus
-        due = int(replies.due_ns[mine].max(initial=found.sent_ns[index]))
+def _exchanges(found: Exchanges) -> Iterator[_Exchange]:
+    """Yield the exchanges that ask servos."""
+    due, replies = found.due, found.replies
+    following = np.append(found.asked_ns[1:], _NEVER)
+    following[np.append(np.diff(found.bus), 1) > 0] = _NEVER
+    for index in np.flatnonzero(found.requests.servos[found.request]).tolist():
+        ids, bus = found.requests.kinds[found.request[index]].servo_ids, int(found.bus[index])
+        reply = due.reply[due.exchange == index]
+        came, missing = reply[reply >= 0], np.flatnonzero(reply < 0)
+        planned_end = int(replies.due_ns[came].max(initial=found.sent_ns[index]))
+        lacks = ids[missing[0]] if len(missing) else None
         yield _Exchange(
             bus,
             ids,
             int(found.asked_ns[index]),
-            max(took - length * _BYTE_NS // max(rate, 1), 0),
-            int(found.asked_ns[index + 1]) if same_bus else _NEVER,
-            due + buses[bus].latency_ns,
-            int(replies.last_ns[mine].max(initial=0)),
-            None if not lacking else -1 if not len(mine) and len(ids) > 1 else lacking[0],
+            int(found.blocked_ns[index]),
+            int(following[index]),
+            planned_end + found.buses[bus].latency_ns,
+            int(replies.last_ns[came].max(initial=0)),
+            -1 if len(missing) == len(ids) > 1 else lacks,
         )

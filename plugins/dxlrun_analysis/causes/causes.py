@@ -30,6 +30,7 @@ from dxlrun_analysis.causes.timeline import timeline
 from dxlrun_analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
 from dxlrun_analysis.cycles.worst import Cause, CauseShare, WorstCycle
 from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.servos.exchanges import Pairing
 
 KEPT = 200
 """So many of the worst cycles are split ..."""
@@ -111,8 +112,9 @@ class CycleCauses:
     def finish(self) -> Causes:
         """Return the causes of the whole run."""
         self._advance(final=True)
+        pairing = Pairing(self._buses)
         accounts = [
-            Account(one.cycle, one.before, one.packets, self._buses, self._controllers) for one in self._kept
+            Account(one.cycle, one.before, one.packets, pairing, self._controllers) for one in self._kept
         ]
         self._share_with_machine(accounts)
         sums: defaultdict[CauseName, list[tuple[int, bool]]] = defaultdict(list)

@@ -55,17 +55,15 @@ class ReplyCollector:
             return
         if not len(self._rows):
             self._begin()
-        count, replies = len(self._names), exchanges.replies
-        of, servo = replies.exchange[replies.answers], replies.servo_id[replies.answers]
+        count, due = len(self._names), exchanges.due
         values = np.full((len(exchanges.bus), 2 * count), np.nan, np.float32)
-        column = self._rows[exchanges.bus[of], servo]
-        took_us = (replies.last_ns[replies.answers] - exchanges.asked_ns[of]) / 1e3
-        values[of[column >= 0], column[column >= 0]] = took_us[column >= 0]
-        missing = exchanges.asks[exchanges.request] & exchanges.ended[:, None]
-        missing[of, servo] = False
-        row, servo = np.nonzero(missing)
-        column = self._rows[exchanges.bus[row], servo]
-        values[row[column >= 0], count + column[column >= 0]] = 1
+        column = self._rows.reshape(-1)[due.servo]
+        came = np.flatnonzero((due.reply >= 0) & (column >= 0))
+        of = due.exchange[came]
+        took_ns = exchanges.replies.last_ns[due.reply[came]] - exchanges.asked_ns[of]
+        values[of, column[came]] = took_ns / 1e3
+        lost = np.flatnonzero((due.reply < 0) & (column >= 0) & exchanges.ended[due.exchange])
+        values[due.exchange[lost], count + column[lost]] = 1
         # the first exchange of each bus has no instruction, and many instructions ask nothing
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         rows = rows[np.argsort(exchanges.asked_ns[rows], kind="stable")]

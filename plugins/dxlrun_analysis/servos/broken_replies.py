@@ -9,10 +9,9 @@ import numpy as np
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import Exchanges
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges
 from dxlrun_analysis.servos.losses import ServoLosses
 
-_IDS = 256
 _FEWEST = 5
 _ALONE = 0.7
 """Share of the exchanges of a bus with such bytes from which they are one ID's."""
@@ -27,22 +26,21 @@ class BrokenReplies:
 
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""
-        missing, buses = exchanges.missing, len(exchanges.buses)
+        due, buses = exchanges.due, len(exchanges.buses)
         if not len(self._noisy):
-            self._broken, self._cut = np.zeros((2, buses * _IDS), np.int64)
+            self._broken, self._cut = np.zeros((2, buses * IDS), np.int64)
             self._noisy = np.zeros(buses, np.int64)
-        rows = np.flatnonzero(missing.broken & exchanges.ended[missing.exchange])
-        request = exchanges.request[missing.exchange[rows]]
-        servo = exchanges.bus[missing.exchange[rows]] * _IDS + missing.servo_id[rows]
-        ends = np.array([len(one.servo_ids) - 1 if one.fast else -1 for one in exchanges.requests])
-        cut = servo[missing.place[rows] == ends[request]]
-        self._broken += np.bincount(servo, minlength=buses * _IDS)
-        self._cut += np.bincount(cut, minlength=buses * _IDS)
+        rows = np.flatnonzero(due.broken & exchanges.ended[due.exchange])
+        servo, request = due.servo[rows], exchanges.request[due.exchange[rows]]
+        ends = due.place[rows] == exchanges.requests.servos[request] - 1
+        cut = servo[ends & exchanges.requests.fast[request]]
+        self._broken += np.bincount(servo, minlength=buses * IDS)
+        self._cut += np.bincount(cut, minlength=buses * IDS)
         self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
         """Name the one ID of a bus whose replies are broken; not where that depends on the joint's angle."""
-        mine = self._broken[index * _IDS : (index + 1) * _IDS]
+        mine = self._broken[index * IDS : (index + 1) * IDS]
         total = int(self._noisy[index]) if len(mine) else 0
         if total < _FEWEST or len(losses) < 2:  # of a single servo it is the line
             return ()
@@ -51,7 +49,7 @@ class BrokenReplies:
         if broken < _ALONE * total or lost is None or lost.angles is not None:
             return ()
         name = bus.names.get(servo_id) or f"servo {servo_id}"
-        end = self._cut[index * _IDS + servo_id] >= _ALONE * broken
+        end = self._cut[index * IDS + servo_id] >= _ALONE * broken
         cut = "; or the end of the status packet that all share, which is its part, is lost" if end else ""
         return (
             Finding(

@@ -1,4 +1,4 @@
-"""Pair the instructions of a log with the replies to them, as columns: no loop goes over packets.
+"""Pair the instructions of a log with the replies to them: one table, as columns; no loop goes over packets.
 
 The packets are parsed here anew, so that nothing depends on what the run believed. A reply belongs to the
 last instruction before it on its bus. Sources: ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction
@@ -7,9 +7,8 @@ and status packets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum, unique
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,14 @@ from numpy.typing import NDArray
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
+from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
 
-BROADCAST_ID = 0xFE
-_IDS = 256
+IDS = 256
+"""A servo is one number: that of its bus times this, plus its ID."""
 _ROWS = 40
-"""Bits of an exchange's index in a key; above them bus and servo."""
+"""Bits of an exchange's index in a key; above them the servo."""
 _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""
 _HEADER_2 = b"\xff\xff\xfd\x00"
@@ -42,8 +42,7 @@ Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedRequest:
+class LoggedRequest(NamedTuple):
     """The replies that one instruction requests: from which servos, with how many bytes of data each."""
 
     servo_ids: tuple[int, ...] = ()
@@ -53,15 +52,43 @@ class LoggedRequest:
     """All answer in one status packet."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Exchanges:
-    """Instructions with their replies, bus by bus and in order of time; shape (exchanges,).
+class Requests(NamedTuple):
+    """All different requests: none, of each servo by itself, then as found; columns of shape (requests,)."""
+
+    kinds: tuple[LoggedRequest, ...] = ()
+    servos: Numbers = np.zeros(0, np.int64)
+    """How many each asks."""
+    fast: Flags = np.zeros(0, np.bool_)
+    places: Numbers = np.zeros((0, IDS), np.int64)
+    """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
+    ids: Numbers = np.zeros((0, IDS), np.int64)
+    """IDs in the order of places, those that are asked at the end; shape (requests, 256)."""
+
+    def and_more(self, kinds: tuple[LoggedRequest, ...]) -> Requests:
+        """Return these and more requests."""
+        places = np.full((len(kinds), IDS), -1, np.int64)
+        for row, one in zip(places, kinds, strict=True):
+            row[list(one.servo_ids)] = np.arange(len(one.servo_ids))
+        return Requests(
+            (*self.kinds, *kinds),
+            np.append(self.servos, [len(one.servo_ids) for one in kinds]),
+            np.append(self.fast, [one.fast for one in kinds]),
+            np.concatenate([self.places, places]),
+            np.concatenate([self.ids, np.argsort(places, axis=1, kind="stable")]),
+        )
+
+
+_ALONE = Requests().and_more((LoggedRequest(), *(LoggedRequest((servo_id,)) for servo_id in range(IDS))))
+
+
+class Exchanges(NamedTuple):
+    """Instructions with their replies, bus by bus and in order of time; columns of shape (exchanges,).
 
     The first of each bus has no instruction: what arrived before one did.
     """
 
     buses: tuple[LoggedBus, ...]
-    requests: Sequence[LoggedRequest]
+    requests: Requests
     """By `request`."""
     bus: Numbers
     cycle: Numbers
@@ -70,14 +97,18 @@ class Exchanges:
     """Index in `requests`."""
     asked_ns: Numbers
     """Before the write() of the instruction."""
+    blocked_ns: Numbers
+    """How long the write() took beyond the wire's time, where the rate is known."""
     sent_ns: Numbers
     """When the line had carried it, by its rate."""
+    last_ns: Numbers
+    """After the last reply; where there is none, `sent_ns`."""
     ended: Flags
     """False: the log ends before the next instruction, so a missing reply may have come a moment later."""
     noise: Numbers
     """Bytes that belong to no intact packet."""
     replies: Replies
-    missing: Missing
+    due: Due
     late: Late
     others: PacketColumns
     """Instructions of other hosts on the line."""
@@ -85,19 +116,16 @@ class Exchanges:
     """The bus of each own instruction that came back."""
     stray: PacketColumns
     """Bytes that belong to no intact packet."""
-    asks: Flags
-    """Which servos the requests ask, shape (requests, 256)."""
-    places: Numbers
-    """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Replies:
-    """The answers of single servos, of a fast status packet several; shape (replies,)."""
+class Replies(NamedTuple):
+    """What came of single servos, of a fast status packet several; shape (replies,), in order of time."""
 
     exchange: Numbers
     """Index in the exchanges."""
-    servo_id: Numbers
+    servo: Numbers
+    place: Numbers
+    """In the replies that the instruction requests; -1: it does not."""
     error: Numbers
     """The error byte."""
     protocol: Numbers
@@ -117,6 +145,8 @@ class Replies:
 class Loss(IntEnum):
     """Whose loss a missing reply is, as far as its exchange shows it."""
 
+    NONE = -1
+    """It is not missing."""
     OWN = 0
     """The servo's: it was asked alone, or is the first of several without an intact reply."""
     BEHIND = 1
@@ -127,28 +157,27 @@ class Loss(IntEnum):
     """None: the reply came, after it was given up."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Missing:
-    """Requested replies that are not intact; shape (missing replies,), in order of the requests."""
+class Due(NamedTuple):
+    """Each reply that was requested, exchange by exchange and in order of places; shape (due replies,)."""
 
     exchange: Numbers
     """Index in the exchanges."""
-    servo_id: Numbers
+    servo: Numbers
     place: Numbers
     """In the replies that the instruction requests."""
+    reply: Numbers
+    """The answer, an index in the replies; -1: it is missing."""
     loss: Numbers
     """A Loss each."""
     broken: Flags
     """Bytes that belong to no intact packet came in its place; always False where the loss is not its own."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Late:
+class Late(NamedTuple):
     """Intact replies that came after they were given up; shape (late replies,)."""
 
-    bus: Numbers
-    servo_id: Numbers
-    """254: those of several in one fast status."""
+    servo: Numbers
+    """ID 254: those of several in one fast status."""
     exchange: Numbers
     """The newest one that lacks it; -1: that is not among these."""
     at_ns: Numbers
@@ -160,29 +189,25 @@ class Late:
 class Pairing:
     """Pairs slice by slice, in memory that does not grow with the log; keeps what may not be in order yet."""
 
-    def __init__(self) -> None:
-        self._buses: tuple[LoggedBus, ...] | None = None
-        self._waiting: list[PacketColumns] = []
-        self._requests = [LoggedRequest(), *(LoggedRequest((servo_id,)) for servo_id in range(_IDS))]
-        """No servo, then each by itself, then as found."""
-        self._known: dict[bytes, int] = {}
-        self._free_ns: list[int] = []
-        """When the line of each bus has carried all that was sent."""
-
-    @property
-    def buses(self) -> tuple[LoggedBus, ...]:
+    def __init__(self, buses: tuple[LoggedBus, ...] = ()) -> None:
+        """`buses`: of the log; without them those of the first slice."""
+        self.buses = buses
         """The buses of the log, with what its plan says about them."""
-        return self._buses or ()
+        self._waiting: list[PacketColumns] = []
+        self._requests = _ALONE
+        self._known: dict[bytes, int] = {}
+        self._free_ns = np.zeros(len(buses), np.int64)
+        """When the line of each bus has carried all that was sent."""
 
     def take(self, log: Log) -> Exchanges | None:
         """Take the packets of the next slice. Return exchanges that are certain to be whole.
 
         Raises LogError when a packet cannot be read.
         """
-        if self._buses is None:
+        if not self.buses:
             planned = plan_of(log).by_name
-            self._buses = tuple(planned.get(name, LoggedBus(name)) for name in log.buses)
-            self._free_ns = [0] * len(self._buses)
+            self.buses = tuple(planned.get(name, LoggedBus(name)) for name in log.buses)
+            self._free_ns = np.zeros(len(self.buses), np.int64)
         if not len(log.packets):
             return None
         self._waiting.append(log.packets)
@@ -193,16 +218,11 @@ class Pairing:
         certain = packets.first_ns < newest_ns - DISORDER_NS
         # the last instruction of each bus is held: its replies may still come
         instructions = np.flatnonzero(certain & (packets.kind == PacketKind.INSTRUCTION))
-        last = np.full(_IDS, len(packets), np.int64)
+        last = np.full(IDS, len(packets), np.int64)
         last[packets.bus[instructions]] = instructions
         certain &= np.arange(len(packets)) < last[packets.bus]
         self._waiting = [packets.take(~certain).compact()]
-        return self._paired(packets.take(certain), np.zeros(len(self.buses), np.bool_))
-
-    def pair(self, packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Exchanges:
-        """Return the exchanges of some packets alone, as if each was ended; not to be mixed with `take`."""
-        self._buses, self._free_ns = buses, [0] * len(buses)
-        return self._paired(packets, np.zeros(len(buses), np.bool_))
+        return self._paired(packets.take(certain))
 
     def finish(self) -> Exchanges | None:
         """Return the exchanges that are left."""
@@ -210,49 +230,49 @@ class Pairing:
             return None
         packets = ordered(PacketColumns.joined(self._waiting))
         self._waiting = []
-        return self._paired(packets, np.ones(len(self.buses), np.bool_))
+        return self._paired(packets, final=True)
 
-    def _paired(self, packets: PacketColumns, final: Flags) -> Exchanges:
-        count = len(self.buses)
+    def alone(self, packets: PacketColumns) -> Exchanges:
+        """Return the exchanges of some packets as if nothing was before them, and each was ended."""
+        self._free_ns[:] = 0
+        return self._paired(packets)
+
+    def _paired(self, packets: PacketColumns, *, final: bool = False) -> Exchanges:
+        """Return the exchanges of the next packets, bus by bus in order of time; `final`: none come after."""
+        count, kind = len(self.buses), packets.kind
         bus = packets.bus.astype(np.int64)
-        kind = packets.kind
         instructs = kind == PacketKind.INSTRUCTION
-        exchange = np.cumsum(instructs) + bus
-        rows = np.flatnonzero(instructs)
-        heads = np.concatenate([[0], np.cumsum(np.bincount(bus[rows], minlength=count))])[:-1]
-        heads += np.arange(count)
-        size = len(rows) + count
+        exchange, rows = np.cumsum(instructs) + bus, np.flatnonzero(instructs)
+        at, size = exchange[rows], len(rows) + count
+        heads = np.searchsorted(bus[rows], np.arange(count)) + np.arange(count)
         of_bus = np.repeat(np.arange(count), np.diff(np.append(heads, size)))
-        at = exchange[rows]
-        request, asked_ns, sent_ns, cycle = (np.zeros(size, np.int64) for _ in range(4))
+        rates = np.array([one.baud_rate for one in self.buses], np.int64)[bus]
+        delays = np.array([one.return_delay_ns for one in self.buses], np.int64)[bus]
+        wire_ns = np.where(rates > 0, packets.length * _BYTE_NS // np.maximum(rates, 1), 0)
+        request, asked_ns, blocked_ns, sent_ns, cycle = (np.zeros(size, np.int64) for _ in range(5))
         request[at] = self._requested(packets.take(rows))
         asked_ns[at] = packets.first_ns[rows]
+        took_ns = packets.last_ns[rows] - packets.first_ns[rows]
+        blocked_ns[at] = np.where(rates[rows] > 0, np.maximum(took_ns - wire_ns[rows], 0), 0)
         cycle[heads], cycle[at] = -1, packets.cycle[rows]
-        wire_ns = self._wire_ns(bus, packets.length)
-        for index, head in enumerate(heads.tolist()):
-            mine = rows[bus[rows] == index]
-            sent_ns[head] = self._free_ns[index]
-            free = _free_ns(packets.first_ns[mine], wire_ns[mine], self._free_ns[index])
-            sent_ns[head + 1 : head + 1 + len(free)] = free
-            self._free_ns[index] = int(free[-1]) if len(free) else self._free_ns[index]
+        sent_ns[heads] = self._free_ns
+        for mine in np.split(np.arange(size), heads[1:]):
+            sent = rows[mine[1:] - of_bus[mine[0]] - 1]
+            sent_ns[mine[1:]] = _free_ns(packets.first_ns[sent], wire_ns[sent], sent_ns[mine[0]])
+        self._free_ns = sent_ns[np.append(heads[1:], size) - 1]
         ended = np.ones(size, np.bool_)
-        ended[(np.append(heads[1:], size) - 1)[final]] = False
-        noise = kind == PacketKind.NOISE
+        ended[np.append(heads[1:], size) - 1] = not final
+        noise = np.flatnonzero(kind == PacketKind.NOISE)
         noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
-        places = np.full((len(self._requests), _IDS), -1, np.int64)
-        for index, each in enumerate(self._requests):
-            places[index, list(each.servo_ids[::-1])] = np.arange(len(each.servo_ids))[::-1]
-        replies = self._replies(packets, exchange, wire_ns, request, sent_ns, places >= 0)
-        missing = self._missing(request, replies, noise_bytes)
-        blocks, block_ids = self._late_blocks(packets, exchange, request, asked_ns, of_bus, missing)
-        np.subtract.at(noise_bytes, exchange[blocks], packets.length[blocks])
-        missing.broken[noise_bytes[missing.exchange] <= 0] = False
-        whole = np.flatnonzero(kind == PacketKind.LATE)
-        ids = np.concatenate([packets.servo_id[whole].astype(np.int64), block_ids])
-        late = self._late(packets, np.concatenate([whole, blocks]), ids, exchange, sent_ns, of_bus, missing)
+        replies = self._replies(packets, exchange, wire_ns, delays, request, sent_ns)
+        due = self._due(of_bus, request, replies, noise_bytes)
+        blocks, block_ids = self._late_blocks(packets.take(noise), exchange[noise], request, asked_ns, due)
+        np.subtract.at(noise_bytes, exchange[noise[blocks]], packets.length[noise[blocks]])
+        due.broken[noise_bytes[due.exchange] <= 0] = False
+        late = np.append(np.flatnonzero(kind == PacketKind.LATE), noise[blocks])
+        ids = np.append(packets.servo_id[late[: len(late) - len(blocks)]], block_ids)
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
-        echoes = np.concatenate([bus[others[back]], bus[kind == PacketKind.ECHO]])
         return Exchanges(
             self.buses,
             self._requests,
@@ -260,22 +280,18 @@ class Pairing:
             cycle,
             request,
             asked_ns,
+            blocked_ns,
             sent_ns,
+            _last_ns(sent_ns, replies),
             ended,
             noise_bytes,
             replies,
-            missing,
-            late,
+            due,
+            _late(bus[late] * IDS + ids, exchange[late], packets.last_ns[late], sent_ns, due),
             packets.take(others[~back]),
-            echoes,
-            packets.take(np.flatnonzero(noise)),
-            places >= 0,
-            places,
+            np.append(bus[others[back]], bus[kind == PacketKind.ECHO]),
+            packets.take(noise),
         )
-
-    def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
-        rates = np.array([plan.baud_rate for plan in self.buses], np.int64)
-        return np.where(rates[bus] > 0, length * _BYTE_NS // np.maximum(rates[bus], 1), 0)
 
     def _requested(self, packets: PacketColumns) -> Numbers:
         """Return which request each instruction is."""
@@ -290,33 +306,33 @@ class Pairing:
             text = packets.data[packets.start[rows][:, None] + np.arange(length)]
             mixed = text.astype(np.uint64) @ _MIXED[:length]
             _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-            found[rows] = np.array([self._index(text[row].tobytes()) for row in first.tolist()])[inverse]
+            index = [
+                self._known.setdefault(text[row].tobytes(), len(_ALONE.kinds) + len(self._known))
+                for row in first.tolist()
+            ]
+            found[rows] = np.array(index)[inverse]
+        new = tuple(self._known)[len(self._requests.kinds) - len(_ALONE.kinds) :]
+        if new:
+            self._requests = self._requests.and_more(tuple(map(request_of, new)))
         return found
-
-    def _index(self, data: bytes) -> int:
-        index = self._known.get(data)
-        if index is None:
-            index = self._known[data] = len(self._requests)
-            self._requests.append(request_of(data))
-        return index
 
     def _replies(  # noqa: PLR0917  columns of one table
         self,
         packets: PacketColumns,
         exchange: Numbers,
         wire_ns: Numbers,
+        delays: Numbers,
         request: Numbers,
         sent_ns: Numbers,
-        asks: Flags,
     ) -> Replies:
         late = (packets.kind == PacketKind.LATE) & (packets.servo_id != BROADCAST_ID)
         rows = np.flatnonzero((packets.kind == PacketKind.STATUS) | late)
         status = packets.take(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
-        delay = np.array([plan.return_delay_ns for plan in self.buses], np.int64)[status.bus]
-        spent = np.cumsum(wire + delay)
+        took = wire + delays[rows]
+        spent = np.cumsum(took)
         begins = np.flatnonzero(np.diff(of, prepend=-1))
-        earlier = np.repeat(spent[begins] - (wire + delay)[begins], np.diff(np.append(begins, len(of))))
+        earlier = np.repeat(spent[begins] - took[begins], np.diff(np.append(begins, len(of))))
         due_ns = sent_ns[of] + spent - earlier
         before_ns = np.empty(len(of), np.int64)
         before_ns[1:] = last_ns[:-1]
@@ -324,132 +340,109 @@ class Pairing:
         second = _second(status)
         joint = second & (status.servo_id == BROADCAST_ID)
         row = np.flatnonzero(~joint)
-        servo_id = status.servo_id[row].astype(np.int64)
-        error = np.where(second, status.byte(8), status.byte(4))[row].astype(np.int64)
+        servo_id, error = status.servo_id[row], np.where(second, status.byte(8), status.byte(4))[row]
         if joint.any():
             pieces = [(row, np.zeros(len(row), np.int64), servo_id, error)]
             pieces += self._blocks(status, np.flatnonzero(joint), request[of])
             row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
             order = np.lexsort((number, row))
             row, servo_id, error = row[order], servo_id[order], error[order]
+        place = self._requests.places[request[of[row]], servo_id]
         return Replies(
             of[row],
-            servo_id,
-            error,
+            status.bus[row].astype(np.int64) * IDS + servo_id,
+            place,
+            error.astype(np.int64),
             np.where(second, 2, 1)[row],
             wire[row],
             last_ns[row],
             before_ns[row],
             due_ns[row],
-            _answers(of[row], servo_id, asks[request[of[row]], servo_id] & ~late[rows][row]),
+            (place >= 0) & ~late[rows[row]],
         )
 
     def _blocks(
         self, status: PacketColumns, rows: Numbers, request: Numbers
-    ) -> list[tuple[Numbers, Numbers, Numbers, Numbers]]:
+    ) -> list[tuple[Numbers, Numbers, NDArray[np.uint8], NDArray[np.uint8]]]:
         """Return the replies in fast status packets: row, number of the block, servo, error byte."""
         pieces = []
         for index in np.unique(request[rows]).tolist():
             mine = rows[request[rows] == index]
             packets = status.take(mine)
             at = _HEAD_2
-            for number, size in enumerate(self._requests[index].sizes):  # a block: error, ID, data, CRC
+            for number, size in enumerate(self._requests.kinds[index].sizes):  # a block: error, ID, data, CRC
                 there = at + size + 4 <= packets.length  # one that was cut has its intact blocks
-                piece = (
-                    mine[there],
-                    np.full(int(there.sum()), number, np.int64),
-                    packets.byte(at + 1)[there].astype(np.int64),
-                    packets.byte(at)[there].astype(np.int64),
-                )
-                pieces.append(piece)
+                numbers = np.full(int(there.sum()), number, np.int64)
+                pieces.append((mine[there], numbers, packets.byte(at + 1)[there], packets.byte(at)[there]))
                 at += size + 4
         return pieces
 
-    def _missing(self, request: Numbers, replies: Replies, noise: Numbers) -> Missing:
-        answered_by = np.bincount(replies.exchange[replies.answers], minlength=len(request))
-        local = np.full(len(request), -1, np.int64)
-        place = np.full(_IDS, -1, np.int64)
-        parts = [(*np.zeros((4, 0), np.int64), np.zeros(0, np.bool_))]
-        for index in np.unique(request).tolist():
-            ids = np.array(list(dict.fromkeys(self._requests[index].servo_ids)), np.int64)
-            rows = np.flatnonzero((request == index) & (answered_by < len(ids)))
-            if not len(rows):
-                continue
-            local[rows], place[ids] = np.arange(len(rows)), np.arange(len(ids))
-            mine = np.flatnonzero(replies.answers & (local[replies.exchange] >= 0))
-            missing = np.ones((len(rows), len(ids)), np.bool_)
-            missing[local[replies.exchange[mine]], place[replies.servo_id[mine]]] = False
-            local[rows] = -1
-            row, at = np.nonzero(missing)
-            loss = np.where(at == missing.argmax(axis=1)[row], Loss.OWN, Loss.BEHIND)
-            if len(ids) > 1:
-                loss[missing.sum(axis=1)[row] == len(ids)] = Loss.LINE
-            parts.append((rows[row], ids[at], at, loss, (loss == Loss.OWN) & (noise[rows[row]] > 0)))
-        exchange, servo_id, at, loss, broken = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Missing(exchange, servo_id, at, loss, broken)
+    def _due(self, bus: Numbers, request: Numbers, replies: Replies, noise: Numbers) -> Due:
+        count = self._requests.servos[request]
+        exchange, begin = np.repeat(np.arange(len(request)), count), np.cumsum(count) - count
+        place = np.arange(len(exchange)) - begin[exchange]
+        servo_id = self._requests.ids[request[exchange], place - count[exchange]]
+        reply = np.full(len(exchange), -1, np.int64)
+        rows = np.flatnonzero(replies.answers)[::-1]  # of several replies of a servo the first counts
+        reply[begin[replies.exchange[rows]] + replies.place[rows]] = rows
+        replies.answers[:] = False
+        replies.answers[reply[reply >= 0]] = True
+        loss, missing = np.full(len(exchange), Loss.NONE, np.int64), np.flatnonzero(reply < 0)
+        loss[missing] = np.where(np.diff(exchange[missing], prepend=-1) > 0, Loss.OWN, Loss.BEHIND)
+        silent = (np.bincount(exchange[missing], minlength=len(request)) == count) & (count > 1)
+        loss[silent[exchange]] = Loss.LINE
+        broken = (loss == Loss.OWN) & (noise[exchange] > 0)
+        return Due(exchange, bus[exchange] * IDS + servo_id, place, reply, loss, broken)
 
-    def _late_blocks(  # noqa: PLR0917  columns of one table
-        self,
-        packets: PacketColumns,
-        exchange: Numbers,
-        request: Numbers,
-        asked_ns: Numbers,
-        of_bus: Numbers,
-        missing: Missing,
-    ) -> tuple[Numbers, Numbers]:
+    def _late_blocks(
+        self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: Due
+    ) -> tuple[Numbers, NDArray[np.uint8]]:
         """Return bytes that are the block that a fast status packet lacks, come later; and its ID."""
-        rows = np.flatnonzero(packets.kind == PacketKind.NOISE)
-        fast = np.array([one.fast for one in self._requests])
-        lacks = np.flatnonzero((missing.loss == Loss.OWN) & fast[request[missing.exchange]])
-        if not len(rows) or not len(lacks):
-            return rows[:0], rows[:0]
-        lacks = lacks[np.argsort(missing.exchange[lacks])]
-        at = np.searchsorted(missing.exchange[lacks], exchange[rows]) - 1
-        rows, lacks = rows[at >= 0], lacks[at[at >= 0]]
-        of, noise = missing.exchange[lacks], packets.take(rows)
-        sizes = [self._requests[request[one]].sizes for one in of.tolist()]
-        size = np.array(
-            [some[place] for some, place in zip(sizes, missing.place[lacks], strict=True)], np.int64
-        )
+        lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.fast[request[due.exchange]])
+        at = np.searchsorted(due.exchange[lacks], exchange) - 1
+        rows = np.flatnonzero(at >= 0)
+        lacks, noise = lacks[at[rows]], noise.take(rows)
+        of, kinds = due.exchange[lacks], self._requests.kinds
+        size = [
+            kinds[index].sizes[place]
+            for index, place in zip(request[of].tolist(), due.place[lacks].tolist(), strict=True)
+        ]
         waited_ns = noise.first_ns - asked_ns[of]
-        found = (noise.byte(1) == missing.servo_id[lacks]) & (noise.length == size + 4)
+        found = noise.bus.astype(np.int64) * IDS + noise.byte(1) == due.servo[lacks]
+        found &= noise.length == np.array(size, np.int64) + 4
         found &= (waited_ns >= 0) & (waited_ns < _LATEST_NS)
-        found &= of_bus[of] == noise.bus
-        return rows[found], missing.servo_id[lacks][found]
+        return rows[found], noise.byte(1)[found]
 
-    @staticmethod
-    def _late(  # noqa: PLR0917  columns of one table
-        packets: PacketColumns,
-        rows: Numbers,
-        servo_id: Numbers,
-        exchange: Numbers,
-        sent_ns: Numbers,
-        bus: Numbers,
-        missing: Missing,
-    ) -> Late:
-        """Match late replies to the exchanges that lack them, and note them there."""
-        at_ns = packets.last_ns[rows]
-        # of a fast status the first of its servos stands for all
-        whole = np.flatnonzero((missing.loss == Loss.LINE) & (missing.place == 0))
-        each = np.arange(len(missing.exchange))
-        index = np.concatenate([each, whole])
-        lacks = missing.exchange[index]
-        of = np.concatenate([missing.servo_id, np.full(len(whole), BROADCAST_ID)])
-        keys = ((bus[lacks] * _IDS + of) << _ROWS) + lacks
-        order = np.argsort(keys)
-        key = ((packets.bus[rows].astype(np.int64) * _IDS + servo_id) << _ROWS) + exchange[rows]
-        at = np.searchsorted(keys[order], key, side="right") - 1
-        known = at >= 0
-        known[known] = keys[order][at[known]] >> _ROWS == key[known] >> _ROWS
-        found = np.full(len(rows), -1, np.int64)
-        found[known] = lacks[order][at[known]]
-        missing.loss[index[order][at[known]]] = Loss.LATE
-        missing.loss[
-            (missing.loss == Loss.LINE) & np.isin(missing.exchange, found[servo_id == BROADCAST_ID])
-        ] = Loss.LATE
-        missing.broken[missing.loss == Loss.LATE] = False
-        late_ns = np.where(known, at_ns - sent_ns[found], 0) if len(found) else found
-        return Late(packets.bus[rows].astype(np.int64), servo_id, found, at_ns, late_ns)
+
+def _last_ns(sent_ns: Numbers, replies: Replies) -> Numbers:
+    last_ns = sent_ns.copy()
+    begins = np.flatnonzero(np.diff(replies.exchange, prepend=-1))
+    if len(begins):
+        of = replies.exchange[begins]
+        last_ns[of] = np.maximum(sent_ns[of], np.maximum.reduceat(replies.last_ns, begins))
+    return last_ns
+
+
+def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, due: Due) -> Late:
+    """Match late replies to the exchanges that lack them, and note them there."""
+    missing = np.flatnonzero(due.reply < 0)
+    # of a fast status the first of its servos stands for all
+    whole = np.flatnonzero((due.loss == Loss.LINE) & (due.place == 0))
+    index = np.append(missing, whole)
+    of = np.append(due.servo[missing], due.servo[whole] // IDS * IDS + BROADCAST_ID)
+    keys = (of << _ROWS) + due.exchange[index]
+    order = np.argsort(keys)
+    keys, index = keys[order], index[order]
+    at = np.searchsorted(keys, (servo << _ROWS) + exchange, side="right") - 1
+    known = at >= 0
+    known[known] = keys[at[known]] >> _ROWS == servo[known]
+    found = np.full(len(servo), -1, np.int64)
+    found[known] = due.exchange[index[at[known]]]
+    due.loss[index[at[known]]] = Loss.LATE
+    all_late = np.isin(due.exchange, found[servo % IDS == BROADCAST_ID])
+    due.loss[all_late & (due.loss == Loss.LINE)] = Loss.LATE
+    due.broken[due.loss == Loss.LATE] = False
+    return Late(servo, found, at_ns, np.where(known, at_ns - sent_ns[found], 0))
 
 
 def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Numbers) -> Flags:
@@ -464,16 +457,7 @@ def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Num
     return np.array(found, np.bool_)
 
 
-def _answers(of: Numbers, servo_id: Numbers, awaited: Flags) -> Flags:
-    """Return which replies are the first of their servos in their exchanges that are `awaited`."""
-    rows = np.flatnonzero(awaited)
-    _, first = np.unique(of[rows] * _IDS + servo_id[rows], return_index=True)
-    answers = np.zeros(len(of), np.bool_)
-    answers[rows[first]] = True
-    return answers
-
-
-def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: int) -> Numbers:
+def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: np.int64) -> Numbers:
     """Return when a line has carried each instruction: one begins when it is written and the line is free."""
     sent = np.cumsum(wire_ns)
     begin: Numbers = np.maximum(np.maximum.accumulate(first_ns - sent + wire_ns), free_ns)
@@ -514,7 +498,7 @@ def request_of(data: bytes) -> LoggedRequest:
     fast = code in _FAST
     if code in (_SYNC_READ, _FAST_SYNC_READ):
         sizes = (int.from_bytes(body[2:4], "little"),) * len(body[4:])
-        return LoggedRequest(tuple(body[4:]), sizes, fast)
+        return LoggedRequest(tuple(dict.fromkeys(body[4:])), sizes, fast)
     return _entries(body, 5, 0, fast=fast) if code in (_BULK_READ, _FAST_BULK_READ) else LoggedRequest()
 
 
@@ -522,7 +506,7 @@ def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
     """Return the servos of a bulk read: entries of `width` bytes, the ID at `at`, the size first or last."""
     entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
     sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
-    return LoggedRequest(tuple(entry[at] for entry in entries), tuple(sizes), fast)
+    return LoggedRequest(tuple(dict.fromkeys(entry[at] for entry in entries)), tuple(sizes), fast)
 
 
 def _byte(data: bytes, index: int) -> int:

@@ -12,9 +12,8 @@ import numpy as np
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
 
-_IDS = 256
 _FEWEST = 5
 """Late replies from which they are no chance."""
 _ALONE = 0.8
@@ -40,13 +39,12 @@ class LateReplies:
         """Take the late replies of some exchanges; `rows`: those that were complete, but late, at `at_ns`."""
         late, count = exchanges.late, len(exchanges.buses)
         if not len(self._longest_ns):
-            self._given_up = np.zeros(count * _IDS, np.int64)
+            self._given_up = np.zeros(count * IDS, np.int64)
             self._longest_ns, self._exchanges = np.zeros((2, count), np.int64)
         self._exchanges += np.bincount(exchanges.bus[exchanges.request > 0], minlength=count)
         came_late = ~_in_time(exchanges)
-        late_bus, late_at_ns = late.bus[came_late], late.at_ns[came_late]
-        keys = late_bus * _IDS + late.servo_id[came_late]
-        self._given_up += np.bincount(keys, minlength=count * _IDS)
+        late_bus, late_at_ns = late.servo[came_late] // IDS, late.at_ns[came_late]
+        self._given_up += np.bincount(late.servo[came_late], minlength=count * IDS)
         np.maximum.at(self._longest_ns, late_bus, late.late_ns[came_late])
         # without a rate it is not known when they are due
         known = np.array([bool(bus.baud_rate) for bus in exchanges.buses])
@@ -103,7 +101,7 @@ class LateReplies:
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
         """Name the servo or the bus whose replies came after they were given up."""
-        mine = self._given_up[index * _IDS : (index + 1) * _IDS]
+        mine = self._given_up[index * IDS : (index + 1) * IDS]
         total, servo_id = int(mine.sum()), int(np.argmax(mine)) if len(mine) else 0
         if total < _FEWEST:
             return ()
@@ -132,9 +130,11 @@ def _in_time(exchanges: Exchanges) -> Flags:
     They were given up for another reason, such as bytes that the line lost before them.
     """
     replies, late = exchanges.replies, exchanges.late
+    known = late.exchange >= 0
+    if not known.any():
+        return known
     of = replies.exchange[replies.answers]
-    longest_ns = np.zeros(len(exchanges.requests), np.int64)
+    longest_ns = np.zeros(len(exchanges.requests.kinds), np.int64)
     took_ns = replies.last_ns[replies.answers] - exchanges.sent_ns[of]
     np.maximum.at(longest_ns, exchanges.request[of], took_ns)
-    known = late.exchange >= 0
     return known & (late.late_ns <= longest_ns[exchanges.request[late.exchange]])

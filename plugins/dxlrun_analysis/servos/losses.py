@@ -28,10 +28,9 @@ from dxlrun.errors import counted
 from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Numbers
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss, Numbers
 from dxlrun_analysis.servos.joint_states import ANGLES, BIN_DEG, JointStates, Places, edge_rad
 
-_IDS = 256
 _ROWS = 40
 _EPISODE_NS = 200_000_000
 _WIDEST = 90 // BIN_DEG
@@ -90,7 +89,7 @@ class Losses:
         servos = len(states.joint_of)
         self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
         self._last_ns = np.full(servos, -(1 << 62), np.int64)
-        self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // _IDS), np.int64)
+        self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // IDS), np.int64)
         self._chains, self._broken_off, self._alone, self._lost_alone = np.zeros((4, servos), np.int64)
         """Reads of several servos, by the first; those of which nothing came; reads of one; lost ones."""
         self._answered = np.zeros(servos, np.int64)
@@ -102,32 +101,26 @@ class Losses:
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
         """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""
-        missing, replies = exchanges.missing, exchanges.replies
+        due, ended = exchanges.due, exchanges.ended[exchanges.due.exchange]
         # those that are a servo's own, and chains of which nothing came: they may be the first servo's
-        may_be = (missing.loss == Loss.OWN) | ((missing.loss == Loss.LINE) & (missing.place == 0))
-        rows = np.flatnonzero(exchanges.ended[missing.exchange] & may_be)
-        exchange, own = missing.exchange[rows], missing.loss[rows] == Loss.OWN
-        bus = exchanges.bus[exchange]
-        leads = np.array([one.servo_ids[0] if one.servo_ids else -1 for one in exchanges.requests])
-        several = np.array([len(one.servo_ids) > 1 for one in exchanges.requests], np.bool_)[
-            exchanges.request
-        ]
-        head = exchanges.bus * _IDS + leads[exchanges.request]
-        asked = exchanges.ended & (leads[exchanges.request] >= 0)
-        servo = bus * _IDS + missing.servo_id[rows]
+        may_be = (due.loss == Loss.OWN) | ((due.loss == Loss.LINE) & (due.place == 0))
+        rows = np.flatnonzero(ended & may_be)
+        exchange, servo, own = due.exchange[rows], due.servo[rows], due.loss[rows] == Loss.OWN
+        bus, count = servo // IDS, exchanges.requests.servos[exchanges.request]
+        several, asked = count > 1, exchanges.ended & (count > 0)
+        head = np.zeros(len(count), np.int64)
+        head[due.exchange[due.place == 0]] = due.servo[due.place == 0]
         # those up to the first missing one could have answered
-        first = np.full(len(exchanges.request), _IDS, np.int64)
-        first[exchange] = missing.place[rows]
-        place = exchanges.places[exchanges.request[replies.exchange], replies.servo_id]
-        could = replies.answers & exchanges.ended[replies.exchange] & (place < first[replies.exchange])
-        could_servo = exchanges.bus[replies.exchange[could]] * _IDS + replies.servo_id[could]
+        first = np.full(len(count), IDS, np.int64)
+        first[exchange] = due.place[rows]
+        could = ended & (due.reply >= 0) & (due.place < first[due.exchange])
         begins = self._begins(exchanges, servo, exchange)
         for counts, servos in (
             (self._chains, head[asked & several]),
             (self._broken_off, head[exchange[~own]]),
             (self._alone, head[asked & ~several]),
             (self._lost_alone, head[exchange[own & ~several[exchange]]]),
-            (self._asked, np.append(could_servo, servo[own])),
+            (self._asked, np.append(due.servo[could], servo[own])),
             (self._lost, servo[own]),
             (self._episodes, servo[begins & own]),
             (self._line_episodes, bus[begins]),
@@ -136,17 +129,16 @@ class Losses:
         ):
             np.add(counts, np.bincount(servos, minlength=len(counts)), out=counts)
         begun = begins & own & (self._states.joint_of[servo] >= 0)
-        columns = (bus[begun], exchanges.asked_ns[exchange[begun]], missing.servo_id[rows][begun])
+        columns = (bus[begun], exchanges.asked_ns[exchange[begun]], servo[begun] % IDS)
         at = list(zip(*(column.tolist() for column in columns), strict=True))
         self._episodes_at += at[: _MOST_EPISODES - len(self._episodes_at)]
         self._count_angles(servo, exchanges.cycle[exchange], begins, places)
 
     def _begins(self, exchanges: Exchanges, servo: Numbers, exchange: Numbers) -> NDArray[np.bool_]:
         """Return which losses begin an episode: its servo has answered since the last, a while ago."""
-        replies = exchanges.replies
-        answers = replies.exchange[replies.answers]
-        answered = exchanges.bus[answers] * _IDS + replies.servo_id[replies.answers]
-        keys = np.sort((answered << _ROWS) + answers)
+        due = exchanges.due
+        answered, answers = due.servo[due.reply >= 0], due.exchange[due.reply >= 0]
+        keys = np.sort((answered << _ROWS) + answers) if len(servo) else answers
         before = np.searchsorted(keys, (servo << _ROWS) + exchange) - np.searchsorted(keys, servo << _ROWS)
         before += self._answered[servo]
         self._answered += np.bincount(answered, minlength=len(self._answered))
@@ -181,7 +173,7 @@ class Losses:
                 angles = concentration(
                     self._states.time_ns[row, :ANGLES], self._begun[row], self._lost_at[row]
                 )
-            found[divmod(servo, _IDS)] = ServoLosses(
+            found[divmod(servo, IDS)] = ServoLosses(
                 int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
             )
         return found
@@ -204,7 +196,7 @@ class Losses:
             losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
         loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
         for servo_id, angles in loose.items():
-            where = self._states.range_text(index * _IDS + servo_id, angles.low, angles.high)
+            where = self._states.range_text(index * IDS + servo_id, angles.low, angles.high)
             name = names.get(servo_id, "")
             yield Finding(
                 "loose_cable",
@@ -285,7 +277,7 @@ class Losses:
 
         The line would spoil instructions to single servos, too, two fifths as often as they are shorter [i].
         """
-        ids = slice(index * _IDS, (index + 1) * _IDS)
+        ids = slice(index * IDS, (index + 1) * IDS)
         chains, broken_off, alone, lost = (
             each[ids] for each in (self._chains, self._broken_off, self._alone, self._lost_alone)
         )
@@ -322,7 +314,7 @@ class Losses:
         found = Counter(servo_id for cluster in several for servo_id in cluster)
         members = {servo_id for servo_id, count in found.items() if count >= _TOGETHER * len(several)}
         others = sum(count for servo_id, count in found.items() if servo_id not in members)
-        all_of_bus = np.count_nonzero(self._states.joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
+        all_of_bus = np.count_nonzero(self._states.joint_of[index * IDS : (index + 1) * IDS] >= 0)
         named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
         return (tuple(sorted(members)), len(several)) if named else ((), 0)
 
@@ -330,9 +322,8 @@ class Losses:
 def _noisy(exchanges: Exchanges) -> NDArray[np.bool_]:
     """Return exchanges with bytes that are no packet; in an incomplete fast status they are cut blocks."""
     complete = np.ones(len(exchanges.request), np.bool_)
-    complete[exchanges.missing.exchange] = False
-    fast = np.array([request.fast for request in exchanges.requests], np.bool_)
-    noisy: NDArray[np.bool_] = complete | (exchanges.request == 0) | ~fast[exchanges.request]
+    complete[exchanges.due.exchange[exchanges.due.reply < 0]] = False
+    noisy: NDArray[np.bool_] = complete | ~exchanges.requests.fast[exchanges.request]
     return noisy & (exchanges.noise > 0)
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import counted
 from dxlrun.log.columns import PacketColumns
+from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Loss, Numbers, instruction_of
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Loss, Numbers, instruction_of
 
-_IDS = 256
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits."""
 _MOST_NAMED = 3
@@ -40,13 +40,13 @@ class OtherHosts:
 
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
-        others, missing = exchanges.others, exchanges.missing
-        self._sent.take(others.bus.astype(np.int64), instruction_of(others) * _IDS + others.servo_id)
+        others, due = exchanges.others, exchanges.due
+        self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
         self._stray.take(stray.bus.astype(np.int64), np.zeros(len(stray), np.int64))
         self._pieces.take(*_ends(stray, second[stray.bus]))
-        lost = exchanges.bus[missing.exchange[(missing.loss == Loss.OWN) | (missing.loss == Loss.LINE)]]
+        lost = exchanges.bus[due.exchange[(due.loss == Loss.OWN) | (due.loss == Loss.LINE)]]
         for counts, buses in (
             (self._lost, lost),
             (self._echoes, exchanges.echoes),
@@ -87,10 +87,10 @@ class OtherHosts:
         total = int(counts.sum())
         if total < _FEWEST:
             return ()
-        instructions = values // _IDS
+        instructions = values // IDS
         codes = sorted(set(instructions.tolist()), key=lambda code: -int(counts[instructions == code].sum()))
         kinds = [
-            f"{_name(bus, code)} of {_ids((values[instructions == code] % _IDS).tolist())}"
+            f"{_name(bus, code)} of {_ids((values[instructions == code] % IDS).tolist())}"
             for code in codes[:_MOST_NAMED]
         ]
         if len(codes) > _MOST_NAMED:
@@ -123,13 +123,13 @@ def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
     total = from_end(1)
     for length in range(2, _LONGEST):  # of what is behind the length
         total += from_end(length)
-        code, servo_id = from_end(length), np.where(second, from_end(length + 3), ~(total + length) % _IDS)
+        code, servo_id = from_end(length), np.where(second, from_end(length + 3), ~(total + length) % IDS)
         known = (code == _PING) & (length == 2 + second) | (code == _READ) & (length == 4 + 3 * second)
         known |= (code == _WRITE) & (length >= 4 + 2 * second) | (code == _SYNC_WRITE) & (length >= 7)
         known |= (code == _BULK_READ) & (length >= 6)
-        of_size = np.where(second, from_end(length + 2) + _IDS * from_end(length + 1), from_end(length + 1))
+        of_size = np.where(second, from_end(length + 2) + IDS * from_end(length + 1), from_end(length + 1))
         rows = np.flatnonzero(known & (of_size == length) & (servo_id <= BROADCAST_ID))
-        parts.append((stray.bus[rows].astype(np.int64), code[rows] * _IDS + servo_id[rows]))
+        parts.append((stray.bus[rows].astype(np.int64), code[rows] * IDS + servo_id[rows]))
     buses, values = (np.concatenate(part) for part in zip(*parts, strict=True))
     return buses, values
 

@@ -27,13 +27,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dxlrun.errors import counted
+from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, has_them_alone, median, quantile
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
 from dxlrun_analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
 
-_IDS = 256
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
 """Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone
 after a rest of the line, or right behind an exchange."""
@@ -104,31 +104,31 @@ class ReplyTimes:
         count = len(replies.exchange)
         if not count:
             return
-        asked = np.array([0 if one.fast else len(one.servo_ids) for one in exchanges.requests], np.int64)
-        place = exchanges.places
-        request = exchanges.request[replies.exchange]
+        requests = exchanges.requests
+        asked = np.where(requests.fast, 0, requests.servos)[exchanges.request]
         first = np.flatnonzero(np.diff(replies.exchange, prepend=-1))
         number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
         own_ns = replies.last_ns - replies.before_ns - replies.wire_ns
         together = (number > 0) & (own_ns < -(replies.wire_ns // 2))
         followed = np.append(together[1:], False)
-        in_turn = replies.answers & (place[request, replies.servo_id] == number)
-        known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
-        of = replies.exchange[known]
-        kinds = np.where(asked[exchanges.request] == 1, np.where(rested(exchanges), _RESTED, _NEXT), _FIRST)
+        in_turn = replies.answers & (replies.place == number)
+        known = np.flatnonzero(in_turn & (asked[replies.exchange] > 0) & ~together & ~followed)
+        of, servo = replies.exchange[known], replies.servo[known]
+        kinds = np.where(asked == 1, np.where(rested(exchanges), _RESTED, _NEXT), _FIRST)
         kinds[_first_of_cycle(exchanges)] = _FIRST
         kind = np.where(number[known] == 0, kinds[of], _CHAINED)
-        servo = exchanges.bus[of] * _IDS + replies.servo_id[known]
         self._own_us.take(servo * len(_KINDS) + kind, own_ns[known] // 1000)
         late = exchanges.late
-        given_up = np.flatnonzero((late.exchange >= 0) & (late.servo_id != BROADCAST_ID))
-        lacks, by = late.exchange[given_up], late.servo_id[given_up]
-        begun_ns = exchanges.sent_ns.copy()
-        np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
-        behind = place[exchanges.request[lacks], by] > 0
+        given_up = np.flatnonzero((late.exchange >= 0) & (late.servo % IDS != BROADCAST_ID))
+        lacks, by = late.exchange[given_up], late.servo[given_up]
+        begun_ns = exchanges.sent_ns
+        if len(lacks):
+            begun_ns = begun_ns.copy()
+            np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
+        behind = requests.places[exchanges.request[lacks], by % IDS] > 0
         self._take_places(
             exchanges.cycle[np.append(of, lacks)],
-            np.append(servo, exchanges.bus[lacks] * _IDS + by),
+            np.append(servo, by),
             np.append(kind, np.where(behind, _CHAINED, kinds[lacks])),
             np.append(own_ns[known], late.at_ns[given_up] - begun_ns[lacks]) // 1000,
             places,
@@ -140,7 +140,7 @@ class ReplyTimes:
         """Count the replies of some cycles, and the latest of the others, where their joints were."""
         compared = np.flatnonzero(kind != _FIRST)
         cycle, servo, kind, own_us = (each[compared] for each in (cycle, servo, kind, own_us))
-        like = (cycle * len(self._states.joint_of) + servo // _IDS) * len(_KINDS) + kind
+        like = (cycle * len(self._states.joint_of) + servo // IDS) * len(_KINDS) + kind
         order = np.lexsort((own_us, like))
         ends = np.searchsorted(like[order], like, side="right") - 1
         last, second = order[ends], order[ends - 1]
@@ -163,7 +163,7 @@ class ReplyTimes:
         places = self._places()
         servos = sorted({group // len(_KINDS) for group in self._own_us.groups})
         return {
-            divmod(each, _IDS): self._time(each, buses[each // _IDS], *places.get(each, (0, [])))
+            divmod(each, IDS): self._time(each, buses[each // IDS], *places.get(each, (0, [])))
             for each in servos
         }
 
@@ -173,14 +173,14 @@ class ReplyTimes:
         for group in self._own_us.groups:
             servo, kind = divmod(group, len(_KINDS))
             values = self._own_us.of(group)
-            if servo // _IDS == index and kind != _FIRST and values[1].sum() >= _FEWEST:
-                samples.setdefault(servo % _IDS, {})[kind] = values
+            if servo // IDS == index and kind != _FIRST and values[1].sum() >= _FEWEST:
+                samples.setdefault(servo % IDS, {})[kind] = values
         yield from _slow_servos(bus, samples)
 
     def somewhere(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
         """Name servos that answer later at some angles of their joint, or when hot, than elsewhere."""
         for servo, (kind, places) in self._places().items():
-            if servo // _IDS != index:
+            if servo // IDS != index:
                 continue
             angles = self._later(servo, kind, [at for at in places if at < ANGLES])
             heat = self._later(servo, kind, [at for at in places if at >= ANGLES])
@@ -193,7 +193,7 @@ class ReplyTimes:
             later = angles or heat
             if later is None:
                 continue
-            name, where = _name_of(bus, servo % _IDS)
+            name, where = _name_of(bus, servo % IDS)
             doubt = "; the log does not show which of the two it is" if len(causes) > 1 else ""
             yield Finding(
                 "slow_servo",
@@ -282,10 +282,8 @@ def _joined(parts: Iterable[_Values]) -> _Values:
 
 def rested(exchanges: Exchanges) -> Flags:
     """Return before which exchanges the line had carried nothing for a while, shape (exchanges,)."""
-    last_ns = exchanges.sent_ns.copy()
-    np.maximum.at(last_ns, exchanges.replies.exchange, exchanges.replies.last_ns)
-    found = np.ones(len(last_ns), np.bool_)
-    found[1:] = exchanges.asked_ns[1:] - last_ns[:-1] > _REST_NS
+    found = np.ones(len(exchanges.bus), np.bool_)
+    found[1:] = exchanges.asked_ns[1:] - exchanges.last_ns[:-1] > _REST_NS
     return found
 
 

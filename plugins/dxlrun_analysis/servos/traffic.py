@@ -12,18 +12,18 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.log.reader import Log
+from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
-from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Numbers, Pairing
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Numbers, Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested
 
-_IDS = 256
 _BYTES = 256
 LATE_US = 2000
 """An adapter that adds so much more than the plan expects is late."""
@@ -112,7 +112,7 @@ class Traffic:
 
     def _size(self, buses: int, states: JointStates) -> None:
         self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(states)
-        servos = buses * _IDS
+        servos = buses * IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
         self._late, self._alone = np.zeros((2, 2, servos), np.int64)
         """Of reads of one servo those that were late, and all; behind an exchange, and after a rest."""
@@ -136,7 +136,7 @@ class Traffic:
             size = np.bincount(kind, packets.length, self._packets.size)
             self._bytes += size.astype(np.int64).reshape(shape)
             sent = packets.kind == PacketKind.INSTRUCTION
-            servo = packets.bus[sent].astype(np.int64) * _IDS + packets.servo_id[sent]
+            servo = packets.bus[sent].astype(np.int64) * IDS + packets.servo_id[sent]
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
         exchanges = self._pairing.take(log)
         self._states.take(log)
@@ -146,13 +146,13 @@ class Traffic:
         """Return the traffic of each servo and of each bus."""
         self._count(self._pairing.finish(), final=True)
         addressed = self._instructions.copy()
-        addressed[BROADCAST_ID::_IDS] = 0
+        addressed[BROADCAST_ID::IDS] = 0
         servos = np.flatnonzero(self._seen | (addressed > 0)).tolist()
         plans = self._pairing.buses
         own, losses = self._reply_times.finish(plans), self._losses.finish()
         found = tuple(
             replace(
-                self._servo(servo), own=own.get(divmod(servo, _IDS)), losses=losses.get(divmod(servo, _IDS))
+                self._servo(servo), own=own.get(divmod(servo, IDS)), losses=losses.get(divmod(servo, IDS))
             )
             for servo in servos
         )
@@ -169,7 +169,7 @@ class Traffic:
             somewhere = tuple(self._reply_times.somewhere(index, plan))
             if index not in together:
                 if not somewhere and is_late(
-                    bus, len(plan.servos), self._late[:, index * _IDS : (index + 1) * _IDS].sum(axis=0)
+                    bus, len(plan.servos), self._late[:, index * IDS : (index + 1) * IDS].sum(axis=0)
                 ):
                     findings.append(_late_replies(bus))
                     continue
@@ -188,7 +188,7 @@ class Traffic:
     def _now_and_then(self, index: int, bus: BusTraffic, plan: LoggedBus) -> Iterable[Finding]:
         """Name the one servo that is late where it is asked alone; else the bus, where that is often."""
         names, moments = plan.names, self._late_replies.moments(index)
-        ids = slice(index * _IDS, (index + 1) * _IDS)
+        ids = slice(index * IDS, (index + 1) * IDS)
         late, asked = self._late[:, ids], self._alone[:, ids]
         one = int(np.argmax(late.sum(axis=0)))
         mine, others = late[:, one], late.sum(axis=1) - late[:, one]
@@ -227,38 +227,30 @@ class Traffic:
         self._losses.take(exchanges, places)
         self._broken.take(exchanges)
         self._others.take(exchanges)
-        count = len(self._asked)
-        replies, requests = exchanges.replies, len(exchanges.requests)
-        bus = exchanges.bus * requests + exchanges.request
-        asks = exchanges.asks.astype(np.int64)
-        asked = np.bincount(bus, minlength=count // _IDS * requests).reshape(-1, requests) @ asks
-        servo = exchanges.bus[replies.exchange] * _IDS + replies.servo_id
-        answered = np.bincount(servo[replies.answers], minlength=count)
+        count, due, replies = len(self._asked), exchanges.due, exchanges.replies
         # what is still open where the log ends may have been answered a moment later
-        last = np.flatnonzero(~exchanges.ended)
-        still = np.zeros((count // _IDS, _IDS), np.int64)
-        np.add.at(still, exchanges.bus[last], asks[exchanges.request[last]])
-        in_last = replies.answers & ~exchanges.ended[replies.exchange]
-        still_open = still.reshape(-1) - np.bincount(servo[in_last], minlength=count)
-        self._seen |= asked.reshape(-1) > 0
-        self._asked += asked.reshape(-1) - still_open
-        self._lost += asked.reshape(-1) - still_open - answered
-        self._replies += np.bincount(servo, minlength=count)
-        self._seen |= self._replies > 0
-        self._protocol[servo] = replies.protocol  # the last of each counts
-        errors = np.bincount(servo * _BYTES + replies.error, minlength=self._errors.size)
+        lost = (due.reply < 0) & exchanges.ended[due.exchange]
+        for counts, servo in (
+            (self._asked, due.servo[(due.reply >= 0) | lost]),
+            (self._lost, due.servo[lost]),
+            (self._replies, replies.servo),
+        ):
+            np.add(counts, np.bincount(servo, minlength=count), out=counts)
+        self._seen[due.servo] = self._seen[replies.servo] = True
+        self._protocol[replies.servo] = replies.protocol  # the last of each counts
+        errors = np.bincount(replies.servo * _BYTES + replies.error, minlength=self._errors.size)
         self._errors += errors.reshape(self._errors.shape)
-        took_ns = (replies.last_ns - exchanges.asked_ns[replies.exchange])[replies.answers]
-        self._reply_us.take(servo[replies.answers], took_ns // 1000)
-        np.maximum.at(self._reply_max_ns, servo[replies.answers], took_ns)
-        self._extra(exchanges, asks)
-
-    def _extra(self, exchanges: Exchanges, asks: Numbers) -> None:
-        """Count how much longer than wire and return delay each complete exchange took."""
-        replies = exchanges.replies
         answers = np.flatnonzero(replies.answers)
-        of, count = replies.exchange[answers], len(exchanges.request)
-        due = asks.sum(axis=1)[exchanges.request]
+        servo, of = replies.servo[answers], replies.exchange[answers]
+        took_ns = replies.last_ns[answers] - exchanges.asked_ns[of]
+        self._reply_us.take(servo, took_ns // 1000)
+        np.maximum.at(self._reply_max_ns, servo, took_ns)
+        self._extra(exchanges, of, answers)
+
+    def _extra(self, exchanges: Exchanges, of: Numbers, answers: Numbers) -> None:
+        """Count how much longer than wire and return delay each complete exchange took."""
+        replies, count = exchanges.replies, len(exchanges.request)
+        due = exchanges.requests.servos[exchanges.request]
         complete = (np.bincount(of, minlength=count) == due) & (due > 0)
         last = np.zeros(count, np.int64)
         last[of] = answers
@@ -274,12 +266,12 @@ class Traffic:
         self._late_replies.take(exchanges, in_time, replies.last_ns[last[in_time]])
         rows = np.concatenate([in_time, given_up[late_ns >= limits[exchanges.bus[given_up]]]])
         alone, after_rest = np.flatnonzero(due == 1), rested(exchanges).astype(np.int64)
-        servo = exchanges.bus * _IDS + np.argmax(asks, axis=1)[exchanges.request]
-        for counts, of in ((self._late, np.intersect1d(rows, alone)), (self._alone, alone)):
-            np.add.at(counts, (after_rest[of], servo[of]), 1)
+        servo = exchanges.bus * IDS + exchanges.requests.ids[exchanges.request, -1]
+        for counts, at in ((self._late, np.intersect1d(rows, alone)), (self._alone, alone)):
+            np.add.at(counts, (after_rest[at], servo[at]), 1)
 
     def _servo(self, index: int) -> ServoTraffic:
-        bus, servo_id = self._pairing.buses[index // _IDS], index % _IDS
+        bus, servo_id = self._pairing.buses[index // IDS], index % IDS
         names, devices = bus.names, {device.servo_id for device in bus.devices}
         errors = self._errors[index]
         found = {error for error in np.flatnonzero(errors).tolist() if error}
@@ -315,7 +307,7 @@ class Traffic:
         return BusTraffic(
             name=plan.name,
             instructions=packets[PacketKind.INSTRUCTION],
-            broadcasts=int(self._instructions[index * _IDS + BROADCAST_ID]),
+            broadcasts=int(self._instructions[index * IDS + BROADCAST_ID]),
             replies=packets[PacketKind.STATUS],
             noise_bytes=size[PacketKind.NOISE],
             bytes_out=size[PacketKind.INSTRUCTION],

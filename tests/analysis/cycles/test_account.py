@@ -12,6 +12,7 @@ from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.causes.account import Account
 from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import Pairing
 
 PERIOD = 10_000
 """us, as all times here."""
@@ -62,7 +63,7 @@ def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict
     for name, us in zip(NAMES, times, strict=True):
         cycle[name] = us * 1000
     cycle["long"] = True
-    account = Account(cycle, None, PacketColumns.of(packets), buses or (BUS,), ("head",))
+    account = Account(cycle, None, PacketColumns.of(packets), Pairing(buses or (BUS,)), ("head",))
     found = {(name.kind, name.bus, name.servo_id): ns / 1000 for name, ns in account.shares.items()}
     del found["own work", -1, -1]
     return found
