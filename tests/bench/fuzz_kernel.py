@@ -220,7 +220,7 @@ class Side:
 
     def prepare(self):
         """Plan the next cycle; return the reads of each bus, none where it is lost."""
-        self.hardware._plan_reads()
+        self._plan_reads()
         found = []
         for bus, servos in self.hardware._pairs:
             if bus.failure is not None:
@@ -234,6 +234,7 @@ class Side:
         """Change between two cycles what stays for many: modes, torque, limits, servos in the exchange; or
         lose a line.
         """
+        self.hardware._look = True
         _, servos = self.hardware._pairs[number]
         for index, loss in enumerate(servos.devices._losses):
             if loss is not None and not loss.probing and rng.random() < 0.7:
@@ -266,7 +267,7 @@ class Side:
         """Open the lines again that are lost; their servos take part at once. Returns how many they were."""
         hardware = self.hardware
         lost = [index for index, bus in enumerate(hardware._buses) if bus.failure is not None]
-        self.lines.back = True
+        self.lines.back = hardware._look = True
         hardware._reopen_lines()
         self.lines.back = False
         for index in lost:
@@ -275,6 +276,10 @@ class Side:
                 servos.life.on(servo, ServoEvent.RETURNED)
                 servos.life.on(servo, ServoEvent.TORQUE_ON)
         return len(lost)
+
+    def _plan_reads(self):
+        if self.hardware._by_kernel is None:
+            self.hardware._by_kernel = self.hardware._plan_reads()
 
     def answer(self, replies):
         """Prepare the replies of the lines to the reads of a cycle."""
@@ -296,7 +301,7 @@ class Side:
     def read(self):
         """Read once; return everything that a run shows of the cycle, and the time."""
         hardware, clock = self.hardware, self.lines.clock
-        hardware._plan_reads()
+        self._plan_reads()
         began, self.parsed = bool(hardware._by_kernel), False
         hardware.read()
         self.began += began

@@ -155,7 +155,7 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call)
     with monkeypatch.context() as patch:
         patch.setattr(owner, "_now_ns" if call == "now_ns" else call, interrupted)
         with pytest.raises(KeyboardInterrupt):
-            rig.hardware._kernel.read()
+            rig.hardware.read()
     rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
     rig.cycles(5)
     assert rig.states.valid.all()

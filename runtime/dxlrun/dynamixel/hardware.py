@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
 
@@ -13,9 +14,9 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import LATE_NS, Bus, Lines, LineState
+from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, Lines, LineState
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
-from dxlrun.dynamixel.exchange.idle import IdleScheduler
+from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.port.ports import Ports
@@ -77,6 +78,7 @@ class DynamixelHardware:
         self._plans, self._buses = self._lines.plans, self._lines.buses
         self._ports = ports
         self._clock = clock
+        self._now_ns = clock.now_ns
         self._states = states
         self._goals = goals
         self._events = events
@@ -86,6 +88,12 @@ class DynamixelHardware:
         self._full_torque: list[list[int]] = []
         self._by_kernel: bool | None = None
         """Whether the kernel reads the next states, or the parser; None: not planned yet."""
+        self._look = True
+        """There is something to look at in this cycle, beside reading and writing. `_rest` ends that; then
+        the kernel's answers, requests, and `_due_ns` begin it again."""
+        self._due_ns = 0  # when idle time has something to do,
+        self._waiting: list[tuple[array[int], int]] = []
+        """or where it is so long, ns, on a line, whose words these are."""
         self._idle = tuple(
             IdleScheduler(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
         )
@@ -117,6 +125,7 @@ class DynamixelHardware:
             clock,
             beat,
         )
+        self._read, self._write = self._kernel.read, self._kernel.write
         self._start_up = StartUp(self._lines, self._servos, events)
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
@@ -126,6 +135,7 @@ class DynamixelHardware:
         servo, PortError when a line is gone; torque that was given is taken back, and a note of the exception
         says whether every servo confirmed that.
         """
+        self._look = True
         self._start_up.look(self._take_over)
         self._kernel.poll_for_replies()
         try:
@@ -151,8 +161,15 @@ class DynamixelHardware:
 
         The kernel reads as long as everything comes as planned; the parser continues where it does not.
         """
-        self._plan_reads()
-        by_kernel, self._by_kernel = self._by_kernel, None
+        if self._look:
+            self._prepare_read()
+        code = self._read() if self._by_kernel else Answer.UNEXPECTED
+        if code or self._look:
+            self._finish_read(code)
+
+    def _prepare_read(self) -> None:
+        if self._by_kernel is None:
+            self._by_kernel = self._plan_reads()
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
@@ -160,26 +177,33 @@ class DynamixelHardware:
                 servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
-        if by_kernel:
-            answer = self._kernel.read()
-            if answer is not Answer.UNEXPECTED:
-                for bus, servos in self._pairs:
-                    if bus.failure is not None:
-                        self._settle(servos)
-                        self._report_failures()
-                if answer is Answer.LOOK:
-                    self._samples.settle(self._clock.now_ns())
-                return
-            self._interrupt()
-        self._parse()
 
-    def _plan_reads(self) -> None:
+    def _finish_read(self, code: int) -> None:
+        answer = self._kernel.finish_read(code)
+        if answer is Answer.SILENCE:
+            self._look = True
+            self._prepare_read()
+            answer = self._kernel.finish_read(self._read())
+        if answer is Answer.UNEXPECTED:
+            self._look = True
+            if self._by_kernel:
+                self._interrupt()
+            self._parse()
+        else:
+            for bus, servos in self._pairs:
+                if bus.failure is not None:
+                    self._settle(servos)
+                    self._report_failures()
+            if answer is Answer.LOOK:
+                self._samples.settle(self._clock.now_ns())
+        if self._look:
+            self._by_kernel = None
+
+    def _plan_reads(self) -> bool:
         """Plan the next reads, once a cycle and before any of them is sent.
 
-        The kernel does them if every line that is there has a program for it.
+        Return whether the kernel does them: every line that is there has a program for it.
         """
-        if self._by_kernel is not None:
-            return
         kernel, ready = self._kernel, True
         for index, (bus, servos) in enumerate(self._pairs):
             cycle = servos.reads.plan() if servos.reads.stale else servos.reads.cycle
@@ -188,7 +212,7 @@ class DynamixelHardware:
                 known = program is not None and program is kernel.programs[index]
                 ready &= known or (program is not None and kernel.plan(index, program))
                 ready &= not bus.receiver.pending
-        self._by_kernel = ready
+        return ready
 
     def _interrupt(self) -> None:
         for (bus, servos), line in zip(self._pairs, self._kernel.interrupt(), strict=True):
@@ -223,39 +247,63 @@ class DynamixelHardware:
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there."""
-        for servos in self._servos:
-            servos.prepare_goals(self._goals, self._states)
-        for index, failure in self._kernel.write().items():
-            self._buses[index].fail(failure)
-        self._report_failures()
+        if self._look:
+            for servos in self._servos:
+                servos.prepare_goals(self._goals, self._states)
+            self._kernel.plan_writes()
+        code = self._write()
+        if code or self._look:
+            for index, failure in self._kernel.finish_write(code).items():
+                self._buses[index].fail(failure)
+            self._report_failures()
+            self._rest()
+
+    def _rest(self) -> None:
+        """Look at nothing any more where all is as planned, until that changes."""
+        self._look = not (all(servos.at_rest for servos in self._servos) and self._plan_reads())
+        self._due_ns = min((servos.due_ns for servos in self._servos), default=NEVER)
+        self._waiting = [
+            (bus.words, work.least_ns)
+            for bus, work in zip(self._buses, self._idle, strict=True)
+            if work.tasks
+        ]
+        if not self._look:
+            self._by_kernel = True
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in idle time; UNKNOWN leaves one as it is."""
+        self._look = True
         for servos in self._servos:
             servos.desired.change_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
         """Write a RAM item of a joint's servo in idle time, and read it back; see `DesiredState`."""
-        servos, index = self._places[row]
+        servos, index = self._place(row)
         servos.desired.write_register(index, item, value, done)
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
         """Read an item of a joint's servo in idle time."""
-        servos, index = self._places[row]
+        servos, index = self._place(row)
         servos.desired.read_register(index, item, done)
 
     def switch_torque(self, row: int, on: bool, done: Done = ignore) -> None:
         """Switch the torque of a joint's servo in idle time; see `Requests`."""
-        servos, index = self._places[row]
+        servos, index = self._place(row)
         (servos.requests.torque_on if on else servos.requests.torque_off)(index, done)
 
     def reboot(self, row: int, done: Done) -> None:
         """Reboot a joint's servo in idle time; see `Requests`."""
-        servos, index = self._places[row]
+        servos, index = self._place(row)
         servos.requests.reboot(index, done)
+
+    def _place(self, row: int) -> tuple[Servos, int]:
+        """Return where the servo of a joint is, which is to be looked at."""
+        self._look = True
+        return self._places[row]
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
+        self._look = True
         for servos in self._servos:
             servos.goals.weaken(fraction)
         for plan, bus, servos, full in zip(
@@ -267,6 +315,15 @@ class DynamixelHardware:
 
     def idle(self, until_ns: int) -> None:
         """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so."""
+        if not self._look:
+            now_ns = self._now_ns()
+            left_ns = until_ns - IDLE_MARGIN_NS - now_ns
+            self._look = now_ns >= self._due_ns
+            for words, least_ns in self._waiting:
+                if left_ns >= least_ns + max(words[LATE_NS], LEAST_MARGIN_NS):
+                    self._look = True
+            if not self._look:
+                return
         for bus in self._buses:
             if bus.failure is not None:
                 self._reopen_lines()
@@ -286,7 +343,7 @@ class DynamixelHardware:
         if working:
             self._lines.clear(self._buses)
             self._lines.pump()
-        self._plan_reads()  # here nothing waits for it
+        self._by_kernel = self._plan_reads()  # here nothing waits for it
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""

@@ -46,9 +46,10 @@ MOST_OWED = 8
 """So many replies of a servo that did not come in time, the newest ones, are known as late when they come."""
 _FORGOTTEN = 6  # With each reply that is less late, 2 ** -6 of a line's lateness is forgotten
 
-FREE_NS, LATE_NS, LOST = range(3)
+FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
 """What `Bus.words` holds, which the exchange kernel shares: when everything that was sent is off the wire;
-how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost."""
+how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost; when the servos
+were last asked, 0: their watchdogs are not armed; how long these wait, 0: there are none."""
 
 _READY, _AWAITING, _RESTING, _DRAINING = range(4)
 # to look into an Enum takes as long as to pack a packet's record
@@ -99,7 +100,7 @@ class Bus:
         self.unrequested = 0
         """Packets since the start that no request of this host explains: instructions of another one, and the
         replies to them."""
-        self.words = array("q", (0, 0, 0))  # Memory that the exchange kernel shares, see `FREE_NS`
+        self.words = array("q", (0, 0, 0, 0, 0))  # Memory that the exchange kernel shares, see `FREE_NS`
         self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         """What a byte takes on the wire, ns."""
         self._latency_ns = plan.latency_ns

@@ -13,7 +13,7 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.bus import NEVER, Bus
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
@@ -101,6 +101,19 @@ class IdleScheduler:
         """How many programs have not come to their end."""
         return len(self.tasks)
 
+    @property
+    def least_ns(self) -> int:
+        """The least idle time, beside the margin for late replies, in which anything can be done.
+
+        NEVER: nothing waits; 0: what waits is looked at in each.
+        """
+        least_ns = NEVER
+        for task in self.tasks:
+            if task.pressed is not Urgency.SLOW or task.begun or task.paused or task.next is None:
+                return 0
+            least_ns = min(least_ns, self._need_ns(task.next, 0))
+        return least_ns
+
     def begin(self, until_ns: int) -> bool:
         """Prepare for the idle time that ends at `until_ns`; return whether there is anything to do."""
         if not self.tasks:
@@ -165,16 +178,20 @@ class IdleScheduler:
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
         """Return the transaction with a timeout that the idle time allows; None: it has to wait."""
         left_ns = self._until_ns - self.now_ns()
-        latest_ns = wanted.due_ns
-        if wanted.awaited:
-            # a reply behind the end would disturb the next cyclic read, which costs far more than this brings
-            latest_ns += self._plan.latency_ns + max(self._bus.late_ns, LEAST_MARGIN_NS)
+        latest_ns = self._need_ns(wanted, max(self._bus.late_ns, LEAST_MARGIN_NS))
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None
             left_ns = latest_ns + SHORT_TIMEOUT_MARGIN_NS
         task.starved = 0
         return structs.replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
+
+    def _need_ns(self, wanted: Transaction, margin_ns: int) -> int:
+        """Return the time that a transaction takes at most, if its replies are no later than by a margin.
+
+        A reply behind the end would disturb the next cyclic read, which costs far more than this brings.
+        """
+        return wanted.due_ns + (self._plan.latency_ns + margin_ns if wanted.awaited else 0)
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
         """Count the cycles that a program waits; return whether it is done at the cost of the next cycle."""

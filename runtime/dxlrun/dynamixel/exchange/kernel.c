@@ -31,9 +31,9 @@
 #define WRITE_TIMEOUT_NS 20000000 /* port.py */
 #define LEAST_NAP_NS 15000
 
-enum { OK, WAITING, FULL, UNEXPECTED, LOOK };
+enum { OK, WAITING, FULL, UNEXPECTED, LOOK, SILENCE };
 enum { IDLE, AWAITING, THROUGH };
-enum { FREE_NS, LATE_NS, LOST }; /* words of a line that the parser shares: bus.py */
+enum { FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS }; /* words of a line that the parser shares: bus.py */
 #define MOST_LATE_NS 1000000     /* bus.py */
 enum { INSTRUCTION = 1, STATUS = 2 };
 enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE, FLOAT32 };
@@ -155,7 +155,8 @@ typedef struct Kernel {
     int32_t (*send)(int32_t line, const uint8_t *data, int32_t size);
     int32_t (*receive)(int32_t line, uint8_t *data, int32_t room);
     int32_t (*wait)(int64_t deadline_ns, uint8_t *ready);
-    int32_t line_count, servo_count, write_line, write_number, device_count, unused;
+    int32_t line_count, servo_count, write_line, write_number, device_count;
+    int32_t raised; /* one of these functions raised an exception: no call ends well */
     Polling polling;
 } Kernel;
 
@@ -660,11 +661,35 @@ static int settle(Kernel *k, int64_t now)
     return OK;
 }
 
-/* Reads every servo once. WAITING: `beat_ns` has passed since the call; FULL: commit the log; call again. */
-int32_t dxl_read(Kernel *k)
+/* Whether nothing was sent in this cycle yet. */
+static int is_new(const Kernel *k)
+{
+    for (int32_t i = 0; i < k->line_count; i++)
+        if (k->lines[i].state != IDLE)
+            return 0;
+    return 1;
+}
+
+/* Notes that the servos are asked now; false where a line had no instruction for longer than its servos wait. */
+static int is_in_time(Kernel *k, int64_t now)
+{
+    for (int32_t i = 0; i < k->line_count; i++) {
+        const int64_t *words = k->lines[i].words;
+        if (words[ASKED_NS] && words[SILENCE_NS] && now - words[ASKED_NS] > words[SILENCE_NS])
+            return 0;
+    }
+    for (int32_t i = 0; i < k->line_count; i++)
+        if (k->lines[i].words[ASKED_NS])
+            k->lines[i].words[ASKED_NS] = now;
+    return 1;
+}
+
+static int32_t read_all(Kernel *k)
 {
     uint8_t ready[MOST_LINES];
     int64_t now = now_ns(k);
+    if (is_new(k) && !is_in_time(k, now))
+        return SILENCE;
     int64_t stop = NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns; /* `beat_ns` may be NEVER */
     int32_t idle = 0;
     for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
@@ -715,6 +740,14 @@ int32_t dxl_read(Kernel *k)
             return answer;
     }
     return settle(k, now_ns(k));
+}
+
+/* Reads every servo once. WAITING: `beat_ns` has passed since the call; FULL: commit the log; call again. SILENCE:
+ * nothing was sent, watchdogs may have stopped servos. */
+int32_t dxl_read(Kernel *k)
+{
+    int32_t answer = read_all(k);
+    return k->raised ? UNEXPECTED : answer;
 }
 
 /* Goals */
@@ -839,7 +872,7 @@ int32_t dxl_write(Kernel *k)
     k->write_line = 0;
     for (int32_t i = 0; i < k->line_count; i++)
         gone += k->lines[i].gone != 0;
-    return gone ? UNEXPECTED : OK;
+    return gone || k->raised ? UNEXPECTED : OK;
 }
 
 /* Ends a cycle that the parser finishes, and forgets what was asked. */

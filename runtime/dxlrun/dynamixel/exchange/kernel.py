@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -51,9 +52,9 @@ class Answer(IntEnum):
     FULL = 2  # The log's batch must be committed first
     UNEXPECTED = 3  # Something did not come as planned; the parser continues
     LOOK = 4  # All replies came, and a position is further from the last one than is plausible
+    SILENCE = 5  # Nothing was sent: servos had no instruction for longer than their watchdogs wait
 
 
-_ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
 _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
@@ -260,6 +261,10 @@ class Kernel:
             self._kernel.used = _address(desk.used)
             self._kernel.desk_room = self._room
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
+        self.read: Callable[[], int] = partial(self._library.dxl_read, self._pointer)
+        """Reads every servo once, in C; returns 0, or what `finish_read` takes."""
+        self.write: Callable[[], int] = partial(self._library.dxl_write, self._pointer)
+        """Sends the goals that are due, in C; returns 0, or what `finish_write` takes."""
 
     def _laid_lines(self) -> ctypes.Array[ctypes.Structure]:
         lines = (STRUCTS["Line"] * max(len(self._known), 1))()
@@ -350,7 +355,7 @@ class Kernel:
         try:
             return self._now_ns()
         except BaseException as error:
-            self._raised = error
+            self._keep_raised(error)
             return NEVER
 
     def _send(self, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
@@ -359,7 +364,7 @@ class Kernel:
         except PortError:
             return -1
         except BaseException as error:
-            self._raised = error
+            self._keep_raised(error)
             return -1
         return -1 if self._raised else size
 
@@ -370,7 +375,7 @@ class Kernel:
         except PortError:
             return -1  # the parser meets it again and has the reason
         except BaseException as error:
-            self._raised = error
+            self._keep_raised(error)
             return -1
         return -1 if self._raised else count
 
@@ -383,7 +388,7 @@ class Kernel:
                 if heard and not indices:  # a line that is gone is ready for ever: let time pass
                     self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
         except BaseException as error:
-            self._raised = error
+            self._keep_raised(error)
         for index in indices:
             ready[index] = 1
         return len(indices)
@@ -393,10 +398,13 @@ class Kernel:
 
     def _raise(self) -> None:
         """Raise what came up while the kernel was at work."""
-        error, self._raised = self._raised, None
-        if error is not None:
+        if (error := self._raised) is not None:
+            self._raised, self._kernel.raised = None, 0
             self._library.dxl_abandon(self._pointer)
             raise error
+
+    def _keep_raised(self, error: BaseException) -> None:
+        self._raised, self._kernel.raised = error, 1
 
     def poll_for_replies(self) -> None:
         """Begin to poll for replies if the ports are set so; before real time."""
@@ -415,35 +423,37 @@ class Kernel:
         line.reads, line.read_count = ctypes.addressof(program.reads), program.count
         return True
 
-    def read(self) -> Answer:
-        """Read every servo once."""
+    def finish_read(self, code: int) -> Answer:
+        """Continue a read that has not come to its end; return how it ended."""
         while True:
-            answer: Answer = _ANSWERS[self._library.dxl_read(self._pointer)]
-            if self._raised is not None:
-                self._raise()
-            if answer is Answer.WAITING:
+            self._raise()
+            if code == Answer.WAITING:
                 self._beat()
-            elif answer is Answer.FULL:
+            elif code == Answer.FULL:
                 self._packets.commit()
             else:
-                return answer
+                return Answer(code)
+            code = self.read()
 
-    def write(self) -> dict[int, PortError]:
-        """Send the goals that are due; return why lines took no more bytes, by index, once."""
+    def plan_writes(self) -> None:
+        """Take the goals' sync writes, which are others after a change of mode or limits."""
         for index, known in enumerate(self._known):
             if known.goals.sync_writes is not self._writes[index]:
                 self._take_writes(index, known.goals.sync_writes)
-        while (answer := _ANSWERS[self._library.dxl_write(self._pointer)]) is Answer.FULL:
+
+    def finish_write(self, code: int) -> dict[int, PortError]:
+        """Continue a write that has not ended; return why lines took no more bytes, by index, once."""
+        while code == Answer.FULL:
             self._packets.commit()
-        if self._raised is not None:
-            self._raise()
-        if answer is Answer.OK:
+            code = self.write()
+        self._raise()
+        if code == Answer.OK:
             return {}
         found = {index: self._failure(index) for index in range(len(self._known))}
         return {index: failure for index, failure in found.items() if failure is not None}
 
     def _take_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
-        """Lay the sync writes of a bus out, which are others after a change of mode or limits."""
+        """Lay the sync writes of a bus out."""
         self._writes[index] = writes
         laid = [_laid_write(one) for one in writes]
         array = _array(_SyncWrite, [one for one, _ in laid])

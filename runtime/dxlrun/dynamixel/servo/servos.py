@@ -40,6 +40,7 @@ LEAST_UNREQUESTED = 2
 alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a byte [i]."""
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
+_RESTING = frozenset((ServoState.TORQUED, ServoState.LIMP, ServoState.RELEASED))
 CAUGHT_UP = 0.05  # rad of the servo from its goal: a returning one has caught up
 
 
@@ -76,7 +77,7 @@ class Servos:
         self._reboots = Reboots(plan, idle, self.life)
         self.desired = DesiredState(plan, idle, self.goals, self.life, self._reboots, states.mode, events)
         """Modes and registers that the servos shall have."""
-        self.watchdogs = WatchdogMonitor(plan, idle, self.life, self.desired, events)
+        self.watchdogs = WatchdogMonitor(plan, bus, idle, self.life, self.desired, events)
         """Whether the Bus Watchdogs receive enough instructions."""
         self._offline = Offline(plan, idle, self.life, self._reboots, self.desired)
         self.requests = Requests(plan, idle, self.life, self._reboots, self.desired, self._offline)
@@ -229,6 +230,39 @@ class Servos:
             self.life.report(EventCode.SERVO_ERROR, severity, index, text)
 
     # Idle time
+
+    @property
+    def at_rest(self) -> bool:
+        """True when nothing is to be looked at here before `due_ns`, as long as replies are as planned.
+
+        A device is looked at in each, for its commands.
+        """
+        return not (
+            self._bus.failure is not None
+            or self._bus.receiver.pending
+            or self._plan.devices
+            or self.reads.stale
+            or self.life.torque_changed
+            or not _RESTING.issuperset(self.life.states)
+            or self._alerts
+            or self._strained
+            or self._alert_cycles
+            or self._noise_waits
+            or any(error & self._dialect.ALERT for error in self._reported_errors)
+        )
+
+    @property
+    def due_ns(self) -> int:
+        """When idle time has something to do that waits for its time."""
+        return self._slow.due_ns
+
+    @property
+    def _noise_waits(self) -> bool:
+        bus = self._bus
+        return (
+            bus.noise_bytes > self._noise_seen
+            or bus.unrequested - self._unrequested_seen >= LEAST_UNREQUESTED
+        )
 
     def abandon(self) -> None:
         """Answer what clients requested and waits for too long, while the line is gone."""

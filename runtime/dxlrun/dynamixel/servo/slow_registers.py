@@ -5,6 +5,7 @@ from __future__ import annotations
 from dxlrun.channels.cycle import Floats, States
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
+from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
@@ -45,9 +46,14 @@ class SlowReads:
         self._limits = [_limit_item(plan, index) for index in range(count)]
         self._hot = [False] * count
 
+    @property
+    def due_ns(self) -> int:
+        """When there is something to read; NEVER while something is being read."""
+        return NEVER if self._reading or not self._round else self._due_ns
+
     def look(self) -> None:
         """Let the coming idle time read the next block when its time has come; called once a cycle."""
-        if self._reading or not self._round or self._idle.now_ns() < self._due_ns:
+        if self._idle.now_ns() < self.due_ns:
             return
         for _ in self._round:
             index, block = self._round[self._next]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.dynamixel.exchange.bus import ASKED_NS, SILENCE_NS, Bus
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import watchdog
@@ -14,18 +15,24 @@ from dxlrun.plan.transaction import Program
 
 
 class WatchdogMonitor:
-    """Knows when the servos of one bus were last sent anything."""
+    """Knows when the servos of one bus were last sent anything; the exchange kernel looks at that, too."""
 
-    def __init__(
-        self, plan: BusPlan, idle: IdleScheduler, life: Life, desired: DesiredState, events: EventSink
+    def __init__(  # noqa: PLR0917  what a bus consists of
+        self,
+        plan: BusPlan,
+        bus: Bus,
+        idle: IdleScheduler,
+        life: Life,
+        desired: DesiredState,
+        events: EventSink,
     ) -> None:
         self._plan = plan
         self._idle = idle
         self._life = life
         self._desired = desired
         self._events = events
-        self._longest_ns = plan.watchdog_ticks * watchdog.UNIT_NS
-        self._sent_ns = 0  # When the servos were sent something, ns; 0: they are not armed yet
+        self._words = bus.words
+        self._words[SILENCE_NS] = plan.watchdog_ticks * watchdog.UNIT_NS
         self._reviving = [False] * len(plan.servos)
         """A revival waits for idle time already: a loop that is late repeatedly requests no second one."""
 
@@ -35,7 +42,7 @@ class WatchdogMonitor:
         All of them at once, and once more before each is read: none is stopped because the others take long.
         """
         plan, line, problems = self._plan, plan_line(self._plan), []
-        self._sent_ns = self._idle.now_ns()
+        self._words[ASKED_NS] = self._idle.now_ns()
         packets = watchdog.to_all(plan, plan.servos, plan.watchdog_ticks)
         for servo in plan.servos:
             if not plan.watchdog_ticks or (item := watchdog.item_of(plan, servo)) is None:
@@ -50,11 +57,12 @@ class WatchdogMonitor:
 
     def sent(self, now_ns: int) -> None:
         """Record that the servos are sent something now; revive them if they were silent for too long."""
-        if not (self._longest_ns and self._sent_ns):
+        words = self._words
+        if not (words[SILENCE_NS] and words[ASKED_NS]):
             return
-        if now_ns - self._sent_ns > self._longest_ns:
-            self._revive_all((now_ns - self._sent_ns) // 1_000_000)
-        self._sent_ns = now_ns
+        if now_ns - words[ASKED_NS] > words[SILENCE_NS]:
+            self._revive_all((now_ns - words[ASKED_NS]) // 1_000_000)
+        words[ASKED_NS] = now_ns
 
     def _revive_all(self, silent_ms: int) -> None:
         plan, life = self._plan, self._life
