@@ -40,6 +40,7 @@ from dxlrun_analysis.cycles.latency import (
 from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun_analysis.tally import Tally
 from dxlrun_analysis.verdict import Verdict, judge
@@ -102,12 +103,17 @@ def analyze_log(path: str | Path) -> Report:
     return analyze(open_log(path))
 
 
-def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report:
+def analyze(
+    reader: LogReader | Log,
+    *watching: Callable[[Log], None],
+    exchanges: Callable[[Exchanges], None] = lambda _: None,
+) -> Report:
     """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read.
 
-    Each of `watching` gets the slices too: a log is decompressed once.
+    Each of `watching` gets the slices too, and `exchanges` those of their packets: a log is decompressed
+    once, and each packet is paired once.
     """
-    tally, durations, topics = Tally(), Durations(), _Topics()
+    tally, durations, topics = Tally(exchanges), Durations(), _Topics()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)

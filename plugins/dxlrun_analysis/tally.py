@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.tracking import JointTracking, Tracking
 from dxlrun_analysis.joints.trends import Trend, Trends
 from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
 _ANSWERS = " answers "
@@ -83,8 +85,9 @@ class RunTotals:
 class Tally:
     """Counts a log, whole or slice by slice, in memory that does not grow with it."""
 
-    def __init__(self) -> None:
-        self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic()
+    def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
+        """`watch` is called with all exchanges, too."""
+        self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
         self._trends, self._tracking = Trends(), Tracking()
         self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
         self._events = EventCounts()

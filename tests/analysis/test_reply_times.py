@@ -230,7 +230,7 @@ def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: i
             if given_up:
                 line.packets[-1] = replace(line.packets[-1], kind=PacketKind.LATE)
     columns = replace(PacketColumns.of(line.packets), cycle=np.array(line.cycles, np.int64))
-    replies, none = LateReplies(), np.zeros(0, np.int64)
+    replies, none = LateReplies(1), np.zeros(0, np.int64)
     replies.take(Pairing((BUS,)).alone(columns), none, none)
     assert [one.code for one in replies.findings(0, BUS)] == named
 

@@ -148,9 +148,9 @@ def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_it(log: Log, report: Report) -> None:
-    from dxlrun_analysis.page.page import page
+    from dxlrun_analysis.page.page import analyzed_page
 
-    text = page(log, report)
+    _, text = analyzed_page(log)
     assert 'id="steering"' in text
     assert "switch activate tail; deactivate head" in text
     assert "Shaded: the loop was paused. Dotted lines: it was steered otherwise." in text

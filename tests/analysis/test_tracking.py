@@ -194,7 +194,7 @@ def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> N
 
 
 def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
-    from dxlrun_analysis.page.page import page
+    from dxlrun_analysis.page.page import analyzed_page
 
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
@@ -205,4 +205,4 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
     words = "worst 1.72 deg (position minus what was reachable), lag 59 ms, settled after"
-    assert words in page(log, report)
+    assert words in analyzed_page(log)[1]

@@ -632,9 +632,7 @@ def test_the_timer_of_a_port_has_a_command_where_it_is_a_device(
 def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log of a stormy run, in small chunks, with streams, pauses and refusals."""
     path = tmp_path_factory.mktemp("storm") / "run.mcap"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(log_writer, "CHUNK_BYTES", 4096)
-        robot = simulated_robot(TORSO, duration_s=4.0, log=path)
+    robot = simulated_robot(TORSO, duration_s=4.0, log=path)
     script = FaultScript(
         [parse_fault("storm seed=3 faults=12 within=3s kinds=lose,silence,noise,reboot at=300ms")]
     )
@@ -648,7 +646,9 @@ def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, (at_ms, kind, data) in enumerate(asked, start=1):
         command = Command(number, "", kind, data, "anna")
         robot.buses[0].at(at_ms * MS, lambda command=command: robot.inbox.waiting.append(command))
-    robot.run()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_writer, "CHUNK_BYTES", 4096)
+        robot.run()
     return path
 
 
@@ -693,7 +693,7 @@ def analyze_totals(path: Path) -> RunTotals:
 
 
 def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
-    from dxlrun_analysis.page.page import page
+    from dxlrun_analysis.page.page import analyzed_page
 
     log = read_log(storm)
     report = analyze(log)
@@ -702,7 +702,7 @@ def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
     assert report.verdict == said
     shown = json.loads(json_text(report))["verdict"]
     assert (shown["good"], tuple(shown["sentences"])) == (said.good, said.sentences)
-    text = page(log, report)
+    _, text = analyzed_page(log)
     assert f"<h1>{said.findings[0].sentence}</h1>" in text
     assert all(f"<p>{finding.sentence}" in text for finding in said.findings[1:])
 

@@ -74,12 +74,17 @@ def analyze(
             show(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
         return 0
     with progress_bar(hidden=as_json) as draw:
-        result = analysis.analyze(reader, lambda _: draw(f"reading {log.name}", reader.share))
-        if report is not None:
-            from dxlrun_analysis.page.page import page
 
-            draw(f"drawing {report.name}", 1.0)
-            write_report(report, page(reader, result))
+        def reading(_: object) -> None:
+            draw(f"reading {log.name}", reader.share)
+
+        if report is None:
+            result = analysis.analyze(reader, reading)
+        else:
+            from dxlrun_analysis.page.page import analyzed_page
+
+            result, text = analyzed_page(reader, reading)
+            write_report(report, text)
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from dxlrun_analysis.page.servos import reply_plots
 from dxlrun_analysis.page.worst import worst_plots
 from dxlrun_analysis.report import (
     Report,
+    analyze,
     began,
     facts,
     tables,
@@ -35,13 +36,19 @@ _FEW_CHANGES = 60
 """More lines would bury the curves."""
 
 
-def page(reader: LogReader | Log, report: Report) -> str:
+def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> tuple[Report, str]:
+    """Analyze a log, and return its page as well. Takes bokeh. Raises LogError as `analyze`."""
+    replies = ReplyCollector()
+    report = analyze(reader, *watching, exchanges=replies.take)
+    return report, page(reader, report, replies.finish())
+
+
+def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
     """Return the page of a log and its report: well-formed, self-contained, the same bytes each time.
 
-    It goes through the log once more, slice by slice. Takes bokeh. Raises LogError when a packet of the log
-    cannot be read.
+    `replies`: as ReplyCollector has them. It goes through the cycles of the log once more, slice by slice.
     """
-    run = _drawn(reader, report)
+    run = _drawn(reader, report, replies)
     when = began(run.log, report)
     sections = _sections(run, report)
     return document(
@@ -67,11 +74,11 @@ class _Run(NamedTuple):
     canvas: Canvas
 
 
-def _drawn(reader: LogReader | Log, report: Report) -> _Run:
+def _drawn(reader: LogReader | Log, report: Report, replies: Curves) -> _Run:
     curves = CurveCollector(worst.scheduled_ns for worst in report.causes.worst)
-    replies, events, machine = ReplyCollector(), EventCollector(), MachineCollector()
-    for part in reader.slices():
-        for collector in (curves, replies, events, machine):
+    events, machine = EventCollector(), MachineCollector()
+    for part in reader.slices(packets=False):
+        for collector in (curves, events, machine):
             collector.take(part)
     log = replace(reader.about, cycles=reader.about.cycles[:0], events=events.finish())
     drawn = curves.finish()
@@ -85,7 +92,7 @@ def _drawn(reader: LogReader | Log, report: Report) -> _Run:
         pauses=[(pause.begin_s, pause.end_s) for pause in report.pauses],
         changes=changes if len(changes) <= _FEW_CHANGES else (),
     )
-    return _Run(log, drawn, replies.finish(), *machine.finish(), canvas)
+    return _Run(log, drawn, replies, *machine.finish(), canvas)
 
 
 def _header(report: Report, when: str, plots: Collection[str]) -> Element:

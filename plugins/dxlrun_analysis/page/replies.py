@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from dxlrun.log.reader import Log
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope
-from dxlrun_analysis.servos.exchanges import Exchanges, Pairing
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges
 
 BYTES_OF_REPLIES = 1_000_000
 """In a page, before they are text: 4 bytes a number, two numbers a row and curve."""
@@ -15,49 +17,24 @@ _FEWEST_ROWS, _MOST_ROWS = 50, 1500
 _BYTES_A_VALUE = 8
 _BIN_NS = 1_000_000
 """Of a bin at first."""
-_IDS = 256
 
 
 class ReplyCollector:
-    """Takes the packets of a log: its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 where one is."""
+    """Takes the exchanges of a log: its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 where one is."""
 
     def __init__(self) -> None:
-        self._pairing = Pairing()
-        self._rows = np.zeros((0, _IDS), np.int64)
-        """Number of each servo of the plan by bus and ID, -1: none; shape (buses, IDs)."""
+        self._columns = np.zeros(0, np.int64)
+        """Number of each servo of the plan, by bus and ID; -1: it is not in it."""
         self._names: tuple[str, ...] = ()
         self._envelope = Envelope(0, 2, 1)
 
-    def take(self, log: Log) -> None:
-        """Take the next slice. Raises LogError when a packet in it cannot be read."""
-        self._add(self._pairing.take(log))
-
-    def finish(self) -> Curves:
-        """Return the curves of all servos of the log's plan."""
-        self._add(self._pairing.finish())
-        names = tuple(f"{kind} {name}" for kind in ("reply", "lost") for name in self._names)
-        return Curves.of(self._envelope.rows(), names)
-
-    def _begin(self) -> None:
-        buses = self._pairing.buses
-        self._rows = np.full((len(buses), _IDS), -1, np.int64)
-        names: list[str] = []
-        for index, bus in enumerate(buses):
-            for servo_id in bus.names:
-                if 0 <= servo_id < _IDS:
-                    self._rows[index, servo_id] = len(names)
-                    names.append(f"{bus.name} {servo_id}")
-        self._names = tuple(names)
-        self._envelope = Envelope(2 * len(names), rows_of_replies(len(names)), _BIN_NS)
-
-    def _add(self, exchanges: Exchanges | None) -> None:
-        if exchanges is None:
-            return
-        if not len(self._rows):
-            self._begin()
+    def take(self, exchanges: Exchanges) -> None:
+        """Take the next exchanges."""
+        if not len(self._columns):
+            self._begin(exchanges.buses)
         count, due = len(self._names), exchanges.due
         values = np.full((len(exchanges.bus), 2 * count), np.nan, np.float32)
-        column = self._rows.reshape(-1)[due.servo]
+        column = self._columns[due.servo]
         came = np.flatnonzero((due.reply >= 0) & (column >= 0))
         of = due.exchange[came]
         took_ns = exchanges.replies.last_ns[due.reply[came]] - exchanges.asked_ns[of]
@@ -68,6 +45,23 @@ class ReplyCollector:
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         rows = rows[np.argsort(exchanges.asked_ns[rows], kind="stable")]
         self._envelope.take(exchanges.asked_ns[rows], values[rows])
+
+    def _begin(self, buses: Sequence[LoggedBus]) -> None:
+        servos = {
+            index * IDS + servo_id: f"{bus.name} {servo_id}"
+            for index, bus in enumerate(buses)
+            for servo_id in bus.names
+            if 0 <= servo_id < IDS
+        }
+        self._columns = np.full(len(buses) * IDS, -1, np.int64)
+        self._columns[list(servos)] = np.arange(len(servos))
+        self._names = tuple(servos.values())
+        self._envelope = Envelope(2 * len(servos), rows_of_replies(len(servos)), _BIN_NS)
+
+    def finish(self) -> Curves:
+        """Return the curves of all servos of the log's plan."""
+        names = tuple(f"{kind} {name}" for kind in ("reply", "lost") for name in self._names)
+        return Curves.of(self._envelope.rows(), names)
 
 
 def rows_of_replies(servos: int) -> int:

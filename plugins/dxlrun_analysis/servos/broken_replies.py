@@ -20,16 +20,15 @@ _ALONE = 0.7
 class BrokenReplies:
     """Counts broken replies of each ID."""
 
-    def __init__(self) -> None:
-        self._broken, self._cut, self._noisy = (np.zeros(0, np.int64) for _ in range(3))
-        """Of each ID; of these at the end of a shared status packet; and exchanges of each bus."""
+    def __init__(self, buses: int) -> None:
+        self._broken, self._cut = np.zeros((2, buses * IDS), np.int64)
+        """Of each servo; of these at the end of a shared status packet."""
+        self._noisy = np.zeros(buses, np.int64)
+        """Exchanges of each bus."""
 
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""
-        due, buses = exchanges.due, len(exchanges.buses)
-        if not len(self._noisy):
-            self._broken, self._cut = np.zeros((2, buses * IDS), np.int64)
-            self._noisy = np.zeros(buses, np.int64)
+        due, buses = exchanges.due, len(self._noisy)
         rows = np.flatnonzero(due.broken & exchanges.ended[due.exchange])
         servo, request = due.servo[rows], exchanges.request[due.exchange[rows]]
         ends = due.place[rows] == exchanges.requests.servos[request] - 1
@@ -41,7 +40,7 @@ class BrokenReplies:
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
         """Name the one ID of a bus whose replies are broken; not where that depends on the joint's angle."""
         mine = self._broken[index * IDS : (index + 1) * IDS]
-        total = int(self._noisy[index]) if len(mine) else 0
+        total = int(self._noisy[index])
         if total < _FEWEST or len(losses) < 2:  # of a single servo it is the line
             return ()
         servo_id = int(np.argmax(mine))

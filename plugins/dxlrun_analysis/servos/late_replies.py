@@ -28,19 +28,15 @@ _TOGETHER = 0.6
 class LateReplies:
     """Collects them, in memory that does not grow with the log."""
 
-    def __init__(self) -> None:
-        self._given_up = np.zeros(0, np.int64)
-        self._longest_ns = np.zeros(0, np.int64)
-        self._exchanges = np.zeros(0, np.int64)
+    def __init__(self, buses: int) -> None:
+        self._given_up = np.zeros(buses * IDS, np.int64)
+        self._longest_ns, self._exchanges = np.zeros((2, buses), np.int64)
         self._moments: Counter[int] = Counter()
         """How many there were, by the buses that were late in them, a bit each."""
 
     def take(self, exchanges: Exchanges, rows: Numbers, at_ns: Numbers) -> None:
         """Take the late replies of some exchanges; `rows`: those that were complete, but late, at `at_ns`."""
-        late, count = exchanges.late, len(exchanges.buses)
-        if not len(self._longest_ns):
-            self._given_up = np.zeros(count * IDS, np.int64)
-            self._longest_ns, self._exchanges = np.zeros((2, count), np.int64)
+        late, count = exchanges.late, len(self._exchanges)
         self._exchanges += np.bincount(exchanges.bus[exchanges.request > 0], minlength=count)
         came_late = ~_in_time(exchanges)
         late_bus, late_at_ns = late.servo[came_late] // IDS, late.at_ns[came_late]
@@ -102,7 +98,7 @@ class LateReplies:
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
         """Name the servo or the bus whose replies came after they were given up."""
         mine = self._given_up[index * IDS : (index + 1) * IDS]
-        total, servo_id = int(mine.sum()), int(np.argmax(mine)) if len(mine) else 0
+        total, servo_id = int(mine.sum()), int(np.argmax(mine))
         if total < _FEWEST:
             return ()
         late = f"came after they were given up, up to {self._ms(index)} ms after the request"

@@ -34,9 +34,9 @@ _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 class OtherHosts:
     """Collects the instructions of other hosts, in memory that does not grow with the log."""
 
-    def __init__(self) -> None:
-        self._sent, self._pieces, self._stray, self._lost, self._echoes = (Counts() for _ in range(5))
-        self._asked = Counts()
+    def __init__(self, buses: int) -> None:
+        self._sent, self._pieces = Counts(), Counts()
+        self._stray, self._lost, self._echoes, self._asked = np.zeros((4, buses), np.int64)
 
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
@@ -44,20 +44,20 @@ class OtherHosts:
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
-        self._stray.take(stray.bus.astype(np.int64), np.zeros(len(stray), np.int64))
         self._pieces.take(*_ends(stray, second[stray.bus]))
-        lost = exchanges.bus[due.exchange[(due.loss == Loss.OWN) | (due.loss == Loss.LINE)]]
         for counts, buses in (
-            (self._lost, lost),
+            (self._stray, stray.bus),
+            (self._lost, due.servo[(due.loss == Loss.OWN) | (due.loss == Loss.LINE)] // IDS),
             (self._echoes, exchanges.echoes),
             (self._asked, exchanges.bus[exchanges.asked_ns > 0]),
         ):
-            counts.take(buses, np.zeros(len(buses), np.int64))
+            np.add(counts, np.bincount(buses, minlength=len(counts)), out=counts)
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
         """Return code and ID of the instructions on a bus, and how often each was seen."""
-        stray, pieces = (int(counts.of(index)[1].sum()) for counts in (self._stray, self._pieces))
-        found = [self._sent, self._pieces] if pieces >= max(_FEWEST, _PIECES * stray) else [self._sent]
+        pieces = int(self._pieces.of(index)[1].sum())
+        enough = pieces >= max(_FEWEST, _PIECES * self._stray[index])
+        found = [self._sent, self._pieces] if enough else [self._sent]
         values, counts = (
             np.concatenate(each) for each in zip(*(one.of(index) for one in found), strict=True)
         )
@@ -65,12 +65,12 @@ class OtherHosts:
 
     def explains(self, index: int) -> bool:
         """Return whether a bus has another host that may have spoilt its missing replies."""
-        sent, lost = int(self._of(index)[1].sum()), int(self._lost.of(index)[1].sum())
-        return sent >= _FEWEST and 2 * sent >= lost
+        sent = int(self._of(index)[1].sum())
+        return sent >= _FEWEST and 2 * sent >= self._lost[index]
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
         """Name the other host of a bus, or an adapter that began to echo; none: neither."""
-        echoes, asked = (int(counts.of(index)[1].sum()) for counts in (self._echoes, self._asked))
+        echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
             return (
                 Finding(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,16 +102,18 @@ class BusTraffic:
 class Traffic:
     """Counts packets, slice by slice of a log, in memory that does not grow with it."""
 
-    def __init__(self) -> None:
-        self._pairing = Pairing()
+    def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
+        """`watch` is called with all exchanges, too: they are paired once."""
+        self._pairing, self._watch = Pairing(), watch
         self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
-        self._broken, self._late_replies, self._others = BrokenReplies(), LateReplies(), OtherHosts()
         self.findings: tuple[Finding, ...] = ()
         """By the rules of this room; known when all is finished."""
         self._size(0, JointStates())
 
     def _size(self, buses: int, states: JointStates) -> None:
         self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(states)
+        self._broken, self._late_replies = BrokenReplies(buses), LateReplies(buses)
+        self._others = OtherHosts(buses)
         servos = buses * IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
         self._late, self._alone = np.zeros((2, 2, servos), np.int64)
@@ -222,6 +224,7 @@ class Traffic:
     def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
             return
+        self._watch(exchanges)
         places = self._states.until(int(exchanges.cycle.max(initial=-1)), everything=final)
         self._reply_times.take(exchanges, places)
         self._losses.take(exchanges, places)

@@ -108,23 +108,25 @@ class LogReader:
             raise LogError(_foreign(self.path))
         return self._about
 
-    def slices(self) -> Iterator[Log]:
+    def slices(self, *, packets: bool = True) -> Iterator[Log]:
         """Yield cycles, packets, events, commands and topics as logs of their own, in the order of the file.
 
         Each has whole cycles with all their packets, also those of the idle time after them; what belongs to
-        no slice (attachments, damage) is in `about`. Raises LogError for a file of another program.
+        no slice (attachments, damage) is in `about`. Without `packets` these are not looked at. Raises
+        LogError for a file of another program.
         """
         if self.header is None:
             raise LogError(_foreign(self.path))
         known = McapFile(metadata=dict(self.metadata), attachments=dict(self.attachments))
         walk = LogWalk(self.path, known)
-        slicer = Slicer(self.header, walk)
+        slicer = Slicer(self.header, walk, packets=packets)
         with _readable(self.path):
             for messages in gathered(walk.messages(), SLICE_BYTES):
                 self.share = walk.share
                 yield slicer.take(messages)
             yield slicer.rest()
-        self._about = slicer.about()
+        if packets or self._about is None:
+            self._about = slicer.about()
 
     def columns(self, topic: str, *fields: str) -> dict[str, NDArray[np.generic]]:
         """Return fields of all messages of a topic, without `fields` all, one row each: `batches`, joined.

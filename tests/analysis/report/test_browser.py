@@ -19,8 +19,7 @@ import pytest
 from tests.kit.made_logs import Cycle, Said, made_log
 
 from dxlrun.log.reader import read_log
-from dxlrun_analysis.page.page import page
-from dxlrun_analysis.report import analyze
+from dxlrun_analysis.page.page import analyzed_page
 
 Make = Callable[..., Any]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -133,7 +132,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     log = read_log(made_log(directory, cycles, (), [Said(2, 30, "<b>bold</b>")]))
     target: Path = directory / "report.html"
-    target.write_text(page(log, analyze(log)), encoding="utf-8")
+    target.write_text(analyzed_page(log)[1], encoding="utf-8")
     return target
 
 

@@ -20,7 +20,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
-from dxlrun_analysis.page.page import page
+from dxlrun_analysis.page.page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
 
 Make = Callable[..., Any]
@@ -67,7 +67,7 @@ def data(text: str, name: str) -> Any:
 
 def made(path: Path) -> Made:
     log = read_log(path)
-    text = page(log, analyze(log))
+    text = analyzed_page(log)[1]
     return text, Reader(text)
 
 
@@ -260,10 +260,9 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make) -> None:
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun_analysis.page.page import page;"
-        "from dxlrun_analysis.report import analyze;"
+        "import sys; from dxlrun_analysis.page.page import analyzed_page;"
         "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
-        "print(len(page(log, analyze(log)))); assert 'matplotlib' not in sys.modules"
+        "print(len(analyzed_page(log)[1])); assert 'matplotlib' not in sys.modules"
     )
     environment = {
         key: value for key, value in os.environ.items() if key not in {"DISPLAY", "WAYLAND_DISPLAY"}

@@ -22,9 +22,9 @@ from dxlrun_analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve
 from dxlrun_analysis.page.events import MOST_EVENTS, EventCollector, events_plot
 from dxlrun_analysis.page.joints import joint_plots
 from dxlrun_analysis.page.loop import latency_plots, steps_plot, typical_plot
-from dxlrun_analysis.page.page import page
+from dxlrun_analysis.page.page import analyzed_page
 from dxlrun_analysis.page.replies import BYTES_OF_REPLIES, ReplyCollector, rows_of_replies
-from dxlrun_analysis.report import Report, analyze
+from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
 Data = NDArray[np.float64]
@@ -241,7 +241,7 @@ def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> N
             packets.append(Wire(PacketKind.STATUS, 5, 1400 + number * 20_000 + 10 * number, answer))
     log = read_log(write([Cycle(number) for number in range(20)], packets))
     collector = ReplyCollector()
-    collector.take(log)
+    analyze(log, exchanges=collector.take)
     replies = collector.finish()
     times = replies.low("reply main 5")
     known = np.isfinite(times)
@@ -314,9 +314,7 @@ def test_the_report_of_a_log_read_in_slices_is_that_of_the_whole(logs: dict[int,
 
         about = replace(log, cycles=log.cycles[:0])
 
-        def slices(self) -> list[Log]:
+        def slices(self, *, packets: bool = True) -> list[Log]:
             return [replace(log, cycles=part) for part in np.array_split(log.cycles, 5)]
 
-    whole: Report = analyze(log)
-    assert analyze(Sliced()) == whole  # type: ignore[arg-type]  # what analyze() reads of a reader
-    assert page(Sliced(), whole) == page(log, whole)  # type: ignore[arg-type]  # as above
+    assert analyzed_page(Sliced()) == analyzed_page(log)  # type: ignore[arg-type]  # what is read of a reader

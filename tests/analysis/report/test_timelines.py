@@ -18,6 +18,7 @@ from dxlrun_analysis.page.canvas import Canvas, Plot
 from dxlrun_analysis.page.curves import CurveCollector
 from dxlrun_analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
 from dxlrun_analysis.page.page import page
+from dxlrun_analysis.page.replies import ReplyCollector
 from dxlrun_analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
 from dxlrun_analysis.report import analyze
 
@@ -206,7 +207,8 @@ def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest
     )
     log = read_log(write([Cycle(0), Cycle(1)]))
     report = analyze(log)
-    text = page(log, structs.replace(report, causes=replace(report.causes, worst=(WORST,))))
+    report = structs.replace(report, causes=replace(report.causes, worst=(WORST,)))
+    text = page(log, report, ReplyCollector().finish())
     for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
         assert f'id="plot-{name}"' in text
     assert "late reply of servo 21 (head) 27.60 ms" in text

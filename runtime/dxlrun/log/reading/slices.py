@@ -82,7 +82,7 @@ class Log:
     part: int = 0
     """Index of the part that it begins with; above 0 it lacks the run's beginning."""
 
-    def slices(self) -> Iterator[Log]:
+    def slices(self, *, packets: bool = True) -> Iterator[Log]:
         """Yield the log itself: one that was read whole is its own only slice."""
         yield self
 
