@@ -27,7 +27,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
-from dxlrun.simulation import read_ledger
+from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_analysis.cycles.late_servos import overruns_by_servos
 
 HIGHEST_HZ = 2000.0

@@ -10,7 +10,7 @@ from tests.kit.made_logs import Cycle, Wire
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun_analysis.cycles.late_servos import overruns_by_servos, transactions, waits_for_servos
 
 PERIOD_US = 20_000

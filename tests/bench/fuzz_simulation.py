@@ -23,7 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 PER_SERVO = 250

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
+from dxlrun.plan.simulation_plan import BusConfig
+from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 from exchange.simulated import SimulatedServos
 
 

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from dxlrun.compile.robot import compile_files
-from dxlrun.simulation import BusConfig, DeviceConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot

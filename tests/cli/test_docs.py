@@ -27,12 +27,12 @@ from dxlrun.cli.steering.written import Written
 from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation import BusConfig, ServoConfig, SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.messages import SimulationMessage
+from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 from dxlrun.testing import plan_of, read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]
@@ -104,8 +104,8 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[SimulationConfig]:
     """What `dxlrun sim` was about to serve."""
     configs: list[SimulationConfig] = []
 
-    def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
-        configs.append(config)
+    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+        configs.append(job.config)
         return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)

@@ -8,7 +8,7 @@ import yaml
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 
 def servos(*models):

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.simulation import read_ledger
+from dxlrun.simulation.bus.ledger import read_ledger
 
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"

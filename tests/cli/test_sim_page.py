@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli.sim import sim
+from dxlrun.plan.simulation_plan import SimulationConfig
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation import SimulationConfig
 from dxlrun.simulation.faults.kinds import KINDS
-from dxlrun.simulation.messages import SimulationMessage
+from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "simulation.md").read_text()
@@ -23,8 +23,8 @@ COMMANDS = re.findall(r"^    (dxlrun sim .+)$", PAGE, re.MULTILINE)
 def test_each_command_of_the_page_is_understood(dxlrun, line, monkeypatch, tmp_path):
     asked: list[SimulationConfig] = []
 
-    def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
-        asked.append(config)
+    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+        asked.append(job.config)
         return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)

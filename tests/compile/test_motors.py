@@ -17,8 +17,8 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import from_json, to_json
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.remote.preparation import Preparation, RefusedRequest
-from dxlrun.simulation import Load, decode_config, encode_config
 from dxlrun_analysis.replay.changes import Setting, with_settings
 
 MOTOR = MotorModel(
@@ -95,7 +95,6 @@ def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo() -> None:
     assert shoulder.load == Load(0.004, 0.0, 0.2, pytest.approx(math.pi - 0.5))
     assert (shoulder.times.response_delay_ns, elbow.times.response_delay_ns) == (1_500_000, 0)
     assert (elbow.motor, elbow.load) == (None, Load())
-    assert decode_config(encode_config(simulated_buses(plan))).buses == simulated_buses(plan)
 
 
 def test_keys_of_the_joint_count_before_the_load_of_its_motor_file() -> None:

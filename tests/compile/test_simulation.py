@@ -14,7 +14,7 @@ from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulat
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
-from dxlrun.simulation import (
+from dxlrun.plan.simulation_plan import (
     AdapterConfig,
     CoupledServo,
     Coupling,
@@ -22,8 +22,6 @@ from dxlrun.simulation import (
     ServoTimes,
     UrdfBodies,
     UrdfJoint,
-    decode_config,
-    encode_config,
 )
 
 SIMULATED = PAIR.replace("/dev/ttyUSB0", "sim")
@@ -105,7 +103,6 @@ def test_servos_that_share_joints_are_simulated_together() -> None:
     assert simulation.bodies is not None
     assert simulation.bodies.joints == (None, None)
     assert [servo.load for servo in simulation.buses[0].servos] == [Load(), Load()], "it is the joints'"
-    assert decode_config(encode_config(simulation)) == simulation
     real = replace(coupled, buses=(*plan.buses, replace(plan.buses[0], port="/dev/x", servos=(right,))))
     elsewhere = replace(real, buses=(replace(plan.buses[0], servos=(left,)), real.buses[1]))
     assert simulation_of(elsewhere).couplings == (), "one of them is on a real port"

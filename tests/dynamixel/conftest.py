@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
-import sys
 
 import pytest
+from tests.kit.bus_process import started
 
-from dxlrun.simulation import encode_config, read_ledger
+from dxlrun.simulation.bus.ledger import read_ledger
 
 
 @pytest.fixture
@@ -19,17 +16,9 @@ def simulated_line(tmp_path):
     children = []
 
     def start(bus):
-        ours, theirs = socket.socketpair()
-        reader, writer = os.pipe()
-        os.write(writer, encode_config((bus,)))
-        os.close(writer)
         ledger = tmp_path / f"ledger{len(children)}.jsonl"
-        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
-        command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
-        child = subprocess.Popen(command, pass_fds=(reader, theirs.fileno()), start_new_session=True)
+        child, ours = started((bus,), ledger=str(ledger))
         children.append((child, ours))
-        os.close(reader)
-        theirs.close()
         ours.settimeout(60)
 
         def finish():

@@ -11,7 +11,7 @@ from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 
 RATE = 57_600
 

@@ -10,7 +10,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 
 
 def torque_given(rig, since=0):

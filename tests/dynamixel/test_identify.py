@@ -7,7 +7,8 @@ from dxlrun.clock import VirtualClock
 from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
 

@@ -7,7 +7,7 @@ import pytest
 from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.log.reader import read_log
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 ROBOT = """\
 name: pair

@@ -8,7 +8,7 @@ from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import Search, find, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
-from dxlrun.simulation import AdapterConfig, ServoConfig
+from dxlrun.plan.simulation_plan import AdapterConfig, ServoConfig
 
 
 def two(servo_id, model="XM430-W350", **more):

@@ -20,7 +20,7 @@ from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 
 @pytest.fixture

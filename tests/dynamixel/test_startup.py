@@ -9,7 +9,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.checks import _silence
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 
 
 def refusal(rig):

@@ -7,10 +7,6 @@ servos. What the servos refused is read from the ledger in the end, and must be 
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,8 +15,10 @@ from typing import Any
 import pytest
 from dynamixel_sdk import PortHandler
 from tests.foreign.patience import PATIENCE_S
+from tests.kit.bus_process import started
 
-from dxlrun.simulation import BusConfig, LedgerEntry, encode_config, read_ledger
+from dxlrun.plan.simulation_plan import BusConfig
+from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 
 
 class Simulation:
@@ -30,18 +28,8 @@ class Simulation:
         self._path = ledger
         self._refusals: Counter[str] = Counter()
         self._hasty: set[str] = set()
-        self._control, theirs = socket.socketpair()
+        self._child, self._control = started(buses, ledger=str(ledger))
         self._control.settimeout(PATIENCE_S)
-        reader, writer = os.pipe()
-        with theirs:
-            command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
-            command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
-            self._child = subprocess.Popen(
-                command, pass_fds=(reader, theirs.fileno()), start_new_session=True
-            )
-        os.close(reader)
-        with open(writer, "wb") as config:
-            config.write(encode_config(buses))
         self._said = self._control.makefile("rb")
         first = self._said.readline()
         self.ports: dict[str, str] = json.loads(first)["ports"] if first else {}

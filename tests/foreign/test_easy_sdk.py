@@ -19,7 +19,7 @@ from dynamixel_easy_sdk import (
 from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 NUMBERS = ControlTable.parsingModelList()
 MODELS = tuple(

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 IDS = range(11, 17)
 MIDDLE = 3.141593

@@ -10,7 +10,7 @@ import rustypot
 from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
 RATE = 1_000_000
 POSITION = 2.0

@@ -9,27 +9,43 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from typing import Any
 
-from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig, encode_config
+import msgspec
+
+from dxlrun.channels import process
+from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
+from dxlrun.simulation.messages import SimulationJob
 
 PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 
 
+def started(
+    config: SimulationConfig | Sequence[BusConfig], *, errors: int | None = None, **options: Any
+) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """Start it; return the process and our end of the control socket, whose end ends it.
+
+    `options`: of the SimulationJob.
+    """
+    whole = config if isinstance(config, SimulationConfig) else SimulationConfig(tuple(config))
+    job = process.memory_file("bus-process", msgspec.json.encode(SimulationJob(whole, **options)))
+    ours, theirs = socket.socketpair()
+    command = [sys.executable, "-m", "dxlrun.simulation", "--job-fd", str(job)]
+    command += ["--control-fd", str(theirs.fileno())]
+    inherited = (job, theirs.fileno())
+    child = subprocess.Popen(command, pass_fds=inherited, stderr=errors, start_new_session=True)
+    theirs.close()
+    os.close(job)
+    return child, ours
+
+
 @contextlib.contextmanager
 def bare(
-    path: Path, config: SimulationConfig | Sequence[BusConfig], *options: str
+    config: SimulationConfig | Sequence[BusConfig], **options: Any
 ) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
-    """Start it from a file; give the process and our end of the control socket, whose end ends it."""
-    path.write_bytes(encode_config(config))
-    ours, theirs = socket.socketpair()
-    with path.open("rb") as file:
-        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(file.fileno())]
-        command += ["--control-fd", str(theirs.fileno()), *options]
-        inherited = (file.fileno(), theirs.fileno())
-        child = subprocess.Popen(command, pass_fds=inherited, stderr=subprocess.PIPE, start_new_session=True)
-    theirs.close()
+    """Start it, and close our end of the socket in the end."""
+    child, ours = started(config, errors=subprocess.PIPE, **options)
     with child, ours:
         yield child, ours
 

@@ -17,8 +17,7 @@ from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
-from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST
+from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST, LedgerEntry
 from dxlrun.simulation.faults.fault import Fault, parse_fault
 from dxlrun.simulation.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun_analysis.plan import plan_of

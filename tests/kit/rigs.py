@@ -34,7 +34,8 @@ from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.virtual_ports import VirtualPorts

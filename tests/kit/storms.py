@@ -35,7 +35,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log
 from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript

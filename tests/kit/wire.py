@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from tests.kit.packets import crc
 
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x83, 0x82, 0x8A, 0x92

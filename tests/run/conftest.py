@@ -21,7 +21,7 @@ from tests.kit.wire import all_writes
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 from dxlrun_controllers.group import JointGroupPositionController
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")

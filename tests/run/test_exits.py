@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.simulation import read_ledger
+from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_analysis.report import analyze
 
 Running = Any

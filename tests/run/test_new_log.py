@@ -15,7 +15,7 @@ from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.run.run_log import discard_log, ledger_of, new_log
-from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.ledger import Ledger
 
 
 @pytest.fixture

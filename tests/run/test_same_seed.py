@@ -12,7 +12,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation import Ledger, read_ledger
+from dxlrun.simulation.bus.ledger import Ledger, read_ledger
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of

@@ -192,7 +192,7 @@ def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch
     (tmp_path / "nodding.yaml").write_text(ON_A_LINK)
     served: list[SimulationConfig] = []
     monkeypatch.setattr(
-        sim, "_serve", lambda config, *_, **__: served.append(config) or Served(1.0, SimulationMessage(), ())
+        sim, "_serve", lambda job, *_, **__: served.append(job.config) or Served(1.0, SimulationMessage(), ())
     )
     assert main(["sim", str(tmp_path / "nodding.yaml")]) == 0
     assert served[0].sensed is not None

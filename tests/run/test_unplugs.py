@@ -30,7 +30,7 @@ import pytest
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketKind
-from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 A_RUN = 10

@@ -38,7 +38,7 @@ from dxlrun.run.guardian import (
 )
 from dxlrun.run.loop_process import AskedToStop, Pulse
 from dxlrun.run.run_processes import create_memory, guardian_job
-from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import plan_of

@@ -12,9 +12,8 @@ import pytest
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
 from dxlrun.contract.body import Shafts
-from dxlrun.plan.simulation_plan import NO_LOAD, SensedBodies
+from dxlrun.plan.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint
 from dxlrun.run.sensor_process import RemoteBody
-from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 from dxlrun.simulation.motion.body import SensedBody, ShaftsShown, SimulatedBody, quaternion
 from dxlrun.simulation.motion.control_law import LIMP
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics

@@ -16,7 +16,8 @@ from tests.kit.bus_process import PATIENCE_S, bare
 from tests.kit.packets import crc, packet1, packet2
 
 from dxlrun.clock import VirtualClock
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, ServoTimes, read_ledger
+from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
+from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -263,7 +264,7 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
 
         def run(buses: Sequence[BusConfig]) -> Running:
             path = tmp_path / "bus.jsonl"
-            child, control = stack.enter_context(bare(tmp_path / "config", buses, "--ledger", str(path)))
+            child, control = stack.enter_context(bare(buses, ledger=str(path)))
             control.settimeout(PATIENCE_S)
             sent = stack.enter_context(control.makefile("rb"))
             return Running(child, control, sent, json.loads(sent.readline())["ports"], path)

@@ -11,7 +11,8 @@ from tests.kit.packets import packet1, packet2
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import PortError
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.servo.making import make_servo
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, CLEAR = 1, 2, 3, 4, 5, 6, 0x10

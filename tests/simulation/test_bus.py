@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 from tests.kit.packets import packet1
 
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")

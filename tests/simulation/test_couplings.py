@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
-from dxlrun.plan.simulation_plan import NO_LOAD
-from dxlrun.simulation import CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
+from dxlrun.plan.simulation_plan import NO_LOAD, CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
 from dxlrun.simulation.motion.control_law import ServoCommand
 from dxlrun.simulation.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of

@@ -8,7 +8,8 @@ import struct
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation import BusConfig, DeviceConfig, Ledger, Shown
+from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, Shown
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.measured import on_the_wire
 from dxlrun.simulation.faults.fault import parse_fault

@@ -13,8 +13,7 @@ from tests.kit.judges import log_has_every_byte
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus.ledger import OTHER_HOST
+from dxlrun.simulation.bus.ledger import OTHER_HOST, LedgerEntry
 from dxlrun.testing import simulated_robot
 
 THREE = {"main": (2.0, 3)}

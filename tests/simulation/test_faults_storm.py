@@ -10,7 +10,8 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import InputError
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.kinds import PASSING

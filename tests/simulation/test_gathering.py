@@ -8,7 +8,8 @@ from collections.abc import Callable
 import pytest
 from tests.kit.packets import packet2
 
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, LedgerEntry, ServoConfig
+from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 MICROFRAME_NS = 125_000

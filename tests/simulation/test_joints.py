@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import Load, ServoConfig
+from dxlrun.plan.simulation_plan import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.making import make_servo

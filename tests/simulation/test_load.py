@@ -11,7 +11,7 @@ import serial
 from tests.kit.packets import packet2
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
+from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 

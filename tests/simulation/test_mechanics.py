@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table
-from dxlrun.simulation import Load
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import (
     AMBIENT_C,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.wire.packets import InstructionPacket
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import Load
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 

@@ -16,7 +16,7 @@ from msgspec import structs
 
 from dxlrun import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import Load, ServoConfig
+from dxlrun.plan.simulation_plan import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint

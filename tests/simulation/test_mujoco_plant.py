@@ -13,8 +13,7 @@ import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
 from dxlrun.errors import InputError
-from dxlrun.plan.simulation_plan import NO_LOAD
-from dxlrun.simulation import Load, UrdfBodies, UrdfJoint
+from dxlrun.plan.simulation_plan import NO_LOAD, Load, UrdfBodies, UrdfJoint
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint

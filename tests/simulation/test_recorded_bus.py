@@ -19,9 +19,10 @@ from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
 from dxlrun.run import virtual_run
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation import BusConfig, Ledger, SimulationConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.messages import SimulationMessage

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, ServoTimes
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, ServoTimes
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 MS = 1_000_000

@@ -5,7 +5,8 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.errors import PortError
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun_analysis.plan import LoggedBus, plan_of
 
 _BITS_A_BYTE = 10

@@ -20,7 +20,7 @@ import msgspec
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun_lab.desired import DesiredPath
 from dxlrun_lab.sweep.scores import CycleMemory, Scores
 

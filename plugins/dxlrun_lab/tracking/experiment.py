@@ -17,7 +17,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
-from dxlrun.simulation import read_ledger
+from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion

@@ -5,7 +5,6 @@ Nothing of the simulation itself is imported here, so that the rest of the runti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -179,15 +178,3 @@ class SimulationConfig(msgspec.Struct, frozen=True):
     couplings: tuple[Coupling, ...] = ()  # Servos that share joints; all others move one each
     sensed: SensedBodies | None = None
     """The bodies with which devices move that are on a link; None: none is."""
-
-
-def encode_config(config: SimulationConfig | Sequence[BusConfig]) -> bytes:
-    """Return what `--config-fd` takes; buses alone are a configuration without faults."""
-    if not isinstance(config, SimulationConfig):
-        config = SimulationConfig(tuple(config))
-    return msgspec.json.encode(config)
-
-
-def decode_config(data: bytes) -> SimulationConfig:
-    """Return the configuration of `encode_config`; raises msgspec.ValidationError."""
-    return msgspec.json.decode(data, type=SimulationConfig)

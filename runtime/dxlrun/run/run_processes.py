@@ -28,8 +28,8 @@ from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.guardian import GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob
-from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
-from dxlrun.simulation.messages import SimulationMessage
+from dxlrun.run.simulation_front import first_message, start_simulation
+from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 
 SensorMessage = Ready | Failed
 RecorderMessage = Ready | Draining | Failed | LogClosed
@@ -115,9 +115,8 @@ def start_simulated_buses(
         if scheduler.policy != "other"
         else (0, -1)
     )
-    config = simulation_of(plan)
-    options = FrontOptions(ledger, *real_time, shafts=memory.shafts)
-    child = start_simulation(config, options, memory.stderr)
+    job = SimulationJob(simulation_of(plan), str(ledger) if ledger else None, *real_time, memory.shafts)
+    child = start_simulation(job, memory.stderr)
     try:
         return child, first_message(child).ports or {}
     except BaseException:

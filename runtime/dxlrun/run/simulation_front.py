@@ -14,7 +14,6 @@ import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Protocol
 
 import msgspec
@@ -22,8 +21,7 @@ import msgspec
 from dxlrun.channels import process
 from dxlrun.channels.process import Child, MessageChannel
 from dxlrun.errors import PortError
-from dxlrun.simulation import BusConfig, SimulationConfig, encode_config
-from dxlrun.simulation.messages import Request, SimulationMessage
+from dxlrun.simulation.messages import Request, SimulationJob, SimulationMessage
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""
@@ -37,27 +35,11 @@ _ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
 Messages = MessageChannel[SimulationMessage]
 
 
-class FrontOptions(msgspec.Struct, frozen=True):
-    """How the process of the simulated buses is started."""
-
-    ledger: Path | None = None
-    priority: int = 0  # Real-time priority that it asks for; 0: none
-    core: int = -1  # Core that it stays on; -1: any
-    shafts: int = -1
-    """Descriptor of the slot into which it writes how its shafts move; -1: none."""
-
-
-def start_simulation(
-    config: SimulationConfig | Sequence[BusConfig], options: FrontOptions, errors: int
-) -> Child[SimulationMessage]:
+def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage]:
     """Start the process of simulated buses; `errors` takes what it prints."""
-    descriptor = process.memory_file("dxlrun-simulation", encode_config(config))
-    arguments = ["--config-fd", str(descriptor)]
-    arguments += ["--priority", str(options.priority)] if options.priority else []
-    arguments += ["--core", str(options.core)] if options.core >= 0 else []
-    arguments += ["--ledger", str(options.ledger)] if options.ledger else []
-    arguments += ["--shafts-fd", str(options.shafts)] if options.shafts >= 0 else []
-    inherited = [descriptor, *([options.shafts] if options.shafts >= 0 else [])]
+    descriptor = process.memory_file("dxlrun-simulation", msgspec.json.encode(job))
+    arguments = ["--job-fd", str(descriptor)]
+    inherited = [descriptor, *([job.shafts] if job.shafts >= 0 else [])]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
         return Child("simulated bus", "dxlrun.simulation", arguments, inherited, errors, messages)
@@ -151,9 +133,7 @@ class TypedLines:
         return lines
 
 
-def serve(
-    config: SimulationConfig, options: FrontOptions, audience: Audience, typed: TypedLines | None
-) -> Served:
+def serve(job: SimulationJob, audience: Audience, typed: TypedLines | None) -> Served:
     """Serve simulated buses until SIGINT or SIGTERM comes; nothing is left of them when it returns.
 
     Raises PortError when the process refuses its configuration, ProcessFault when it does not start.
@@ -161,7 +141,7 @@ def serve(
     errors = process.memory_file("dxlrun-stderr")
     with _stop_signals() as stop:
         began = time.monotonic()
-        child = start_simulation(config, options, errors)
+        child = start_simulation(job, errors)
         front = _Front(child, audience, typed, stop)
         try:
             front.run()

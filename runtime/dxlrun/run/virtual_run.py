@@ -32,7 +32,7 @@ from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
-from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.motion.body import SensedBody

@@ -4,6 +4,19 @@ from __future__ import annotations
 
 import msgspec
 
+from dxlrun.plan.simulation_plan import SimulationConfig
+
+
+class SimulationJob(msgspec.Struct, frozen=True):
+    """What the process of the simulated buses does, as JSON through a descriptor."""
+
+    config: SimulationConfig
+    ledger: str | None = None  # JSON-lines file of every byte on the buses
+    priority: int = 0  # Real-time priority that it asks for, 1 to 99; 0: none
+    core: int = -1  # Core that it stays on; -1: any
+    shafts: int = -1
+    """Descriptor of the slot into which it writes how its shafts move; -1: none."""
+
 
 class Request(msgspec.Struct):
     """To the simulation."""

@@ -10,8 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
+from dxlrun.channels.process import MessageChannel
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import InputError
 from dxlrun.plan.simulation_plan import SimulationConfig
@@ -39,65 +38,8 @@ hand-over costs the processor, and the host's, more than a reply."""
 
 IDLE_NS = 300_000  # So long the mechanics of a few steps and the lines of the ledger may take
 
-_LONGEST_LINE = 1 << 16
-_MOST_UNREAD = 1 << 18
-
 _GOAL_MODES = (3, 4, 5)
 """Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
-
-
-class ControlLine:
-    """The line to the process that started the simulation: JSON objects, one a line.
-
-    Never a reason to wait: what the other end does not read in time is dropped, whole lines of it.
-    """
-
-    def __init__(self, end: socket.socket) -> None:
-        self._socket = end
-        end.setblocking(False)
-        self._received = b""
-        self._unsent = bytearray()
-        self.closed = False  # True after the other end hung up
-
-    def fileno(self) -> int:
-        """Return the descriptor, for epoll."""
-        return self._socket.fileno()
-
-    @property
-    def has_unsent(self) -> bool:
-        """True when `flush` is to be called as soon as the socket takes something."""
-        return bool(self._unsent)
-
-    def receive(self) -> list[bytes]:
-        """Return the lines that were completed by what has arrived; sets `closed` at the end."""
-        try:
-            chunk = self._socket.recv(65536)
-        except BlockingIOError:
-            return []
-        except OSError:  # the other end closed without having read everything
-            chunk = b""
-        if not chunk:
-            self.closed = True
-        *lines, self._received = (self._received + chunk).split(b"\n")
-        if len(self._received) > _LONGEST_LINE:
-            self._received = b""
-        return lines
-
-    def send(self, message: SimulationMessage) -> None:
-        """Send a message, now or when the socket takes it; never raises, never waits."""
-        line = msgspec.json.encode(message) + b"\n"
-        if len(self._unsent) + len(line) <= _MOST_UNREAD:
-            self._unsent += line
-            self.flush()
-
-    def flush(self) -> None:
-        """Send what could not be sent before."""
-        try:
-            del self._unsent[: self._socket.send(self._unsent)]
-        except BlockingIOError:
-            return
-        except OSError:  # the other end hung up; `receive` finds that out
-            self._unsent.clear()
 
 
 class Server:
@@ -108,12 +50,16 @@ class Server:
     """
 
     def __init__(
-        self, config: SimulationConfig, ledger: Ledger, line: ControlLine, shafts: SlotWriter | None = None
+        self,
+        config: SimulationConfig,
+        ledger: Ledger,
+        starter: MessageChannel[Request],
+        shafts: SlotWriter | None = None,
     ) -> None:
         """`shafts` takes how the shafts move, for sensors in other processes."""
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
-        self._line = line
+        self._starter = starter
         self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies, config.couplings))
         self._buses = tuple(
             (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
@@ -138,9 +84,9 @@ class Server:
         self._ledger.on_note = self._report_fault
         with _wake_on_sigterm() as wake, self._waiting as waiting:
             waiting.register(wake, select.EPOLLIN)
-            waiting.register(self._line, select.EPOLLIN)
+            waiting.register(self._starter, select.EPOLLIN)
             self._plug()
-            self._line.send(SimulationMessage(self._ports(), granted))
+            self._tell(SimulationMessage(self._ports(), granted))
             while not self._stopped:
                 self._serve_once(wake.fileno())
                 if self._shafts is not None:
@@ -190,8 +136,6 @@ class Server:
                 del self._held[number]
                 self._waiting.register(number, select.EPOLLIN)
             times += self._held.values()
-        unsent = select.EPOLLOUT if self._line.has_unsent else 0
-        self._waiting.modify(self._line, select.EPOLLIN | unsent)
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
     def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
@@ -214,7 +158,7 @@ class Server:
         terminal.deliver(now_ns)
         if terminal.follow_adapter():
             self._plug()
-            self._line.send(SimulationMessage(self._ports()))
+            self._tell(SimulationMessage(self._ports()))
 
     def _read_ready(self, number: int, wake: int, now_ns: int) -> None:
         terminal = self._by_descriptor.get(number)
@@ -222,8 +166,7 @@ class Server:
             self._receive(number, terminal, now_ns)
         elif number == wake:
             self._stopped = True
-        elif number == self._line.fileno():
-            self._line.flush()
+        elif number == self._starter.fileno():
             self._answer_requests(now_ns)
 
     def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
@@ -253,22 +196,22 @@ class Server:
 
     def _report_fault(self, note: str) -> None:
         if note.startswith(FAULT):
-            self._line.send(SimulationMessage(happened=note.removeprefix(FAULT)))
+            self._tell(SimulationMessage(happened=note.removeprefix(FAULT)))
+
+    def _tell(self, message: SimulationMessage) -> None:
+        """Send a message; where the starter does not read it is dropped, never a reason to wait."""
+        if select.select((), (self._starter,), (), 0)[1]:  # there is room for 100 KB and more then
+            self._starter.send(message)
 
     def _answer_requests(self, now_ns: int) -> None:
-        """Answer the lines of the process that started the simulation."""
-        for text in self._line.receive():
-            try:
-                request = msgspec.json.decode(text, type=Request)
-            except msgspec.MsgspecError as error:
-                self._line.send(SimulationMessage(error=f"not a request to a simulation: {error}"))
-                continue
+        """Answer the requests of the process that started the simulation."""
+        for request in self._starter.receive():
             if request.look:
                 looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
-                self._line.send(SimulationMessage(servos=looks, lateness_us=lateness_us(self._buses)))
+                self._tell(SimulationMessage(servos=looks, lateness_us=lateness_us(self._buses)))
             if request.fault is not None:
-                self._line.send(self._inject(request.fault, now_ns))
-        self._stopped = self._stopped or self._line.closed
+                self._tell(self._inject(request.fault, now_ns))
+        self._stopped = self._stopped or self._starter.closed
 
     def _inject(self, text: str, now_ns: int) -> SimulationMessage:
         try:

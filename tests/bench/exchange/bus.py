@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 from dxlrun_analysis.cycles.late_servos import Sent, transactions
 from exchange.canned import CannedResponder
 from exchange.case import Case

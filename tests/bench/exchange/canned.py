@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import ProcessFault
-from dxlrun.simulation import BusConfig, encode_config
+from dxlrun.plan.simulation_plan import BusConfig
 from exchange.hosts import Host
 
 _RESPONDER = Path(__file__).with_name("responder.py")
@@ -41,7 +41,7 @@ class CannedResponder:
             stdout=subprocess.PIPE,
             start_new_session=True,  # a terminal's Ctrl-C is for its starter, which ends it
         )
-        self.ports = self._ask(encode_config(buses)).ports
+        self.ports = self._ask(msgspec.json.encode(tuple(buses))).ports
         """The devices, one a bus."""
 
     def rehearse(self, port: int, host: Host, *, first: bool) -> Steps:

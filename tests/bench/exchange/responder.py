@@ -24,7 +24,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from dxlrun.simulation import BusConfig, Ledger, decode_config
+import msgspec
+
+from dxlrun.plan.simulation_plan import BusConfig
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 Does = Literal["rehearse", "learn", "play"]
@@ -113,7 +116,8 @@ def main() -> None:
     if options.core >= 0:
         with suppress(OSError):
             os.sched_setaffinity(0, {options.core})
-    terminals = [Terminal(config) for config in decode_config(sys.stdin.buffer.readline()).buses]
+    buses = msgspec.json.decode(sys.stdin.buffer.readline(), type=tuple[BusConfig, ...])
+    terminals = [Terminal(config) for config in buses]
     _say(ports=[terminal.path for terminal in terminals])
     gc.collect()
     gc.freeze()

@@ -9,8 +9,9 @@ from types import TracebackType
 
 from dxlrun.channels import process
 from dxlrun.errors import ProcessFault
-from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
-from dxlrun.simulation import BusConfig
+from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
+from dxlrun.run.simulation_front import first_message, start_simulation
+from dxlrun.simulation.messages import SimulationJob
 
 _PRIORITY = 33
 """As in a run: a servo's electronics do not wait for the host's processor."""
@@ -21,7 +22,9 @@ class SimulatedServos:
 
     def __init__(self, buses: Sequence[BusConfig], core: int, ledger: Path) -> None:
         self._errors = process.memory_file("dxlrun-bench-stderr")
-        self._child = start_simulation(buses, FrontOptions(ledger, _PRIORITY, core), self._errors)
+        self._child = start_simulation(
+            SimulationJob(SimulationConfig(tuple(buses)), str(ledger), _PRIORITY, core), self._errors
+        )
         ports = first_message(self._child).ports or {}
         self.ports = tuple(ports[bus.name] for bus in buses)
         """The devices, in the order of the buses."""

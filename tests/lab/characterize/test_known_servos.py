@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.simulation import BusConfig, Ledger, Load, ServoConfig, ServoTimes
+from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
+from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.control_law import ROWS
 from dxlrun.simulation.motion.motor import motor_of

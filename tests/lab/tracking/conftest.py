@@ -14,7 +14,7 @@ import pytest
 from dxlrun.compile.robot import compile_files
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import VirtualRobot
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion, desired_motion

@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dxlrun.cli.sim.sim_views import Shown
-    from dxlrun.run.simulation_front import FrontOptions, Served
-    from dxlrun.simulation import BusConfig, SimulationConfig
+    from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
+    from dxlrun.run.simulation_front import Served
     from dxlrun.simulation.faults.fault import Fault
+    from dxlrun.simulation.messages import SimulationJob
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
 _ABOVE_LOOP = 2  # The guardian is one above the loop
@@ -127,7 +128,7 @@ def sim(
     check_simulated(buses, planned, seed)
     from dxlrun.channels.process import spare_core
     from dxlrun.cli.sim.sim_views import Shown, ending
-    from dxlrun.run.simulation_front import FrontOptions
+    from dxlrun.simulation.messages import SimulationJob
 
     title = simulated.title
     config = msgspec.structs.replace(
@@ -138,8 +139,9 @@ def sim(
         links={bus: str(path) for bus, path in links.items()},
     )
     shown = Shown(title, buses, links, simulated.hint)
-    options = FrontOptions(ledger, simulated.priority, spare_core(simulated.loop_cores))
-    served = _serve(config, options, shown, as_json=as_json)
+    core = spare_core(simulated.loop_cores)
+    job = SimulationJob(config, str(ledger) if ledger else None, simulated.priority, core)
+    served = _serve(job, shown, as_json=as_json)
     if not as_json:
         show(ending(title, served.elapsed_s, served.look), *[f"ledger: {ledger}"] * (ledger is not None))
     if debug:
@@ -166,7 +168,7 @@ def _simulated(
     baud: int | None,
     protocol: float | None,
 ) -> _Simulated:
-    from dxlrun.simulation import SimulationConfig
+    from dxlrun.plan.simulation_plan import SimulationConfig
 
     if robot is None:
         if not servo:
@@ -210,7 +212,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     from dxlrun.log.reader import open_log
     from dxlrun.plan.robot_plan import from_json
-    from dxlrun.simulation import BusConfig, SimulationConfig
+    from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
 
     reader = open_log(log)
     try:
@@ -228,7 +230,7 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 
     Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
     """
-    from dxlrun.simulation import Ledger
+    from dxlrun.simulation.bus.ledger import Ledger
     from dxlrun.simulation.bus.recorded_bus import RecordedBus
     from dxlrun.simulation.bus.simulated_bus import SimulatedBus
     from dxlrun.simulation.faults.script import FaultScript
@@ -263,17 +265,17 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     return {name: path.absolute() for name, path in links.items()}
 
 
-def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
+def _serve(job: SimulationJob, shown: Shown, *, as_json: bool) -> Served:
     from dxlrun.cli.sim.sim_views import JsonView, PlainView
     from dxlrun.run.simulation_front import TypedLines, serve
 
     typed = TypedLines(sys.stdin.fileno())
     if as_json:
-        return serve(config, options, JsonView(shown), typed)
+        return serve(job, JsonView(shown), typed)
     if not sys.stdout.isatty() or not typed.in_foreground:
-        return serve(config, options, PlainView(shown), typed)
+        return serve(job, PlainView(shown), typed)
     from dxlrun.cli.sim.sim_views import TableView
 
     view = TableView(shown, out())
     with view.showing():
-        return serve(config, options, view, typed)
+        return serve(job, view, typed)

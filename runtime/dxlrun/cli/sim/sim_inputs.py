@@ -14,7 +14,7 @@ from dxlrun.errors import InputError, Mark, Problem
 
 if TYPE_CHECKING:
     from dxlrun.dynamixel.control_table import ControlTable
-    from dxlrun.simulation import BusConfig
+    from dxlrun.plan.simulation_plan import BusConfig
     from dxlrun.simulation.faults.fault import Fault
 
 Split = Literal["whole", "byte", "random"]
@@ -57,7 +57,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
     """
     from dxlrun.control.controllers.plugins import load_plugins
     from dxlrun.dynamixel.control_table import added_control_tables, control_table
-    from dxlrun.simulation import BusConfig, ServoConfig
+    from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 
     load_plugins()  # they may bring servo models along
     models = _models(words)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console, Group
 
-    from dxlrun.simulation import BusConfig
+    from dxlrun.plan.simulation_plan import BusConfig
     from dxlrun.simulation.messages import ServoLook, SimulationMessage
 
 _LOOK_S = 0.25

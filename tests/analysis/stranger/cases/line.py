@@ -7,7 +7,7 @@ from functools import partial
 from tests.analysis.stranger.expectation import BROKEN, HOST, LATE, SHARED, Case, collector
 from tests.analysis.stranger.kit import JOINTS, MS, Story
 
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 
 CASES: list[Case] = []
 case = collector(CASES)
