@@ -19,6 +19,7 @@ import tempfile
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -177,17 +178,45 @@ def commands(random: Random, joints: list[str], controllers: list[str]) -> Itera
 
 
 def topics(log: Path) -> dict[str, str]:
-    """Return a hash of all messages of each topic."""
+    """Return a hash of all messages of each topic; of packets as format 7 had them, a message a cycle."""
     from mcap.reader import make_reader
 
     found: dict[str, Any] = defaultdict(hashlib.sha256)
     with log.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            if schema and b"cycle_delta" in schema.data:
+                continue
             name = schema.name if schema else ""
             found[f"topic {channel.topic}"].update(
                 f"{name} {message.log_time} {len(message.data)} ".encode() + message.data
             )
+    for topic, log_time, data in packets(log):
+        found[topic].update(f"dxlrun_msgs/msg/BusPackets {log_time} {len(data)} ".encode() + data)
     return {topic: value.hexdigest()[:16] for topic, value in found.items()}
+
+
+def packets(log: Path) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, time and message of each cycle's packets."""
+    import numpy as np
+
+    from dxlrun.log.reader import read_log
+    from dxlrun.messages.cdr import Codec
+    from dxlrun.messages.definition import MessageType
+
+    arrays = "int64[] first_ns\nint64[] duration_ns\nuint8[] kind\nuint8[] servo_id\nuint16[] length\n"
+    codec = Codec(MessageType("dxlrun_msgs/msg/BusPackets", f"int64 cycle\n{arrays}uint8[] data\n"))
+    read = read_log(log)
+    for index, bus in enumerate(read.buses):
+        of_bus = read.packets.take(read.packets.bus == index)
+        begins = [0, *(np.flatnonzero(np.diff(of_bus.cycle)) + 1).tolist(), len(of_bus)]
+        pieces = [at for begin, end in pairwise(begins) for at in range(begin, end, 1000)]
+        for rows in np.split(np.arange(len(of_bus)), pieces[1:]):
+            one = of_bus.take(rows).compact()
+            if len(one):
+                took = one.last_ns - one.first_ns
+                bodies = one.kind.tobytes(), one.servo_id.tobytes(), one.length.astype(np.uint16)
+                data = codec.pack(int(one.cycle[0]), one.first_ns, took, *bodies, one.data.tobytes())
+                yield f"topic /bus/{bus}", int(one.last_ns[-1]) + read.header.epoch_offset_ns, data
 
 
 def run(number: int, tree: Path, directory: Path, show: Path | None) -> dict[str, Any]:
