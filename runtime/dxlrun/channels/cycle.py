@@ -8,10 +8,11 @@ fills arrays, the ring copies once, and the recorder writes what it finds.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag, unique
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -329,74 +330,56 @@ class CycleLayout:
         return slice(places[0], places[-1] + 1) if places else slice(0, 0)
 
 
-class _Word:
-    """A scalar field of 64 bits, by its index in the record."""
+class _Scalars(ctypes.LittleEndianStructure):
+    """The fields that a cycle has once."""
 
-    __slots__ = ("_index",)
-
-    def __init__(self, index: int) -> None:
-        self._index = index
-
-    def __get__(self, record: CycleRecord, owner: type[CycleRecord]) -> int:
-        return record.words[self._index]
-
-    def __set__(self, record: CycleRecord, value: int) -> None:
-        record.words[self._index] = value
+    _fields_ = tuple((name, getattr(ctypes, f"c_{kind}")) for name, kind in SCALARS)
 
 
-class CycleRecord:
+class CycleRecord(_Scalars):
     """One cycle's memory, filled again and again: the arrays that hardware, controllers and gate share.
 
     Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
     """
 
-    __slots__ = (
-        "_renewed",
-        "clamped",
-        "commands",
-        "controller_ns",
-        "device_command",
-        "floats",
-        "goals",
-        "layout",
-        "raw",
-        "reference",
-        "sources",
-        "states",
-        "words",
-    )
-
-    cycle = _Word(0)
+    cycle: int
     """Number of the period since the loop's first deadline, skipped ones counted."""
-    scheduled_ns = _Word(1)
+    scheduled_ns: int
     """The deadline of this cycle: start + cycle * period."""
-    woken_ns = _Word(2)
+    woken_ns: int
     """After the wake-up."""
-    read_ns = _Word(3)
+    read_ns: int
     """After the states were read."""
-    updated_ns = _Word(4)
+    updated_ns: int
     """After the controllers and the gate."""
-    written_ns = _Word(5)
+    written_ns: int
     """After the goals were sent."""
-    period_ns = _Word(6)
+    period_ns: int
     """The true time since the cycle before, as controllers saw it, capped."""
-    skipped = _Word(7)
+    skipped: int
     """Whole periods that were declared skipped before this cycle."""
-    active = _Word(8)
+    active: int
     """Bit i: controller i is active."""
-    published = _Word(9)
+    published: int
     """Bit i: controller i marked this cycle for the topics it publishes."""
-    command_count = _Word(10)
+    command_count: int
     """Commands handed to controllers in this cycle."""
+    _array: NDArray[np.void]
+
+    def __new__(cls, layout: CycleLayout) -> Self:
+        """Lay a record out in memory of its own."""
+        array: NDArray[np.void] = np.zeros(1, dtype=layout.dtype)
+        record = cls.from_buffer(array.view(np.uint8).data)
+        record._array = array
+        return record
 
     def __init__(self, layout: CycleLayout) -> None:
         self.layout = layout
-        array: NDArray[np.void] = np.zeros(1, dtype=layout.dtype)
+        array = self._array
         for name, count in layout.lengths.items():
             array[name] = count
         self.raw: memoryview = array.view(np.uint8).data
         """The bytes of the record; a view, not a copy."""
-        self.words: memoryview = self.raw[: 8 * len(SCALARS)].cast("q")
         self.states = States(
             motion=_rows(array, "position", 3),
             valid=array["valid"][0],
@@ -442,20 +425,22 @@ class CycleRecord:
 
     def renew(self) -> None:
         """Begin a cycle: nothing was published, taken, clamped or updated in it yet."""
-        words = self.words
-        words[9] = words[10] = 0
+        self.published = self.command_count = 0
         for part, nothing in self._renewed:
             part[:] = nothing
 
     def wake(self, cycle: int, scheduled_ns: int, woken_ns: int, period_ns: int) -> None:
         """Take what is known of a cycle when it begins."""
-        words = self.words
-        words[0], words[1], words[2], words[6] = cycle, scheduled_ns, woken_ns, period_ns
+        self.cycle, self.scheduled_ns, self.woken_ns, self.period_ns = (
+            cycle,
+            scheduled_ns,
+            woken_ns,
+            period_ns,
+        )
 
     def set_times(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
         """Take when the parts of a cycle ended."""
-        words = self.words
-        words[3], words[4], words[5] = read_ns, updated_ns, written_ns
+        self.read_ns, self.updated_ns, self.written_ns = read_ns, updated_ns, written_ns
 
     @property
     def valid(self) -> NDArray[np.bool_]:

@@ -22,16 +22,41 @@ def _nothing() -> None:
     """Stand in for the kernel's fence where that was not built."""
 
 
+def library(path: Path = _LIBRARY) -> ctypes.PyDLL:
+    """Return the compiled kernel's functions for shared memory.
+
+    Their calls keep the interpreter: they take no time in which others could have it. Raises OSError where it
+    was not built, AttributeError where it is not a kernel.
+    """
+    found = ctypes.PyDLL(str(path))
+    address = ctypes.c_void_p
+    found.dxl_fence.argtypes, found.dxl_fence.restype = (), None
+    size = ctypes.c_uint64
+    found.dxl_append.argtypes = (address, size, size, ctypes.c_uint32, address, size)
+    found.dxl_append.restype = ctypes.c_int64
+    found.dxl_commit.argtypes, found.dxl_commit.restype = (address, size, size, address), None
+    return found
+
+
+def functions() -> ctypes.PyDLL:
+    """Return the installed kernel's functions; raises StartUpError where it was not compiled."""
+    try:
+        return library()
+    except (OSError, AttributeError):
+        raise StartUpError(MISSING) from None
+
+
+def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
+    """Return memory that can be written as these functions take it; it lives as long as this does."""
+    return (ctypes.c_char * len(memory)).from_buffer(memory)
+
+
 def load(path: Path = _LIBRARY) -> Callable[[], None]:
     """Return the compiled fence; one that does nothing where there is none."""
     try:
-        found = ctypes.PyDLL(
-            str(path)
-        ).dxl_fence  # it takes no time in which others could have the interpreter
+        compiled: Callable[[], None] = library(path).dxl_fence
     except (OSError, AttributeError):
         return _nothing
-    found.argtypes, found.restype = (), None
-    compiled: Callable[[], None] = found
     return compiled
 
 

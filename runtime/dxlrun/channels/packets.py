@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
 
-from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, RingWriter, record_size
 
 LONGEST_BATCH = 16 * 1024
 """Bytes: a batch has the packets of one cycle, of a large robot and of noisy lines in pieces of this size."""
@@ -99,8 +100,9 @@ class PacketLog(PacketSink, Protocol):
         """Note that a cycle begins: what follows is of its period."""
         ...
 
-    def commit(self) -> None:
-        """Hand on what was collected."""
+    @property
+    def commit(self) -> Callable[[], object]:
+        """Hands on what was collected."""
         ...
 
 
@@ -119,7 +121,7 @@ class PacketBatch:
     because a process may be killed between any two.
     """
 
-    __slots__ = ("_batch", "_buffer", "_room", "_words", "_writer")
+    __slots__ = ("_batch", "_buffer", "_room", "_words", "_writer", "commit")
 
     def __init__(
         self, writer: Appender, desk: memoryview | None = None, cycle: int = BEFORE_FIRST_CYCLE
@@ -136,6 +138,10 @@ class PacketBatch:
         self._words[_CYCLE] = cycle + 1 << _MARK_BITS
         if self._room <= _HEADER.size:
             raise ValueError(f"a desk of {self._room} bytes holds no packet")
+        self.commit: Callable[[], object] = self._hand_on
+        """Hands on what was collected; without packets nothing is."""
+        if isinstance(writer, RingWriter):
+            self.commit = writer.commits(desk, len(self._batch))
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
@@ -168,8 +174,8 @@ class PacketBatch:
         words = self._words
         words[_CYCLE] = cycle + 1 << _MARK_BITS | words[_USED]
 
-    def commit(self) -> None:
-        """Hand on what was collected; without packets nothing is."""
+    def _hand_on(self) -> None:
+        # as dxl_commit in kernel.c does, for a reader in the same process
         words = self._words
         if used := words[_USED]:
             position = self._writer.append(RecordKind.PACKETS, self._batch[: _BATCH.size + used])

@@ -8,7 +8,7 @@ Layout of the memory, little-endian, everything aligned to 8 bytes:
 
     header  magic u64, capacity u64, longest record u64, head u64 (end of the last whole record), intent u64
             (end of the record that is being written, or was last), latest u64 (start of the last record),
-            taken u64 (for a reader that lets the writer know how far it is), 8 bytes reserved
+            taken u64 (for a reader that lets the writer know how far it is), number u64 (of the next record)
     record  mark u64 (its position + 1), number u32 (counted from 0, modulo 2^32), length u32, kind u32,
             CRC-32 u32 of these fields and of the payload (zlib, polynomial 0xEDB88320), payload
 
@@ -25,16 +25,18 @@ x86-64 only.
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import mmap
 import os
 import struct
 from collections.abc import Callable
 from enum import IntEnum, unique
+from functools import partial
 from typing import NamedTuple, Protocol
 from zlib import crc32
 
-from dxlrun.channels.fence import fence
+from dxlrun.channels.fence import array_of, fence, functions
 
 RING_SECONDS = 10
 """How long a reader may be away before records are lost, at the rates that the sizes are computed for."""
@@ -101,6 +103,10 @@ class Appender(Protocol):
         """Take one record; return the position behind it."""
         ...
 
+    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+        """Return what appends the present content of some memory, each time it is called."""
+        ...
+
 
 def record_size(length: int) -> int:
     """Return how many bytes of a ring a record takes whose payload has this length."""
@@ -164,41 +170,39 @@ class RingWriter(_Ring):
     """The one writer of a ring; `append` is made for the loop: no wait, no lock, no look at readers.
 
     The pages are touched when it is built, so that the loop does not meet their first use. Continues after
-    the last record when the ring was written before. Raises ValueError when the memory is no ring.
+    the last record when the ring was written before. What writes is in C (`kernel.c`). Raises ValueError when
+    the memory is no ring, StartUpError where the kernel was not compiled.
     """
 
-    __slots__ = ("_number",)
+    __slots__ = ("_append", "_compiled", "_place")
 
-    def __init__(self, memory: int | memoryview) -> None:
+    def __init__(self, memory: int | memoryview, compiled: ctypes.PyDLL | None = None) -> None:
         super().__init__(memory, mmap.MAP_POPULATE)
-        self._number = 0
-        if self.head:
-            start = _HEADER + self._words[_LATEST] % self._capacity
-            self._number = (_FIELDS.unpack_from(self._bytes, start)[1] + 1) % _NUMBERS
+        self._compiled = compiled or functions()
+        self._place = array_of(self._bytes), self._capacity
+        self._append = partial(self._compiled.dxl_append, *self._place, self.longest)
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
         """Copy one record behind the last; return the position behind it. Raises ValueError when too long."""
-        length = len(payload)
+        self._require(len(payload))
+        end: int = self._append(kind, bytes(payload), len(payload))
+        return end
+
+    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+        """Return what appends the present content of some memory, each time it is called."""
+        self._require(len(memory))
+        return partial(self._append, kind, array_of(memory), len(memory))
+
+    def commits(self, desk: memoryview, most: int) -> Callable[[], object]:
+        """Return what appends the batch on a desk, see `PacketBatch`, of at most so many bytes."""
+        self._require(most)
+        return partial(self._compiled.dxl_commit, *self._place, most, array_of(desk))
+
+    def _require(self, length: int) -> None:
         if length > self.longest:
             raise ValueError(
                 f"a record of {length} bytes does not fit this ring, its longest is {self.longest}"
             )
-        words, memory = self._words, self._bytes
-        position = words[_HEAD]
-        end = position + (RECORD_HEADER + length + _WORD - 1) // _WORD * _WORD
-        words[_INTENT] = end
-        fence()  # a reader of what is overwritten now sees the intent before the first byte changes
-        start = _HEADER + position % self._capacity
-        body = start + RECORD_HEADER
-        fields = _FIELDS.pack(position + 1, self._number, length, kind)
-        memory[start : start + _CRC_AT] = fields
-        _CRC.pack_into(memory, start + _CRC_AT, crc32(payload, crc32(fields)))
-        memory[body : body + length] = payload
-        fence()  # and the whole record before the head behind it
-        words[_LATEST] = position
-        words[_HEAD] = end
-        self._number = (self._number + 1) % _NUMBERS
-        return end
 
     @property
     def taken(self) -> int:
@@ -331,3 +335,7 @@ class Handover:
         self._take(kind, payload)
         self.head += 1
         return self.head
+
+    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+        """Return what hands over the present content of some memory, each time it is called."""
+        return partial(self.append, kind, memory)

@@ -48,6 +48,9 @@ class Sinks:
     """Wall time = time of the run's clock + this, for the stamps of messages."""
     wake: Callable[[int], None] = field(init=False)
     """Note that a cycle begins: the packets that follow are of its period."""
+    _commit: Callable[[], object] = field(init=False)
+    _keep: Callable[[], object] = field(init=False)
+    """Records the cycle; its memory is the same in each."""
     ran: int = field(default=0, init=False)
     skipped: int = field(default=0, init=False)
 
@@ -57,13 +60,15 @@ class Sinks:
 
     def begin(self, record: CycleRecord) -> None:
         """Record the packets of the start-up, and what the controllers are activated with."""
-        self.packets.commit()
-        self.cycles.append(RecordKind.CYCLE, record.raw)
+        self._commit = self.packets.commit
+        self._keep = self.cycles.repeat(RecordKind.CYCLE, record.raw)
+        self._commit()
+        self._keep()
 
     def append(self, record: CycleRecord) -> None:
         """Record one finished cycle, and the packets since the one before."""
-        self.packets.commit()
-        self.cycles.append(RecordKind.CYCLE, record.raw)
+        self._commit()
+        self._keep()
         self.ran += 1
         self.skipped += record.skipped
         self.progress(self.ran, self.skipped)

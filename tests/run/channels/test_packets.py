@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import struct
+
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -18,7 +21,7 @@ from dxlrun.channels.packets import (
     salvage,
     split_packets,
 )
-from dxlrun.channels.ring import Handover, Payload, RecordKind, record_size
+from dxlrun.channels.ring import Handover, Payload, RecordKind, RingReader, RingWriter, create, record_size
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(
@@ -175,6 +178,31 @@ def test_each_packet_has_the_cycle_in_whose_period_it_was():
         (9, b"9"),
     ]
     assert len(slots) == 6  # one was full before its time
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.one_of(PACKETS, st.none(), st.integers(0, 2**40)), max_size=30))
+def test_the_kernel_commits_to_a_ring_what_is_handed_over_elsewhere(steps):
+    slots, writer = collected()
+    descriptor = create("packets", 1 << 14, 144)
+    ring, reader = RingWriter(descriptor), RingReader(descriptor)
+    desks = desk_of(128), desk_of(128)
+    batches = [PacketBatch(one, desk) for one, desk in zip((writer, ring), desks, strict=True)]
+    for step in [*steps, None]:
+        for batch in batches:
+            if step is None:
+                batch.commit()
+            elif isinstance(step, int):
+                batch.wake(step)
+            else:
+                batch.packet(step.bus, step.kind, step.servo_id, step.first_ns, step.last_ns, step.data)
+        assert desks[0][16:] == desks[1][16:]
+        position = struct.unpack_from("<Q", desks[1], 8)[0]
+        assert position == ring.head
+    os.close(descriptor)
+    found = list(iter(reader.read, None))
+    assert [record.payload for record in found] == slots
+    assert {record.kind for record in found} <= {RecordKind.PACKETS}
 
 
 def test_what_a_dead_process_left_keeps_its_cycles():

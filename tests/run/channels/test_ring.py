@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import random
+import shutil
 import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -27,8 +30,9 @@ from dxlrun.channels.ring import (
 from dxlrun.errors import StartUpError
 
 HEADER = 64
-HEAD, INTENT, LATEST, TAKEN = 24, 32, 40, 48
+HEAD, INTENT, LATEST, TAKEN, NUMBER = 24, 32, 40, 48, 56
 KINDS = list(RecordKind)
+SOURCE = Path(fence.__file__).parents[1] / "dynamixel" / "exchange" / "kernel.c"
 
 
 @pytest.fixture
@@ -164,11 +168,15 @@ def test_a_record_that_comes_behind_its_head_is_awaited_and_none_is_lost(make):
     assert reader.read() is None
 
 
-def test_the_writer_fences_intent_record_and_head(make, monkeypatch):
+def test_the_writer_fences_intent_record_and_head(make, tmp_path):
     descriptor, seen = make(128, 16), []
-    writer = RingWriter(descriptor)
-    append(writer, b"one")
-    monkeypatch.setattr(ring, "fence", lambda: seen.append(os.pread(descriptor, 256, 0)))
+    options = ["-O2", "-fPIC", "-shared", "-DAT_FENCE", "-o", tmp_path / "libkernel.so"]
+    subprocess.run([shutil.which("cc") or "cc", *options, SOURCE, "-lm"], check=True)
+    compiled = fence.library(tmp_path / "libkernel.so")
+    at_fence = ctypes.CFUNCTYPE(None)(lambda: seen.append(os.pread(descriptor, 256, 0)))
+    append(RingWriter(descriptor), b"one")
+    writer = RingWriter(descriptor, compiled)
+    ctypes.c_void_p.in_dll(compiled, "dxl_at_fence").value = ctypes.cast(at_fence, ctypes.c_void_p).value
     before = os.pread(descriptor, 256, 0)
     append(writer, b"two")
     after = os.pread(descriptor, 256, 0)
@@ -297,7 +305,7 @@ def test_a_second_writer_goes_on_where_the_first_ended(make):
 def test_numbers_go_round_without_a_gap(make):
     descriptor = make(256, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    writer._number = reader._number = 2**32 - 2
+    writer._words[NUMBER // 8] = reader._number = 2**32 - 2
     for text in (b"a", b"b", b"c"):
         append(writer, text)
         assert all_of(reader) == [event(text)]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, Floats, States
-from dxlrun.channels.fence import MISSING
+from dxlrun.channels.fence import MISSING, array_of
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
@@ -257,8 +257,8 @@ class Kernel:
         self._room = NEVER
         if desk is not None:
             self._room = len(desk.records)
-            self._kernel.desk = _address(desk.records)
-            self._kernel.used = _address(desk.used)
+            self._kernel.desk = ctypes.addressof(array_of(desk.records))
+            self._kernel.used = ctypes.addressof(array_of(desk.used.cast("B")))
             self._kernel.desk_room = self._room
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
         self.read: Callable[[], int] = partial(self._library.dxl_read, self._pointer)
@@ -542,7 +542,3 @@ def _data(array: NDArray[np.generic]) -> int:
     if not array.flags.c_contiguous:
         raise ValueError("the kernel takes contiguous arrays only")
     return array.ctypes.data
-
-
-def _address(memory: memoryview) -> int:
-    return ctypes.addressof(ctypes.c_char.from_buffer(memory))
