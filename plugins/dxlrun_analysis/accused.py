@@ -21,6 +21,7 @@ _OF_TIME = frozenset(
         *(code for code in _REPLIES if code not in SPOILT),
         *("missing_replies", "servo_lost", "device_lost", "slow_writes"),
         *("late_wake_ups", "rough_wake_ups", "busy_machine", "own_work", "long_cycle"),
+        "stream_ran_out",
     )
 )
 """Codes of what a machine that is too busy does too; also to the replies of a real servo, which wait for the

@@ -186,11 +186,18 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
         joints = counted(len(waited), "joint", "joints")
         sentence = (
             f"States of {joints} on bus {_joined(buses)} were invalid, in up to {most:.1%} of the cycles, as "
-            "whole chains of replies were missing: it is the line, or the first servo of the chain"
+            f"whole chains of replies were missing: either {_head(totals, buses)} is silent, or the "
+            "instruction is lost on the line"
         )
     yield Finding(
         "invalid_states", subject, f"{sentence}; {INVALID_SHARE:.0%} tolerated.", rank=Rank.SHARE, share=most
     )
+
+
+def _head(totals: RunTotals, buses: Sequence[str]) -> str:
+    """Return the first servo of the chains of some buses, with its name where it is always the same."""
+    heads = [one for one in totals.servos if one.bus in buses and one.losses and one.losses.broken_off]
+    return "the first servo of the chain" + (f", {_name(heads[0])}," if len(heads) == 1 else "")
 
 
 def _waited(totals: RunTotals, counts: Mapping[str, int]) -> set[str]:

@@ -30,6 +30,7 @@ _REASONS = {
     "another_host": "another host sent on bus {subject}",
     "noise": "noise on bus {subject}",
     "sensor_hangs": "sensor {subject} hung",
+    "device_hangs": "device {subject} stood still",
     "jammed_joint": "{subject} was blocked",
     "bus_lost": "bus {subject} was lost",
     "device_lost": "device {subject} was lost",

@@ -19,6 +19,7 @@ from dxlrun.channels.events import (
 from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
+from dxlrun_analysis.conduct.clients import Clients
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
@@ -90,6 +91,7 @@ class Tally:
         self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
         self._trends, self._tracking = Trends(), Tracking()
         self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
+        self._clients = Clients()
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
         self._granted = False
@@ -100,6 +102,7 @@ class Tally:
         for take in (
             *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
             *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
+            self._clients.take,
         ):
             take(log)
         for event in log.events:
@@ -145,7 +148,7 @@ class Tally:
             damage=log.damage,
             findings=(
                 *(*self._traffic.findings, *movement, *self._trends.findings(movement)),
-                *self._sensors.findings(),
+                *(*self._sensors.findings(), *self._clients.findings()),
             ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlrun_analysis.report import analyze_log
-from dxlrun_analysis.servos.joint_states import BIN_DEG, JointStates
-from dxlrun_analysis.servos.losses import Losses, concentration
+from dxlrun_analysis.servos.joint_states import BIN_DEG, SPEEDS, STEP_RAD_S, JointStates
+from dxlrun_analysis.servos.losses import Fast, Losses, ServoLosses, concentration, when_fast
 
 Make = Callable[..., Any]
 BINS = 720 // BIN_DEG
@@ -156,3 +156,47 @@ def test_losses_that_come_together_by_chance_or_of_all_are_no_cable(
     episodes: list[tuple[float, int]],
 ) -> None:
     assert lost(*episodes)._group(0) == ((), 0)
+
+
+SPEED = np.abs(np.cos(np.arange(5000) * 0.05)) * 2.0
+"""rad/s of a joint that swings; it is faster than 1 rad/s for two thirds of the time."""
+
+
+def by_speed(lost: Any, begun: Any = None) -> tuple[Any, Any, Any]:
+    """Time of a swinging joint, lost replies and episodes, by bins of its speed."""
+    edges = np.append(np.arange(SPEEDS) * STEP_RAD_S, np.inf)
+    counts = [np.histogram(SPEED[rows], edges)[0] for rows in (slice(None), lost, lost[::3])]
+    return counts[0], counts[1], counts[2] if begun is None else begun
+
+
+def test_losses_at_high_speed_are_found_with_both_shares() -> None:
+    fast = np.random.default_rng(2).choice(np.flatnonzero(SPEED > 1.5), 30, replace=False)
+    found = when_fast(*by_speed(fast))
+    assert found is not None
+    assert found.rad_s == pytest.approx(1.6, abs=0.11)
+    assert found.lost_share >= 0.9
+    assert found.time_share == pytest.approx(np.mean(found.rad_s <= SPEED), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("rows", "one_time"),
+    [(np.arange(5000), False), (np.flatnonzero(SPEED > 0.4), False), (np.flatnonzero(SPEED > 1.5), True)],
+    ids=["at any speed", "at nearly any", "one interruption"],
+)
+def test_other_losses_do_not_depend_on_the_speed(rows: Any, one_time: bool) -> None:
+    begun = np.eye(SPEEDS, dtype=np.int64)[18] if one_time else None
+    for seed in range(300):
+        chance = np.random.default_rng(seed)
+        lost = chance.choice(rows, int(chance.integers(1, 60)), replace=False)
+        assert when_fast(*by_speed(lost, begun)) is None
+
+
+def test_of_a_joint_that_loses_replies_when_it_is_fast_it_is_said_and_of_one_of_many_not() -> None:
+    states = JointStates(["main"], ["knee", "other"])
+    states.joint_of[1:3] = range(2)
+    losses = {1: ServoLosses(500, 40, 9, fast=Fast(1.0, 0.97, 0.3)), 2: ServoLosses(500, 2, 2)}
+    bus = LoggedBus("main", servos=[LoggedServo(joint="knee", servo_id=1)])
+    (finding,) = Losses(states).findings(0, bus, losses)
+    assert (finding.code, finding.subject) == ("loose_cable", "knee")
+    assert "97% of 40 above 57 deg/s, where it was for 30% of the time" in finding.sentence
+    assert not list(Losses(states).findings(0, bus, {**losses, 2: ServoLosses(500, 30, 9)}))

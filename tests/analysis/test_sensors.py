@@ -15,7 +15,7 @@ from dxlrun.plan.loop_plan import SensorPlan
 from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.finding import Rank
 
-Floats = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating[Any]]
 TIME = np.arange(600) * 0.01
 """6 s"""
 NOISE = np.random.default_rng(1).normal(size=600)
@@ -23,17 +23,28 @@ MOVES = np.sin(TIME)
 HANGS = np.where(TIME < 2.0, NOISE, NOISE[199])
 
 
-def findings(values: Floats, joint: Floats = MOVES, name: str = "gyro") -> list[Any]:
-    kinds = [("position", np.float64, 1), ("source_valid", np.bool_, 1), ("source_state", np.float64, 2)]
-    cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds])
-    cycles["read_ns"], cycles["source_valid"] = 10**9 + np.rint(TIME * 1e9).astype(np.int64), True
-    cycles["position"][:, 0], cycles["source_state"][:, 0] = joint, values
-    sensors, layout = Sensors(), SimpleNamespace(source_slice=lambda name: slice(0, 2))
-    plan = {"loop": loop_of(sensors=(SensorPlan(name, "", "", "{}", ("x", "y"), 1, 1),))}
+def findings(
+    values: Floats,
+    joint: Floats = MOVES,
+    name: str = "gyro",
+    kind: str = "sensor",
+    valid: npt.NDArray[np.bool_] | None = None,
+) -> list[Any]:
+    values = values if values.ndim > 1 else np.stack([values, values], axis=1)
+    states = tuple("xyz"[: values.shape[1]])
+    kinds = [("position", np.float64, 1), ("source_valid", np.bool_, 1)]
+    cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds, ("source_state", np.float64, len(states))])
+    cycles["read_ns"] = 10**9 + np.rint(TIME * 1e9).astype(np.int64)
+    cycles["source_valid"][:, 0] = True if valid is None else valid
+    cycles["position"][:, 0], cycles["source_state"] = joint, values
+    sensors, layout = Sensors(), SimpleNamespace(source_slice=lambda name: slice(0, len(states)))
+    sensor = (SensorPlan(name, "", "", "{}", states, 1, 1),)
+    device = {"name": "main", "devices": [{"name": name, "servo_id": 101}]}
+    plan = {"loop": loop_of(sensors=sensor)} if kind == "sensor" else {"buses": [device]}
     for begin in range(0, len(TIME), 170):
         part: Any = SimpleNamespace(
             cycles=cycles[begin : begin + 170],
-            header=SimpleNamespace(sources={"gyro": ("x", "y")}, layout=layout),
+            header=SimpleNamespace(sources={"gyro": states}, layout=layout),
             attachments={"plan.json": json.dumps(plan).encode()},
             metadata={},
         )
@@ -61,3 +72,75 @@ def test_a_sensor_whose_values_stay_while_joints_move_hangs() -> None:
 )
 def test_one_that_has_a_reason_does_not(values: Floats, joint: Floats, name: str) -> None:
     assert findings(values, joint, name) == []
+
+
+def test_a_sensor_that_was_lost_meanwhile_did_not_hang() -> None:
+    gone = np.where((TIME > 2.0) & (TIME < 5.0), NOISE[200], NOISE)
+    assert findings(gone)
+    assert not findings(gone, valid=(TIME <= 2.0) | (TIME >= 5.0))
+
+
+# Devices, and values that trembled
+
+CELLS: Floats = 40.0 + np.random.default_rng(2).integers(-4, 5, size=(600, 3))
+"""Forces that tremble by some steps."""
+RESTS = np.zeros(600)
+
+
+def still(from_s: float, *cells: int, at: float = 41.0) -> Floats:
+    """Cells of which some stand still from a time on."""
+    found = np.array(CELLS, np.float64)
+    for cell in cells:
+        found[from_s <= TIME, cell] = at
+    return found
+
+
+@pytest.mark.parametrize("joint", [MOVES, RESTS], ids=["joints move", "at rest"])
+@pytest.mark.parametrize(("from_s", "seconds"), [(1.0, 5.0), (4.0, 2.0)])
+def test_a_device_whose_trembling_values_stand_still_hangs(
+    joint: Floats, from_s: float, seconds: float
+) -> None:
+    (finding,) = findings(still(from_s, 0, 1, 2), joint, kind="device")
+    assert (finding.code, finding.subject, finding.rank) == ("device_hangs", "gyro", Rank.SERVO_CAUSE)
+    assert "Device gyro (ID 101 on bus main) stands still: x, y, z were unchanged" in finding.sentence
+    assert f"for {seconds:.1f} s while it answered, from {from_s:.1f} s" in finding.sentence
+
+
+def test_one_value_that_stands_still_beside_others_is_named_alone() -> None:
+    (finding,) = findings(still(3.0, 1), RESTS, kind="device")
+    assert (finding.code, finding.rank) == ("device_hangs", Rank.CAUSE)
+    assert "stands still: y was unchanged to the bit for 3.0 s" in finding.sentence
+    assert "its other values went on" in finding.sentence
+
+
+TWO_STEPS = np.where(TIME[:, None] < 3.0, np.random.default_rng(3).integers(12, 14, size=(600, 3)), 12.0)
+WALKS = np.round(40 + 9 * np.sin(TIME[:, None] * np.array([9.0, 10.0, 11.0])))
+
+
+@pytest.mark.parametrize(
+    ("values", "joint"),
+    [
+        (CELLS, MOVES),
+        (still(3.0, 0, 1, 2, at=0.0), MOVES),
+        (still(3.0, 1, at=0.0), MOVES),
+        (still(3.0, 0, 1, 2, at=60.0), MOVES),
+        (np.where(TIME[:, None] < 3.0, CELLS, 41.0), np.where(TIME < 3.0, MOVES, MOVES[299])),
+        (TWO_STEPS, MOVES),
+        (np.where(TIME[:, None] < 3.0, WALKS, WALKS[299]), MOVES),
+        (np.where((TIME % 3 < 1.5)[:, None], 0.0, np.ones(3)), MOVES),
+        (np.full((600, 3), 29.0), MOVES),
+        (still(5.5, 0, 1, 2), MOVES),
+    ],
+    ids=[
+        *("trembles", "in the air", "one in the air", "at its end", "stands on it", "two steps"),
+        *("follows the walk", "buttons", "a model number", "half a second"),
+    ],
+)
+def test_a_device_with_another_reason_does_not_hang(values: Floats, joint: Floats) -> None:
+    assert findings(values, joint, kind="device") == []
+
+
+def test_a_device_that_was_silent_meanwhile_does_not_hang() -> None:
+    gone = np.where(((TIME > 2.0) & (TIME < 5.0))[:, None], CELLS[200], CELLS)
+    assert findings(gone, kind="device")
+    assert not findings(gone, kind="device", valid=(TIME <= 2.0) | (TIME >= 5.0))

@@ -74,6 +74,20 @@ def test_a_supply_that_falls_with_the_load_of_all_is_that_of_the_bus() -> None:
     assert "from 12.0 V" in sentence or "from 11." in sentence
 
 
+@pytest.mark.parametrize(
+    "rises", [np.minimum(5.0, TIME), np.full(len(TIME), 5.0)], ids=["creeps up", "all of it"]
+)
+def test_a_supply_above_the_limit_of_its_servos_does_not_run_down(rises: Floats) -> None:
+    ((code, subject, sentence),) = findings(volts(None, -rises), errors=[1, 1, 1, 1])
+    assert (code, subject) == ("overvoltage", "main")
+    assert "up to 17.0 V, and its servos may have 16.0 V" in sentence
+
+
+def test_one_servo_that_measures_too_much_is_not_the_supply() -> None:
+    assert findings(volts(2, -5.0)) == []
+    assert findings(volts(None, -4.0)) == []
+
+
 def test_a_supply_that_falls_with_the_load_of_one_servo_is_its_own() -> None:
     ((code, subject, sentence),) = findings(volts(2, 2.5 * LOADS[:, 2]))
     assert (code, subject) == ("own_supply", "j2")
@@ -119,7 +133,7 @@ def test_a_battery_that_gets_empty_does_not_sag_under_load() -> None:
 def test_a_voltage_that_most_servos_report_is_that_of_their_bus() -> None:
     ((code, subject, sentence),) = findings(volts(None, 4.0), errors=[1, 1, 1, 0])
     assert (code, subject) == ("undervoltage", "main")
-    assert "The voltage of bus main is out of its limits: 8.0 to 8.0 V." in sentence
+    assert "The voltage of bus main is out of its limits of 9.5 to 16.0 V: 8.0 to 8.0 V." in sentence
 
 
 @pytest.mark.parametrize(("heat", "code"), [(200.0, "temperature_sensor"), (75.0, "hot_joint")])

@@ -74,6 +74,7 @@ def log_of(found: list[LoggedPacket]) -> Any:
         packets=PacketColumns.of(found),
         attachments={"plan.json": PLAN},
         cycles=(),
+        events=(),
         joints=(),
         metadata={},
     )

@@ -1,9 +1,19 @@
-"""Sensors that hang: no value changes while joints move, for much longer than ever before."""
+"""Sensors and devices that hang: they answer, and their values are the same to the bit.
+
+All times are those in which the values were valid, and so that long is told only where it is ten times as
+long as the values ever stayed before, and a second at least.
+
+- A sensor hangs where no value changes while joints move.
+- Values that trembled stand still: of their last 40 changes 16 went back, to one of so many values that it
+  was noise, and where most of them stay is no end of what they had, as that of a foot in the air is. It is
+  told of a device, or a sensor, where all that trembled stay at once, while joints move or as they trembled
+  at rest, too; and of one value where the others still tremble.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,74 +21,226 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 from dxlrun.log.reader import Log
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.plan import plan_of
+from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _HANGS_S = 1.0
 _TIMES_LONGER = 10
 """Than ever before: those of a switch stay for long, and of a simulated sensor without noise at rest."""
 _MOVED_RAD = 0.1
 """A robot at rest may have a sensor, a simulated one, that measures the same."""
+_RESTED_RAD = 0.02
+_CHANGES = 40
+"""So many of the last ones show whether a value trembles ..."""
+_REVERSALS = 16
+"""... as so many of them go back: a measured movement goes one way for longer."""
+_FEWEST_VALUES = 4
+"""A voltage between two steps has two."""
+_FEWEST_ALONE = 8
+"""Of one value, while others still tremble."""
+_MOST_NAMED = 4
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Stay:
+    """The longest time for which something stayed as it was."""
+
+    hung_s: float = 0.0
+    from_s: float = 0.0
+    usual_s: float = 0.0
+    """The longest time before."""
+    moved: bool = False
+    """Joints did, meanwhile."""
+    values: int = 0
+    """That it had in the changes before, where it trembled; 0: it did not."""
+    inside: bool = False
+    """It had greater and smaller values, and is not 0."""
+    rested: bool = False
+    """It trembled while no joint moved."""
 
 
 @dataclass(slots=True)
-class _Sensor:
-    begin_ns: int
+class _Watched:
+    """One value, or all of a source: when it changed, and how long it stayed."""
+
     since_ns: int
     """The last change."""
-    values: Floats
     position: Floats
     """Of the joints, at that change."""
+    moved: bool = False
+    """Since then."""
     longest_ns: int = 0
     """Between two changes."""
-    hung_s: float = 0.0
-    from_s: float = 0.0
+    low: float = np.inf
+    high: float = -np.inf
+    recent: Floats = field(default_factory=lambda: np.zeros(0))
+    """The values of the last changes ..."""
+    places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """... and the positions of the joints at each."""
+    stay: _Stay = field(default_factory=_Stay)
 
-    def take(self, at_ns: NDArray[np.int64], values: Floats, position: Floats) -> None:
-        """Take values in cycles, shape (cycles, states), with where the joints were."""
-        changed = (np.vstack([self.values, values[:-1]]) != values).any(axis=1)
+    def take(self, at_ns: Times, values: Floats, changed: NDArray[np.bool_], position: Floats) -> None:
+        """Take cycles; `at_ns`: valid time since the first one; `values`: of one value, else zeros."""
         rows = np.flatnonzero(changed)
         times = np.concatenate([[self.since_ns], at_ns[rows], at_ns[-1:]])
-        gaps = np.diff(times)
-        longest = np.maximum.accumulate(np.append(self.longest_ns, gaps))
-        for gap in np.flatnonzero(gaps > max(_HANGS_S, self.hung_s) * 1e9).tolist():
+        longest = np.maximum.accumulate(np.append(self.longest_ns, np.diff(times)))
+        recent = np.append(self.recent, values[rows])
+        places = np.vstack([self.places.reshape(-1, position.shape[1]), position[rows]])
+        kept = len(self.recent)
+        for gap in np.flatnonzero(np.diff(times) > max(_HANGS_S, self.stay.hung_s) * 1e9).tolist():
             begin, end = times[gap : gap + 2].tolist()
+            if end - begin <= _TIMES_LONGER * longest[gap] or not longest[gap]:
+                continue
             there = position[rows[gap - 1]] if gap else self.position
             during = position[(at_ns >= begin) & (at_ns <= end)]
-            moved = np.abs(during - there).max(initial=0.0) > _MOVED_RAD
-            if longest[gap] and moved and end - begin > _TIMES_LONGER * longest[gap]:
-                self.hung_s, self.from_s = (end - begin) * 1e-9, (begin - self.begin_ns) * 1e-9
+            moved = bool(np.abs(during - there).max(initial=0.0) > _MOVED_RAD) or (not gap and self.moved)
+            upto = slice(max(0, kept + gap - _CHANGES), kept + gap)
+            low = min(self.low, recent[: kept + gap].min(initial=np.inf))
+            high = max(self.high, recent[: kept + gap].max(initial=-np.inf))
+            at = recent[kept + gap - 1] if kept + gap else 0.0
+            rested = len(places[upto]) > 1 and float(np.ptp(places[upto], axis=0).max()) < _RESTED_RAD
+            inside = bool(low < at < high and at != 0.0)
+            self.stay = _Stay(
+                (end - begin) * 1e-9,
+                begin * 1e-9,
+                int(longest[gap]) * 1e-9,
+                moved,
+                _trembled(recent[upto]),
+                inside,
+                rested,
+            )
         if len(rows):
-            self.since_ns, self.position = int(at_ns[rows[-1]]), position[rows[-1]].copy()
+            self.since_ns, self.position, self.moved = int(at_ns[rows[-1]]), position[rows[-1]].copy(), False
+            self.low, self.high = min(self.low, recent.min()), max(self.high, recent.max())
+            self.recent, self.places = recent[-_CHANGES:].copy(), places[-_CHANGES:].copy()
+        since = position[rows[-1] :] if len(rows) else position
+        self.moved |= bool(np.abs(since - self.position).max(initial=0.0) > _MOVED_RAD)
         self.longest_ns = int(longest[-2])  # the last one may go on
-        self.values = values[-1].copy()
+
+
+class _Source:
+    """The values of one sensor or device."""
+
+    def __init__(self, at_ns: int, values: Floats, position: Floats) -> None:
+        self._at_ns, self._lived_ns, self._was_valid, self._last = at_ns, 0, True, values
+        self.all = _Watched(0, position)
+        self.each = [_Watched(0, position) for _ in values]
+
+    def take(self, at_ns: Times, valid: NDArray[np.bool_], values: Floats, position: Floats) -> None:
+        """Take cycles, shape (cycles, values), with where the joints were."""
+        between = np.diff(at_ns, prepend=self._at_ns)
+        between[~valid | ~np.append(self._was_valid, valid[:-1])] = 0
+        lived = (self._lived_ns + np.cumsum(between))[valid]
+        self._at_ns, self._was_valid = int(at_ns[-1]), bool(valid[-1])
+        values, position = values[valid], position[valid]
+        if not len(values):
+            return
+        self._lived_ns = int(lived[-1])
+        changed = np.vstack([self._last, values[:-1]]) != values
+        self._last = values[-1].copy()
+        self.all.take(lived, np.zeros(len(lived)), changed.any(axis=1), position)
+        for one, mine, column in zip(self.each, changed.T, values.T, strict=True):
+            one.take(lived, column, mine, position)
 
 
 class Sensors:
-    """Finds sensors that hang, in memory that does not grow with the log."""
+    """Finds sensors and devices that hang, in memory that does not grow with the log."""
 
     def __init__(self) -> None:
-        self._sensors: dict[str, _Sensor] = {}
+        self._sources: dict[str, _Source] = {}
+        self._plan, self._states = LoggedPlan(), dict[str, tuple[str, ...]]()
 
     def take(self, log: Log) -> None:
         """Take the cycles of the next slice."""
-        for name in {one.name for one in plan_of(log).loop.sensors} & log.header.sources.keys():
-            valid = log.cycles["source_valid"][:, list(log.header.sources).index(name)]
-            values = np.nan_to_num(log.cycles["source_state"][valid][:, log.header.layout.source_slice(name)])
-            at_ns, position = log.cycles["read_ns"][valid], np.nan_to_num(log.cycles["position"][valid])
-            if len(values) and values.shape[1]:
-                begin = _Sensor(int(at_ns[0]), int(at_ns[0]), values[0], position[0])
-                self._sensors.setdefault(name, begin).take(at_ns, values, position)
+        if not len(log.cycles):
+            return
+        self._plan, self._states = plan_of(log), dict(log.header.sources)
+        known = {one.name for one in self._plan.loop.sensors}
+        known |= {device.name for bus in self._plan.buses for device in bus.devices}
+        position, at_ns = np.nan_to_num(log.cycles["position"]), log.cycles["read_ns"]
+        for index, (name, states) in enumerate(self._states.items()):
+            if name not in known or not states:
+                continue
+            valid = log.cycles["source_valid"][:, index]
+            values = np.nan_to_num(log.cycles["source_state"][:, log.header.layout.source_slice(name)])
+            if name not in self._sources:
+                if not valid.any():
+                    continue
+                first = int(np.argmax(valid))
+                valid, values = valid[first:], values[first:]
+                self._sources[name] = _Source(int(at_ns[first]), values[0], position[first])
+                self._sources[name].take(at_ns[first:], valid, values, position[first:])
+            else:
+                self._sources[name].take(at_ns, valid, values, position)
 
     def findings(self) -> Iterable[Finding]:
-        """Name the sensors that hung."""
-        for name, one in self._sensors.items():
-            if one.hung_s:
+        """Name the sensors and devices that hung."""
+        sensors = {one.name for one in self._plan.loop.sensors}
+        for name, one in self._sources.items():
+            whole, stays = one.all.stay, [each.stay for each in one.each]
+            still = {
+                state: stay
+                for state, stay in zip(self._states[name], stays, strict=True)
+                if stay.values >= _FEWEST_VALUES
+            }
+            lively = sum(_trembled(each.recent) >= _FEWEST_VALUES for each in one.each)
+            inside = sum(stay.inside for stay in still.values())
+            if name in sensors and whole.hung_s and whole.moved:
                 yield Finding(
                     "sensor_hangs",
                     name,
-                    f"Sensor {name} hangs: all its values were the same for {one.hung_s:.1f} s while joints "
-                    f"moved, from {one.from_s:.1f} s of the run on, and changed all the time before.",
+                    f"Sensor {name} hangs: all its values were the same for {whole.hung_s:.1f} s while "
+                    f"joints moved, from {whole.from_s:.1f} s of the run on, and changed all the time "
+                    "before.",
                     "Look at its driver and its plug: samples came, but nothing was measured.",
                     Rank.SERVO_CAUSE,
                     5.0,
                 )
+            elif still and len(still) == lively and _at_once(still.values()):
+                if 2 * inside >= lively and any(each.moved or each.rested for each in still.values()):
+                    stay = max(still.values(), key=lambda stay: stay.from_s)
+                    yield self._stands(name, _listed(list(still)), stay, Rank.SERVO_CAUSE)
+            else:
+                for state, stay in still.items():
+                    if stay.values >= _FEWEST_ALONE and stay.inside and lively > len(still):
+                        others = "; its other values went on"
+                        yield self._stands(name, f"{state} was", stay, Rank.CAUSE, others)
+
+    def _stands(self, name: str, what: str, stay: _Stay, rank: Rank, others: str = "") -> Finding:
+        found = [(bus, each) for bus in self._plan.buses for each in bus.devices if each.name == name]
+        where = "".join(f" (ID {each.servo_id} on bus {bus.name})" for bus, each in found)
+        return Finding(
+            "device_hangs" if found else "sensor_hangs",
+            name,
+            f"{'Device' if found else 'Sensor'} {name}{where} stands still: {what} unchanged to the bit for "
+            f"{stay.hung_s:.1f} s while it answered, from {stay.from_s:.1f} s of the run on"
+            f"{others}; before, it trembled, and stayed for {stay.usual_s * 1e3:.0f} ms at most.",
+            "Its values are old: look at what it measures with, and switch it off and on.",
+            rank,
+            5.0,
+        )
+
+
+def _trembled(values: Floats) -> int:
+    """Return how many values the last changes had where they trembled; 0: they did not."""
+    values = values[-_CHANGES:]
+    steps = np.diff(values)
+    if len(values) < _CHANGES or np.count_nonzero(steps[1:] * steps[:-1] < 0) < _REVERSALS:
+        return 0
+    return len(np.unique(values))
+
+
+def _at_once(stays: Collection[_Stay]) -> bool:
+    """Return whether values stood still from the same moment on, as far as their changes before tell it."""
+    begins = [stay.from_s for stay in stays]
+    return max(begins) - min(begins) <= max(stay.usual_s for stay in stays) + 0.1
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _MOST_NAMED
+    return (
+        ", ".join(names[:_MOST_NAMED])
+        + (f" and {more} more" if more > 0 else "")
+        + (" was" if len(names) == 1 else " were")
+    )

@@ -16,6 +16,7 @@ from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
+_LOWEST_VOLTS, _HIGHEST_VOLTS = ("min_voltage_limit",), ("max_voltage_limit",)
 _GAINS = ("position_p_gain", "p_gain")
 _SOFTEST = 3.0
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
@@ -31,6 +32,9 @@ class PlannedJoint:
     """As sentences name them"""
     hottest: float = math.nan
     """The temperature limit, deg C"""
+    lowest_volts: float = math.nan
+    highest_volts: float = math.nan
+    """The limits of its servos' supply, V"""
     top_effort: float = math.nan
     """In the unit of its effort"""
     speed: float = math.inf
@@ -64,6 +68,12 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 mine[0].bus.name,
                 ", ".join(f"servo {one.servo.servo_id} on bus {one.bus.name}" for one in mine),
                 np.fmin.reduce([_register(one, _LIMITS, math.nan, shipped=True) for one in mine]).item(),
+                np.fmax.reduce(
+                    [_register(one, _LOWEST_VOLTS, math.nan, shipped=True) for one in mine]
+                ).item(),
+                np.fmin.reduce(
+                    [_register(one, _HIGHEST_VOLTS, math.nan, shipped=True) for one in mine]
+                ).item(),
                 1.0 if joint.top_effort is None else joint.top_effort,
                 joint.highest_speed,
                 sum(one.share * _register(one, _ACCELERATIONS, math.inf) for one in mine),

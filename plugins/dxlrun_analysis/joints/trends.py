@@ -1,10 +1,10 @@
 """Temperature, voltage and load of each joint over the run, in bins that double when the run outgrows them.
 
-What they show: a joint that gets hot or is overloaded, and a supply that is too low or sags under load:
-that of the bus, where the voltages of most servos fall together, or of one servo, where the others stay.
-Limits are those of the models' control tables as shipped, or of the robot file's `registers`. Bits of the
-hardware error: ROBOTIS e-Manual, Protocol 2.0, Hardware Error Status (70); Protocol 1.0, Error of the status
-packet.
+What they show: a joint that gets hot or is overloaded, and a supply that is too high, too low or sags under
+load: that of the bus, where the voltages of most servos fall together, or of one servo, where the others
+stay. Limits are those of the models' control tables as shipped, or of the robot file's `registers`. Bits of
+the hardware error: ROBOTIS e-Manual, Protocol 2.0, Hardware Error Status (70); Protocol 1.0, Error of the
+status packet.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ _NEAR_LIMIT_C = 10.0
 """The run warns at this distance from Temperature Limit, too."""
 _SAG = 0.03
 """Part of its voltage by which a supply that sags falls."""
+_STEP_V = 0.1
+"""Voltages are read in such steps."""
 _LEAST_V = 0.3
-"""Voltages are read in steps of 0.1 V."""
 _FEWEST_VOLTAGES = 6
 _FEWEST_OTHERS = 2
 _DIPS_S = 1.5
@@ -191,6 +192,20 @@ class Trends:
         """Name the supply of a bus or of one servo; voltages in shape (bins, members)."""
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
         reported = self._errors[members] & _VOLTAGE != 0
+        joints = [self._joints[index] for index in members]
+        above = highest > np.array([joint.highest_volts for joint in joints]) + _STEP_V / 2
+        if 2 * above.sum() > len(members):
+            limit = min(joint.highest_volts for joint in joints)
+            yield Finding(
+                "overvoltage",
+                bus,
+                f"The supply of bus {bus} is too high: up to {highest.max():.1f} V, and its servos may have "
+                f"{limit:.1f} V; the lowest in the run was {lowest.min():.1f} V.",
+                "Take it off, and check the supply, its setting, or the charger and the number of cells.",
+                Rank.CAUSE,
+                4.0,
+            )
+            return
         falls = lowest < (1 - _SAG) * highest
         samples = [one for one in self._samples if one.joint in members]
         if 2 * falls.sum() > len(members) > 1 and _falls_with_load(samples):
@@ -212,13 +227,18 @@ class Trends:
                 yield found
         if reported.any():
             alone = reported.sum() == 1 < len(members)
-            names = [self._joints[index].name for index in members[reported]]
+            names = [joint.name for joint, bad in zip(joints, reported, strict=True) if bad]
+            low, high = (
+                max(joint.lowest_volts for joint in joints),
+                min(joint.highest_volts for joint in joints),
+            )
             where = f"bus {bus}" if 2 * len(names) > len(members) > 1 else ", ".join(names)
             known = np.isfinite(lowest[reported]).any()
             yield Finding(
                 "undervoltage",
                 names[0] if alone else bus,
                 f"The voltage of {where} is out of its limits"
+                + (f" of {low:.1f} to {high:.1f} V" if math.isfinite(high - low) else "")
                 + (f": {lowest[reported].min():.1f} to {highest[reported].max():.1f} V." if known else "."),
                 "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
                 Rank.CAUSE,

@@ -22,6 +22,9 @@ _IDS = 256
 BIN_DEG = 5
 ANGLES = 720 // BIN_DEG
 """From -360 to 360 deg; what is beyond is in the outer ones."""
+STEP_RAD_S = 0.1
+SPEEDS = 200
+"""From 0 to 20 rad/s; what is faster is in the last one."""
 PLACES = ANGLES + 112
 """Then 0 to 111 deg C, with what is beyond in the outer ones, too."""
 _MOST_HELD = 200_000
@@ -36,6 +39,8 @@ class Places:
     """Their numbers, ascending; shape (cycles,)."""
     angle: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     temperature: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    speed: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    """In bins of 0.1 rad/s"""
 
 
 class JointStates:
@@ -50,6 +55,8 @@ class JointStates:
         """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
         self.time_ns, self.crossed = (np.zeros((len(joints), PLACES), np.int64) for _ in range(2))
         """How long each joint was at each place, and how often it came to it from below or left it so."""
+        self.speed_ns = np.zeros((len(joints), SPEEDS), np.int64)
+        """How long each joint was how fast."""
         self._held: list[tuple[Numbers, Numbers, Floats, NDArray[np.bool_], Floats]] = []
         indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}
@@ -85,6 +92,7 @@ class JointStates:
             known = np.isfinite(angle[:, row])
             if known.any() and not known.all():
                 angle[:, row] = np.interp(numbers, numbers[known], angle[known, row])
+        speed = _speeds(numbers, period_ns, angle)[:end]
         self._held = [(numbers[end:], period_ns[end:], angle[end:], usable[end:], heat[end:])]
         binned = np.floor(np.degrees(np.nan_to_num(angle[:end])) / BIN_DEG).astype(np.int64) + ANGLES // 2
         known = usable[:end] & np.isfinite(angle[:end])
@@ -94,7 +102,13 @@ class JointStates:
         temperatures = np.where(known, np.clip(degrees, ANGLES, PLACES - 1), -1)
         for places in (angles, temperatures):
             self._count(places, period_ns[:end])
-        return Places(numbers[:end], angles, temperatures)
+        known = usable[:end] & np.isfinite(speed)
+        steps = np.minimum(np.nan_to_num(speed) / STEP_RAD_S, SPEEDS - 1).astype(np.int64)
+        speeds = np.where(known, steps, -1)
+        for row, mine in enumerate(speeds.T):
+            ns = period_ns[:end][mine >= 0]
+            self.speed_ns[row] += np.bincount(mine[mine >= 0], ns, SPEEDS).astype(np.int64)
+        return Places(numbers[:end], angles, temperatures, speeds)
 
     def _count(self, places: Numbers, period_ns: Numbers) -> None:
         for row, mine in enumerate(places.T):
@@ -109,6 +123,15 @@ class JointStates:
         share = float(self.share[self.joint_of[servo]])
         factor, unit = (math.degrees(1.0), "deg") if share == 1.0 else (share * 1e3, "mm")
         return f"between {low * factor:.0f} and {high * factor:.0f} {unit}"
+
+
+def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
+    """Return how fast each joint was between the cycles around each, rad/s, in shape (cycles, joints)."""
+    found = np.full(angle.shape, np.nan)
+    if len(numbers) > 2:
+        took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)
+        found[1:-1] = np.abs(angle[2:] - angle[:-2]) / took_s[:, None]
+    return found
 
 
 def edge_rad(place: int) -> float:

@@ -12,14 +12,19 @@ episodes began; the angle at a lost reply is taken from the states before and be
 has at least 90 % of the episodes, and four times as large a share of them as of the time: six of them, or
 five in a tenth of the time.
 
+At which speed: the same with bins of 0.1 rad/s, but for all lost replies, and above a speed, where at least
+90 % of them are, in four episodes, and which the joint had in at most 60 % of the time; five times as often.
+
 Together: episodes of several servos that begin within 0.2 s, while the others of the bus answer.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +34,15 @@ from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss, Numbers
-from dxlrun_analysis.servos.joint_states import ANGLES, BIN_DEG, JointStates, Places, edge_rad
+from dxlrun_analysis.servos.joint_states import (
+    ANGLES,
+    BIN_DEG,
+    SPEEDS,
+    STEP_RAD_S,
+    JointStates,
+    Places,
+    edge_rad,
+)
 
 _ROWS = 40
 _EPISODE_NS = 200_000_000
@@ -44,8 +57,14 @@ _TIMES_MORE = 4.0
 """So much more often than by the time spent there a reply is missing in a range that is named."""
 _INSIDE = 0.9
 """Share of the episodes in it."""
+_SLOWEST = 3
+"""Bins of speeds below which a joint hardly moves."""
+_FEWEST_FAST, _FEWEST_TIMES, _MOST_TIME, _FAST_MORE = 12, 4, 0.6, 5.0
+"""Of losses at high speed: replies, episodes, share of the time, and how much more often than else."""
 _EVEN = 0.6
 """A servo that has more of all episodes of its bus loses them alone."""
+_ALONE = 0.8
+"""A servo that has so many of the lost replies of its bus is named for losing them when it is fast."""
 _SHORTER = 0.4
 _LOSSY_LINE = 10
 """Episodes of a whole bus from which its line is named."""
@@ -69,6 +88,16 @@ class AngleRange:
     """Of the run that the joint was there."""
 
 
+class Fast(NamedTuple):
+    """The speed above which a joint's replies go missing."""
+
+    rad_s: float
+    lost_share: float
+    """Of its lost replies."""
+    time_share: float
+    """Of the run that the joint was so fast."""
+
+
 @dataclass(frozen=True, slots=True)
 class ServoLosses:
     """One servo's own missing replies."""
@@ -77,8 +106,12 @@ class ServoLosses:
     """Those that it could have answered: nobody before it in a chain was missing."""
     lost: int
     episodes: int
+    broken_off: int = 0
+    """Reads of several in which it answers first, of which nothing came."""
     angles: AngleRange | None = None
     """The range of angles in which they are, where chance is excluded."""
+    fast: Fast | None = None
+    """The speed above which they are."""
 
 
 class Losses:
@@ -96,6 +129,8 @@ class Losses:
         self._answered_before = np.full(servos, -1, np.int64)
         """The same before the last loss."""
         self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
+        self._fast, self._begun_fast = np.zeros((2, len(states.share), SPEEDS), np.int64)
+        """Lost replies, and episodes, by the joint's speed."""
         self._episodes_at: list[tuple[int, int, int]] = []
         """Bus, time in ns and ID of each servo's own."""
 
@@ -132,7 +167,7 @@ class Losses:
         columns = (bus[begun], exchanges.asked_ns[exchange[begun]], servo[begun] % IDS)
         at = list(zip(*(column.tolist() for column in columns), strict=True))
         self._episodes_at += at[: _MOST_EPISODES - len(self._episodes_at)]
-        self._count_angles(servo, exchanges.cycle[exchange], begins, places)
+        self._count_places(servo, exchanges.cycle[exchange], begins, places)
 
     def _begins(self, exchanges: Exchanges, servo: Numbers, exchange: Numbers) -> NDArray[np.bool_]:
         """Return which losses begin an episode: its servo has answered since the last, a while ago."""
@@ -150,16 +185,22 @@ class Losses:
             self._answered_before[one], self._last_ns[one] = before[at], at_ns
         return begins
 
-    def _count_angles(
+    def _count_places(
         self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], places: Places
     ) -> None:
         joint = self._states.joint_of[servo]
         row = np.searchsorted(places.cycle, cycle)
         usable = (joint >= 0) & (row < len(places.cycle))
-        joint, angle, begins = joint[usable], places.angle[row[usable], joint[usable]], begins[usable]
-        known = angle >= 0
-        for counts, which in ((self._lost_at, known), (self._begun, known & begins)):
-            np.add.at(counts, (joint[which], angle[which]), 1)
+        joint, begins = joint[usable], begins[usable]
+        angle = places.angle[row[usable], joint]
+        speed = places.speed[row[usable], joint]
+        for places_of, all_of_them, those_that_begin in (
+            (angle, self._lost_at, self._begun),
+            (speed, self._fast, self._begun_fast),
+        ):
+            known = places_of >= 0
+            for counts, which in ((all_of_them, known), (those_that_begin, known & begins)):
+                np.add.at(counts, (joint[which], places_of[which]), 1)
 
     # Results
 
@@ -168,13 +209,19 @@ class Losses:
         found = {}
         for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
             row = int(self._states.joint_of[servo])
-            angles = None
+            angles = fast = None
             if row >= 0:
+                fast = when_fast(self._states.speed_ns[row], self._fast[row], self._begun_fast[row])
                 angles = concentration(
                     self._states.time_ns[row, :ANGLES], self._begun[row], self._lost_at[row]
                 )
             found[divmod(servo, IDS)] = ServoLosses(
-                int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
+                int(self._asked[servo]),
+                int(self._lost[servo]),
+                int(self._episodes[servo]),
+                int(self._broken_off[servo]),
+                angles,
+                fast,
             )
         return found
 
@@ -194,8 +241,11 @@ class Losses:
                 0.5,
             )
             losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
-        loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
-        for servo_id, angles in loose.items():
+        loose: dict[int, AngleRange | Fast] = {}
+        for servo_id, each in losses.items():
+            if (angles := each.angles) is None:
+                continue
+            loose[servo_id] = angles
             where = self._states.range_text(index * IDS + servo_id, angles.low, angles.high)
             name = names.get(servo_id, "")
             yield Finding(
@@ -205,6 +255,26 @@ class Losses:
                 f"{counted(angles.episodes, 'time', 'times')} there, where it spent "
                 f"{angles.time_share:.0%} of the time.",
                 "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
+                Rank.CAUSE,
+                1.0,
+            )
+        all_lost = sum(each.lost for each in losses.values())
+        for servo_id, each in losses.items():
+            if each.fast is None or servo_id in loose or each.lost < _ALONE * all_lost:
+                continue
+            loose[servo_id] = each.fast
+            name, share = (
+                names.get(servo_id, ""),
+                self._states.share[self._states.joint_of[index * IDS + servo_id]],
+            )
+            factor, unit = (math.degrees(1.0), "deg/s") if share == 1.0 else (share * 1e3, "mm/s")
+            yield Finding(
+                "loose_cable",
+                name,
+                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies when it is fast: "
+                f"{each.fast.lost_share:.0%} of {each.lost} above {each.fast.rad_s * factor:.0f} {unit}, "
+                f"where it was for {each.fast.time_share:.0%} of the time: a contact that shakes.",
+                "Shake its plugs and its cable while it is read, and those on the way to it.",
                 Rank.CAUSE,
                 1.0,
             )
@@ -348,3 +418,22 @@ def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | 
     bins = np.flatnonzero(lost[low[best] : high[best]]) + low[best]
     first, last = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (int(low[best]), int(high[best]))
     return AngleRange(edge_rad(first), edge_rad(last), int(inside[best]), float(share[best]))
+
+
+def when_fast(time: Numbers, lost: Numbers, begun: Numbers) -> Fast | None:
+    """Return the speed above which a joint's replies go missing; None where it does not depend on it.
+
+    Of each bin: how long the joint was so fast, lost replies, episodes that began. The module has the rule.
+    """
+    total, in_all = int(lost.sum()), int(time.sum())
+    if total < _FEWEST_FAST or not in_all:
+        return None
+    above, times, share = (np.cumsum(each[::-1])[::-1] for each in (lost, begun, time / in_all))
+    slow_rate = (total - above) / np.maximum(1.0 - share, 1e-9)
+    enough = (above >= _INSIDE * total) & (times >= _FEWEST_TIMES) & (share <= _MOST_TIME) & (share > 0)
+    enough &= above >= _FAST_MORE * slow_rate * share
+    enough[:_SLOWEST] = False
+    if not enough.any():
+        return None
+    at = int(np.flatnonzero(enough)[-1])
+    return Fast(at * STEP_RAD_S, float(above[at] / total), float(share[at]))

@@ -19,9 +19,11 @@ from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Loss, Numbers, instruction_of
+from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 
 _FEWEST = 3
-"""Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits."""
+"""Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits.
+Of those that write items of a servo one is enough."""
 _MOST_NAMED = 3
 _ALL = 0.9
 """Of the instructions from which an adapter always echoes, which it may."""
@@ -37,11 +39,14 @@ class OtherHosts:
     def __init__(self, buses: int) -> None:
         self._sent, self._pieces = Counts(), Counts()
         self._stray, self._lost, self._echoes, self._asked = np.zeros((4, buses), np.int64)
+        self.writes = ForeignWrites()
 
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
         others, due = exchanges.others, exchanges.due
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
+        for packet in others:
+            self.writes.take(packet.bus, exchanges.buses[packet.bus], packet)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
         self._pieces.take(*_ends(stray, second[stray.bus]))
@@ -85,7 +90,8 @@ class OtherHosts:
             )
         values, counts = self._of(index)
         total = int(counts.sum())
-        if total < _FEWEST:
+        written, failed = self.writes.of(index)
+        if total < _FEWEST and not written:
             return ()
         instructions = values // IDS
         codes = sorted(set(instructions.tolist()), key=lambda code: -int(counts[instructions == code].sum()))
@@ -95,17 +101,18 @@ class OtherHosts:
         ]
         if len(codes) > _MOST_NAMED:
             kinds.append("others")
+        wrote = f"; it wrote {written}" if written else ""
         where = f" (`fuser {bus.port}` shows it)" if bus.port else ""
         return (
             Finding(
                 "another_host",
                 bus.name,
                 f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} "
-                f"that this run did not send ({', '.join(kinds)}).",
+                f"that this run did not send ({', '.join(kinds)}){wrote}.",
                 f"Stop the other program{where}, or unplug the other adapter: its packets collide with those "
                 "of the run, and its commands move the same servos.",
                 Rank.CAUSE,
-                1.5 if self.explains(index) else 0.0,
+                5.0 if failed else 1.5 if self.explains(index) else 0.0,
             ),
         )
 

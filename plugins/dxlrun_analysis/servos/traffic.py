@@ -142,6 +142,8 @@ class Traffic:
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
         exchanges = self._pairing.take(log)
         self._states.take(log)
+        for event in log.events:
+            self._others.writes.failed(event)
         self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:

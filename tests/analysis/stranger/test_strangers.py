@@ -16,25 +16,14 @@ from tests.analysis.stranger.campaign import CASES, PAIRS
 from tests.analysis.stranger.expectation import Case, judged
 from tests.conftest import SEED as COMMIT
 
-_FIRST = "the first reply of a read is missing: by its servo, or by the instruction; too few of single servos"
 _LOAD = "its position follows as before: only its load tells"
-_SPEED = "it is said that its states are often invalid, and not that they are so where it is fast"
 _GOOD = "the run is good, and no joint is told of"
-_BAUD = "it is told as lost, and not that its baud rate was written"
 _SWINGS = "it swings too little for the rule of what swings by itself"
-_FLAP = "it is told that the run was steered, and not that controllers were switched in turns"
-_GASPS = "it is told that the run was steered, and not that its stream ran out"
-_DEVICE = "devices are not watched for standing still"
 UNNAMED = {
-    ("head_of_the_chain_is_silent", "x_three"): _FIRST,
     ("gain_lost", "ax_single"): "it is 4.5 deg away at most, on a side where it was not before",
     ("horn_slips", "mx_two"): _LOAD,
     ("horn_slips", "x_three"): _LOAD,
     ("corroded_crimp", "mx_two"): "its voltage is 2 V lower nearly from the start, as if it measured less",
-    ("contact_fails_when_it_moves_fast", "ax_single"): _SPEED,
-    ("contact_fails_when_it_moves_fast", "x_three"): _SPEED,
-    ("baud_rate_written", "mx_two"): _BAUD,
-    ("baud_rate_written", "x_three"): _BAUD,
     ("foot_slips", "mx_bulk"): _GOOD,
     ("foot_slips", "x_sync"): _GOOD,
     ("rubber_band", "ax_single"): _GOOD,
@@ -45,12 +34,6 @@ UNNAMED = {
     ("dry_bearing_on_a_busy_machine", "x_fast"): _GOOD,
     ("own_gain_too_high", "x_fast"): _SWINGS,
     ("own_gain_too_high", "x_three"): _SWINGS,
-    ("controllers_flap", "mx_two"): _FLAP,
-    ("controllers_flap", "x_sync"): _FLAP,
-    ("stream_gasps", "mx_two"): _GASPS,
-    ("stream_gasps", "x_fast"): _GASPS,
-    ("foot_board_hangs", "mx_bulk"): _DEVICE,
-    ("foot_board_hangs", "x_fast"): _DEVICE,
 }
 """Pairs that are known not to be named, and why."""
 COUNT = int(os.environ.get("DXLRUN_STRANGERS", "4"))

@@ -1,0 +1,154 @@
+"""What another host wrote to the servos of the plan: which items, to which servo, and what failed then.
+
+One instruction is enough, where noise has to look like several: it is intact, has the ID of a servo, and
+begins and ends with items of its control table. Sources: ROBOTIS e-Manual, Protocol 1.0 and 2.0, Write, Reg
+Write, Sync Write, Bulk Write, Factory Reset and Reboot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from dxlrun.channels.events import Event, EventCode
+from dxlrun.channels.packets import LoggedPacket
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.plan.transaction import BROADCAST_ID
+from dxlrun_analysis.plan import LoggedBus, LoggedServo
+
+_FAILED = {
+    EventCode.SERVO_REBOOTED: "rebooted",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_LIMP: "lost its torque",
+}
+_AFTER_NS = 2_000_000_000
+"""A servo that fails so soon after it was written to fails by that."""
+_MOST_KEPT = 1000
+_MOST_NAMED = 3
+_HEADER_2 = b"\xff\xff\xfd\x00"
+_WRITES = (protocol1.Instruction.WRITE, protocol1.Instruction.REG_WRITE)
+_RESETS = {
+    protocol2.Instruction.REBOOT: "a reboot",
+    protocol2.Instruction.FACTORY_RESET: "a factory reset",
+}
+
+
+class _Write(NamedTuple):
+    """One item that was written to one servo."""
+
+    t_ns: int
+    bus: int
+    servo_id: int
+    name: str
+    """As the joint is called."""
+    what: str
+    """`baud_rate`, or `a reboot`."""
+    value: int | None
+
+
+class ForeignWrites:
+    """Collects what other hosts wrote, and when servos failed."""
+
+    def __init__(self) -> None:
+        self._writes: list[_Write] = []
+        self._failures: list[Event] = []
+
+    def take(self, bus: int, plan: LoggedBus, packet: LoggedPacket) -> None:
+        """Take an instruction that this run did not send."""
+        if len(self._writes) < _MOST_KEPT:
+            self._writes += _written(bus, plan, packet)
+
+    def failed(self, event: Event) -> None:
+        """Note an event where it says that a servo failed."""
+        if event.code in _FAILED and len(self._failures) < _MOST_KEPT:
+            self._failures.append(event)
+
+    def of(self, bus: int) -> tuple[str, bool]:
+        """Return what was written on a bus, as the end of a sentence, and whether a servo failed by it."""
+        writes = [one for one in self._writes if one.bus == bus]
+        ends = {
+            one.name: event
+            for event in reversed(self._failures)
+            for one in writes
+            if one.name == event.source and 0 <= event.t_ns - one.t_ns <= _AFTER_NS
+        }
+        told = [one for one in writes if one.name in ends] or writes
+        parts = []
+        # those that did not fail are told by ID: nothing is wrong with them
+        by_items: dict[str, list[tuple[int, str]]] = {}
+        for servo_id in dict.fromkeys(one.servo_id for one in told):
+            last = {one.what: one for one in told if one.servo_id == servo_id}
+            shown = list(last.values())[-_MOST_NAMED:]
+            items = " and ".join(
+                f"{one.what}{'' if one.value is None else f' = {one.value}'}" for one in shown
+            )
+            if (name := shown[-1].name) in ends:
+                then = _FAILED[EventCode(ends[name].code)]
+                parts.append(f"{items} to {name} (ID {servo_id}), which {then} then")
+            else:
+                by_items.setdefault(" and ".join(last), []).append((servo_id, items))
+        for names, each in by_items.items():
+            ids = [str(servo_id) for servo_id, _ in each]
+            items = each[0][1] if len({items for _, items in each}) == 1 else names
+            more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""
+            parts.append(f"{items} to {'IDs' if len(ids) > 1 else 'ID'} {', '.join(ids[:_MOST_NAMED])}{more}")
+        more = f"; and to {len(parts) - _MOST_NAMED} more" if len(parts) > _MOST_NAMED else ""
+        return "; ".join(parts[:_MOST_NAMED]) + more, bool(ends)
+
+
+def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write]:
+    """Yield the items that an instruction writes to servos of the plan, and resets."""
+    data = packet.data
+    second = data.startswith(_HEADER_2)
+    at = 4 if second else 2
+    if len(data) <= at + (3 if second else 2):
+        return
+    code = data[at + 3] if second else data[at + 2]
+    if code in _RESETS:
+        for servo in _addressed(plan, data[at]):
+            what = _RESETS[protocol2.Instruction(code)]
+            yield _Write(packet.first_ns, bus, servo.servo_id, servo.joint, what, None)
+        return
+    body = protocol2.unstuffed(data[8:-2]) if second else data[5:-1]
+    for servo_id, address, written in _parts(data[at], code, body, 2 if second else 1):
+        for servo in _addressed(plan, servo_id):
+            for name, value in _items(plan, servo, address, written):
+                yield _Write(packet.first_ns, bus, servo.servo_id, servo.joint, name, value)
+
+
+def _parts(servo_id: int, code: int, body: bytes, width: int) -> Iterator[tuple[int, int, bytes]]:
+    """Yield ID, address and data of what is written; addresses and sizes have `width` bytes."""
+    if code in _WRITES:
+        yield servo_id, int.from_bytes(body[:width], "little"), body[width:]
+    elif code == protocol2.Instruction.SYNC_WRITE:
+        address, size = (int.from_bytes(body[at : at + width], "little") for at in (0, width))
+        for at in range(2 * width, len(body) - size, size + 1):
+            yield body[at], address, body[at + 1 : at + 1 + size]
+    elif code == protocol2.Instruction.BULK_WRITE:
+        at = 0
+        while at + 5 <= len(body):
+            address, size = (int.from_bytes(body[at + i : at + i + 2], "little") for i in (1, 3))
+            yield body[at], address, body[at + 5 : at + 5 + size]
+            at += 5 + size
+
+
+def _addressed(plan: LoggedBus, servo_id: int) -> list[LoggedServo]:
+    return [servo for servo in plan.servos if servo_id in (servo.servo_id, BROADCAST_ID)]
+
+
+def _items(plan: LoggedBus, servo: LoggedServo, address: int, data: bytes) -> list[tuple[str, int]]:
+    """Return the items that some bytes fill, from the first byte to the last; none: they do not."""
+    try:
+        items = control_table(servo.model, plan.protocol).items
+    except LookupError:  # a plug-in's model that is not installed here
+        return []
+    sizes = {item.address: (name, item.size) for name, item in items.items()}
+    found, at = [], 0
+    while at < len(data):
+        name, size = sizes.get(address + at, ("", 0))
+        if not name or at + size > len(data):
+            return []
+        found.append((name, int.from_bytes(data[at : at + size], "little")))
+        at += size
+    return found

@@ -1,0 +1,110 @@
+"""What another host wrote to servos is told, with what failed then; what it only may have written is not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from dxlrun.channels.events import Event, EventCode, Severity
+from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun_analysis.plan import LoggedBus, LoggedServo
+from dxlrun_analysis.servos.foreign_writes import ForeignWrites
+
+S = 10**9
+WIRES: dict[float, Any] = {1.0: protocol1, 2.0: protocol2}
+MODELS = {1.0: "MX-28", 2.0: "XM430-W350"}
+NAMES = ("hip", "knee", "foot")
+
+
+def told(
+    protocol: float, *sent: bytes, failures: tuple[tuple[str, EventCode, float], ...] = ()
+) -> tuple[str, bool]:
+    """What is told of instructions at 1 s, with failures at their times, s."""
+    model = MODELS[protocol]
+    servos = [LoggedServo(joint=name, servo_id=at, model=model) for at, name in enumerate(NAMES, 3)]
+    bus, writes = LoggedBus("main", protocol=protocol, servos=servos), ForeignWrites()
+    for data in sent:
+        writes.take(0, bus, LoggedPacket(0, PacketKind.OTHER_HOST, 254, S, S, data))
+    for name, code, at_s in failures:
+        writes.failed(Event(round(at_s * S), code, Severity.ERROR, name, ""))
+    assert writes.of(1) == ("", False)
+    return writes.of(0)
+
+
+def item(protocol: float, name: str) -> tuple[int, int]:
+    entry = control_table(MODELS[protocol], protocol).items[name]
+    return entry.address, entry.size
+
+
+def write(protocol: float, servo_id: int, name: str, value: int, more: bytes = b"") -> bytes:
+    address, size = item(protocol, name)
+    packet: bytes = WIRES[protocol].write(servo_id, address, value.to_bytes(size, "little") + more)
+    return packet
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_what_was_written_to_which_servo_and_what_failed_then(protocol: float) -> None:
+    sent = write(protocol, 4, "torque_enable", 0), write(protocol, 4, "baud_rate", 3)
+    assert told(protocol, *sent, failures=(("knee", EventCode.SERVO_LOST, 1.2),)) == (
+        "torque_enable = 0 and baud_rate = 3 to knee (ID 4), which was lost then",
+        True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "name", "at_s", "by_it"),
+    [
+        (EventCode.SERVO_LOST, "knee", 2.9, True),
+        (EventCode.SERVO_LIMP, "knee", 1.1, True),
+        (EventCode.SERVO_LOST, "knee", 0.9, False),
+        (EventCode.SERVO_LOST, "knee", 3.1, False),
+        (EventCode.SERVO_LOST, "hip", 1.1, False),
+        (EventCode.SERVO_BACK, "knee", 1.1, False),
+    ],
+)
+def test_a_servo_that_failed_before_or_much_later_did_not_by_it(
+    code: EventCode, name: str, at_s: float, by_it: bool
+) -> None:
+    text, failed = told(1.0, write(1.0, 4, "id", 9), failures=((name, code, at_s),))
+    assert failed is by_it
+    assert text.startswith("id = 9 to knee (ID 4)" if by_it else "id = 9 to ID 4")
+    assert (" then" in text) is by_it
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_all_servos_that_an_instruction_means_are_told(protocol: float) -> None:
+    address, size = item(protocol, "torque_enable")
+    several = WIRES[protocol].sync_write(address, size, {3: b"\0", 5: b"\1", 9: b"\0"})
+    assert told(protocol, several) == (
+        "torque_enable to IDs 3, 5",
+        False,
+    )
+    everybody = WIRES[protocol].factory_reset(254, *([protocol2.Reset.ALL] if protocol > 1 else []))
+    text, _ = told(protocol, everybody)
+    assert text == "a factory reset to IDs 3, 4, 5"
+
+
+def test_of_a_bulk_write_each_part_is_told() -> None:
+    address, _ = item(2.0, "torque_enable")
+    part = bytes((4, address, 0, 1, 0, 0))
+    data = protocol2.instruction_packet(254, protocol2.Instruction.BULK_WRITE, part + b"\5" + part[1:])
+    assert told(2.0, data) == ("torque_enable = 0 to IDs 4, 5", False)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        protocol1.ping(4),
+        protocol1.read(4, 36, 2),
+        write(1.0, 9, "id", 1),
+        protocol1.write(4, 31, b"\1"),
+        write(1.0, 4, "goal_position", 1, b"\1"),
+        b"\xff\xff\x04",
+    ],
+    ids=["a ping", "a read", "nobody", "no item begins there", "half an item", "a piece"],
+)
+def test_what_writes_no_item_of_a_servo_is_not_told(sent: bytes) -> None:
+    assert told(1.0, sent) == ("", False)
