@@ -14,7 +14,7 @@ from dxlrun.channels.slot import SlotReader, SlotWriter
 from dxlrun.contract.body import Shafts
 from dxlrun.plan.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint
 from dxlrun.run.sensor_process import RemoteBody
-from dxlrun.simulation.motion.body import SensedBody, ShaftsShown, SimulatedBody, quaternion
+from dxlrun.simulation.motion.body import SensedBody, ShaftsShown, SimulatedBody
 from dxlrun.simulation.motion.control_law import LIMP
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor
@@ -117,12 +117,6 @@ def test_gears_references_couplings_and_mimic_joints_move_links():
 def test_an_unknown_link_is_a_key_error():
     with pytest.raises(KeyError, match="nose"):
         body_of(CRANE, ["turn"]).motion("nose")
-
-
-def test_quaternions_are_right_at_half_turns_too():
-    for axis in np.eye(3):
-        turn = 2.0 * np.outer(axis, axis) - np.eye(3)
-        assert np.abs(quaternion(turn)) == pytest.approx([*axis, 0.0], abs=1e-12)
 
 
 def test_the_body_in_another_process_moves_as_in_this_one():

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from random import Random
 
 import msgspec
 
+from dxlrun.description.frames.transform import (
+    NO_TURN,
+    Quaternion,
+    Transform,
+    Vector,
+    product,
+    rotated,
+    turn,
+)
 from dxlrun.dynamixel.control_table.device_table import DeviceItem
 from dxlrun.plan.simulation_plan import Shown
 
 STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
 ROOM_CELSIUS = 25.0
 _AXES = "xyzw"
+_UNIT: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _VECTORS = {"angular_velocity": 3, "linear_acceleration": 3, "orientation": 4}
 _TURNS = ("roll", "pitch", "yaw")
 
@@ -23,11 +33,11 @@ class Measured(msgspec.Struct):
     """The world around one device, in SI units."""
 
     volts: float
-    angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular_velocity: Vector = (0.0, 0.0, 0.0)
     """rad/s, in the device's own axes."""
-    linear_acceleration: tuple[float, float, float] = (0.0, 0.0, STANDARD_GRAVITY)
+    linear_acceleration: Vector = (0.0, 0.0, STANDARD_GRAVITY)
     """m/s^2, in the device's own axes; gravity counts as upward, as of every accelerometer at rest."""
-    orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    orientation: Quaternion = NO_TURN
     """Quaternion x, y, z, w of the device in the world."""
     celsius: float = ROOM_CELSIUS
     update: Callable[[], None] = lambda: None
@@ -38,29 +48,25 @@ class Measured(msgspec.Struct):
 
         `angle` returns how far it is turned, rad, and how fast, rad/s.
         """
-        index, update = _AXES.index(axis), self.update
+        update, about = self.update, _UNIT[axis]
         upright = self.angular_velocity, self.linear_acceleration, self.orientation
 
         def tipped() -> None:
             self.angular_velocity, self.linear_acceleration, self.orientation = upright
             update()
             turned, speed = angle()
-            rates = _turned_back(self.angular_velocity, index, turned)
-            rates[index] += speed
-            self.angular_velocity = rates[0], rates[1], rates[2]
-            pull = _turned_back(self.linear_acceleration, index, turned)
-            self.linear_acceleration = pull[0], pull[1], pull[2]
-            self.orientation = _turned(self.orientation, index, turned)
+            back = turn(about, -turned)
+            x, y, z = rotated(back, self.angular_velocity)
+            self.angular_velocity = x + speed * about[0], y + speed * about[1], z + speed * about[2]
+            self.linear_acceleration = rotated(back, self.linear_acceleration)
+            self.orientation = product(self.orientation, turn(about, turned))
 
         self.update = tipped
 
     @property
-    def roll_pitch_yaw(self) -> tuple[float, float, float]:
+    def roll_pitch_yaw(self) -> Vector:
         """The orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
-        x, y, z, w = self.orientation
-        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return Transform(rotation=self.orientation).rpy
 
 
 def shown(
@@ -84,30 +90,6 @@ def shown(
         if value is not None or noise:
             live[name] = _reading(item, value or _constant(0.0), noise, random)
     return live
-
-
-def _turned_back(vector: Sequence[float], axis: int, angle: float) -> list[float]:
-    """Return a vector in the axes of a frame that is turned about one of them, shape (3,)."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    turned = list(vector)
-    turned[first] = math.cos(angle) * vector[first] + math.sin(angle) * vector[second]
-    turned[second] = math.cos(angle) * vector[second] - math.sin(angle) * vector[first]
-    return turned
-
-
-def _turned(
-    quaternion: tuple[float, float, float, float], axis: int, angle: float
-) -> tuple[float, float, float, float]:
-    """Return an orientation that is turned about one of its own axes: q (x, y, z, w) times that turn."""
-    own = [0.0, 0.0, 0.0]
-    own[axis] = math.sin(angle / 2)
-    (x, y, z, w), (i, j, k), c = quaternion, own, math.cos(angle / 2)
-    return (
-        w * i + x * c + y * k - z * j,
-        w * j - x * k + y * c + z * i,
-        w * k + x * j - y * i + z * c,
-        w * c - x * i - y * j - z * k,
-    )
 
 
 def _constant(value: float) -> Callable[[], float]:

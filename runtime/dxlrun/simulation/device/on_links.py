@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from dxlrun.contract.body import LinkMotion, Shafts
+from dxlrun.description.frames.transform import rotated
 from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.device.measured import STANDARD_GRAVITY, Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice
@@ -44,13 +45,10 @@ def _feeling(
 
 
 def feel(world: Measured, motion: LinkMotion) -> None:
-    """Let a device measure the motion of its link: an accelerometer at rest shows gravity upward.
-
-    Gravity in the link's axes is the third row of the rotation that the orientation's quaternion means.
-    """
+    """Let a device measure the motion of its link: an accelerometer at rest shows gravity upward."""
     x, y, z, w = motion.orientation.tolist()
-    up = np.array((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
-    ax, ay, az = (motion.linear_acceleration + STANDARD_GRAVITY * up).tolist()
+    pull = np.array(rotated((-x, -y, -z, w), (0.0, 0.0, STANDARD_GRAVITY)))
+    ax, ay, az = (motion.linear_acceleration + pull).tolist()
     gx, gy, gz = motion.angular_velocity.tolist()
     world.linear_acceleration, world.angular_velocity = (ax, ay, az), (gx, gy, gz)
     world.orientation = (x, y, z, w)

@@ -8,7 +8,6 @@ test compares. The URDF's first link stands still at the world's origin, z up.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 
 import msgspec
@@ -17,15 +16,26 @@ import numpy as np
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.contract.body import Floats, LinkMotion, Shafts
 from dxlrun.description.frames import urdf as frames
+from dxlrun.description.frames.transform import (
+    NO_TURN,
+    Quaternion,
+    Vector,
+    conjugate,
+    from_rpy,
+    near,
+    product,
+    rotated,
+    turn,
+)
 from dxlrun.description.frames.urdf import read_urdf
 from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.motion.mechanics import Mechanics
 
 
 class _Step(msgspec.Struct, frozen=True):
-    offset: Floats  # m, of the joint in the link before
-    rotation: Floats  # Of the joint's frame in the link before, at 0
-    axis: Floats  # Unit vector in the joint's frame
+    offset: Vector  # m, of the joint in the link before
+    rotation: Quaternion  # Of the joint's frame in the link before, at 0
+    axis: Vector  # Unit vector in the joint's frame
     slides: bool
     joint: int  # Which of the joints that shafts move, or that it follows; -1: none
     scale: float  # Coordinate = scale * that joint's + at
@@ -56,14 +66,14 @@ class SimulatedBody:
 
     def motion(self, link: str) -> LinkMotion:
         """Return how a link moves. Raises KeyError for one that the URDF does not have."""
-        turn, position = np.eye(3), np.zeros(3)
+        facing, position = NO_TURN, np.zeros(3)
         speed, rate, gain, spin = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         for step in self._chain(link):
-            arm = turn @ step.offset
+            arm = np.array(rotated(facing, step.offset))
             position = position + arm
             gain = gain + _cross(spin, arm) + _cross(rate, _cross(rate, arm))
             speed = speed + _cross(rate, arm)
-            turn = turn @ step.rotation
+            facing = product(facing, step.rotation)
             if step.joint < 0 and not step.at:
                 continue
             q, dq, ddq = step.at, 0.0, 0.0
@@ -71,7 +81,7 @@ class SimulatedBody:
                 q += step.scale * self._place.item(step.joint)
                 dq = step.scale * self._speed.item(step.joint)
                 ddq = step.scale * self._gain.item(step.joint)
-            axis = turn @ step.axis
+            axis = np.array(rotated(facing, step.axis))
             if step.slides:
                 way = axis * q
                 position = position + way
@@ -79,10 +89,12 @@ class SimulatedBody:
                 gain = gain + 2 * dq * _cross(rate, axis) + ddq * axis
                 speed = speed + _cross(rate, way) + dq * axis
             else:
-                turn = turn @ _about(step.axis, q)
+                facing = product(facing, turn(step.axis, q))
                 spin = spin + ddq * axis + dq * _cross(rate, axis)
                 rate = rate + dq * axis
-        return LinkMotion(position, quaternion(turn), speed, turn.T @ rate, turn.T @ gain)
+        facing = near(facing, NO_TURN)
+        back = conjugate(facing)
+        return LinkMotion(position, np.array(facing), speed, _turned(back, rate), _turned(back, gain))
 
     def _chain(self, link: str) -> tuple[_Step, ...]:
         if (known := self._chains.get(link)) is not None:
@@ -100,9 +112,9 @@ class SimulatedBody:
     def _step(self, joint: frames.UrdfJoint) -> _Step:
         moving, scale, at = self._leader(joint)
         return _Step(
-            offset=np.array(joint.xyz),
-            rotation=_of_rpy(*joint.rpy),
-            axis=np.array(joint.axis),
+            offset=joint.xyz,
+            rotation=from_rpy(joint.rpy),
+            axis=joint.axis,
             slides=joint.type == frames.SLIDING,
             joint=moving,
             scale=scale,
@@ -181,27 +193,6 @@ class SensedBody:
         return self._body.motion(link)
 
 
-def quaternion(turn: Floats) -> Floats:
-    """Return a rotation matrix as a quaternion x, y, z, w whose w is not negative (S. W. Shepperd, 1978)."""
-    squares = (*(2.0 * turn.item(i, i) for i in range(3)), 0.0)
-    trace = turn.item(0, 0) + turn.item(1, 1) + turn.item(2, 2)
-    parts = [squares[0] - trace, squares[1] - trace, squares[2] - trace, trace]
-    big = parts.index(max(parts))
-    root = math.sqrt(max(0.0, 1.0 + parts[big]))
-    q = np.zeros(4)
-    q[big] = root / 2
-    half = 0.5 / root
-    if big == 3:
-        for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
-            q[i] = (turn.item(j, k) - turn.item(k, j)) * half
-    else:
-        j, k = (big + 1) % 3, (big + 2) % 3
-        q[3] = (turn.item(k, j) - turn.item(j, k)) * half
-        q[j] = (turn.item(j, big) + turn.item(big, j)) * half
-        q[k] = (turn.item(k, big) + turn.item(big, k)) * half
-    return -q if q[3] < 0 else q
-
-
 def _cross(a: Floats, b: Floats) -> Floats:
     # numpy's own takes 20 us for three numbers
     ax, ay, az = a.tolist()
@@ -209,21 +200,6 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
-def _about(axis: Floats, angle: float) -> Floats:
-    x, y, z = axis.tolist()
-    s, c = math.sin(angle), math.cos(angle)
-    v = 1.0 - c
-    return np.array(
-        (
-            (x * x * v + c, x * y * v - z * s, x * z * v + y * s),
-            (x * y * v + z * s, y * y * v + c, y * z * v - x * s),
-            (x * z * v - y * s, y * z * v + x * s, z * z * v + c),
-        )
-    )
-
-
-def _of_rpy(roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the rotation of a URDF's `rpy`: about the fixed axes x, then y, then z."""
-    x, y, z = np.eye(3)
-    turn: Floats = _about(z, yaw) @ _about(y, pitch) @ _about(x, roll)
-    return turn
+def _turned(rotation: Quaternion, vector: Floats) -> Floats:
+    x, y, z = vector.tolist()
+    return np.array(rotated(rotation, (x, y, z)))
