@@ -102,7 +102,7 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text():
             "turn servo=2 by=36001deg",
             "by=36001deg: write an angle such as 30deg or -0.5rad, of at most 100 turns",
         ),
-        ("delay servo=3 by=30deg", "delay: by=30deg: write a time such as 2s, 500ms or 100us"),
+        ("delay servo=3 by=30deg", "delay: by=30deg: write a time longer than 0, such as 500ms"),
         ("storm faults=3 within=1s kinds=storm", "storm: kinds=storm: a storm has no 'storm'"),
         ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
     ],

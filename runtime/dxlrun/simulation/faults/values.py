@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 Value = int | float | str | bytes | tuple[str, ...]
@@ -23,84 +24,56 @@ class Reader(NamedTuple):
     show: Callable[..., str] = str
 
 
-def _one_of(may_be: Callable[[str], bool], asked: str) -> Callable[[str], str]:
-    def read(text: str) -> str:
-        if not may_be(text):
-            raise ValueError(f"write {asked}")
-        return text
+def _read(read: Callable[[str], Value], may_be: Callable[..., bool], asked: str) -> Callable[[str], Value]:
+    """Return a reader of what `read` makes of a text, where it `may_be`; else it raises what was asked."""
 
-    return read
+    def checked(text: str) -> Value:
+        with suppress(ValueError):
+            if may_be(value := read(text)):
+                return value
+        raise ValueError(f"write {asked}")
 
-
-def _whole(lowest: int, highest: int) -> Callable[[str], int]:
-    def read(text: str) -> int:
-        try:
-            value = int(text, 0)
-        except ValueError:
-            value = lowest - 1
-        if not lowest <= value <= highest:
-            raise ValueError(f"write a whole number from {lowest} to {highest}")
-        return value
-
-    return read
+    return checked
 
 
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _whole(lowest: int, highest: int) -> Callable[[str], Value]:
+    asked = f"a whole number from {lowest} to {highest}"
+    return _read(lambda text: int(text, 0), lambda value: lowest <= value <= highest, asked)
 
 
-def _number(lowest: float, highest: float) -> Callable[[str], float]:
-    def read(text: str) -> float:
-        value = _float(text)
-        if not lowest <= value <= highest:
-            raise ValueError(f"write a number from {lowest:g} to {highest:g}, without its unit")
-        return value
-
-    return read
+def _number(lowest: float, highest: float) -> Callable[[str], Value]:
+    asked = f"a number from {lowest:g} to {highest:g}, without its unit"
+    return _read(float, lambda value: lowest <= value <= highest, asked)
 
 
-def _share(text: str) -> float:
-    value = _number(0.0, 1.0)(text)
-    if value == 0.0:
-        raise ValueError("write a number above 0, at most 1")
-    return value
+def _time(least_ns: int, asked: str) -> Callable[[str], Value]:
+    return _read(_nanoseconds, lambda value: value >= least_ns, f"a time {asked}")
 
 
-def _angle(text: str) -> float:
-    number = text.removesuffix("deg").removesuffix("rad")
-    value = _float(number) * (1.0 if text.endswith("deg") else math.degrees(1.0))
-    if number == text or not 0.0 < abs(value) <= _MOST_DEGREES:
-        raise ValueError("write an angle such as 30deg or -0.5rad, of at most 100 turns")
-    return value
+def _nanoseconds(text: str) -> int:
+    # not above: the process of the simulated buses needs pydantic for nothing else, and it is slow
+    from dxlrun.description.units import duration
+
+    return duration(text)
 
 
-def _time(least_ns: int, asked: str) -> Callable[[str], int]:
-    def read(text: str) -> int:
-        # not above: the process of the simulated buses needs pydantic for nothing else, and it is slow
-        from dxlrun.description.units import duration
-
-        try:
-            value = duration(text)
-        except ValueError:
-            raise ValueError("write a time such as 2s, 500ms or 100us") from None
-        if value < least_ns:
-            raise ValueError(f"write a time {asked}")
-        return value
-
-    return read
+def _degrees(text: str) -> float:
+    if text.endswith("deg"):
+        return float(text.removesuffix("deg"))
+    if text.endswith("rad"):
+        return math.degrees(float(text.removesuffix("rad")))
+    raise ValueError(text)
 
 
-def _hex(text: str) -> bytes:
-    try:
-        data = bytes.fromhex(text)
-    except ValueError:
-        data = b""
-    if not 1 <= len(data) <= _MOST_BYTES:
-        raise ValueError(f"write 1 to {_MOST_BYTES} bytes in hex, such as ff00fd")
-    return data
+_ANGLE = "an angle such as 30deg or -0.5rad, of at most 100 turns"
+_turn = _read(_degrees, lambda value: 0.0 < abs(value) <= _MOST_DEGREES, _ANGLE)
+_angle = _read(_degrees, lambda value: abs(value) <= _MOST_DEGREES, _ANGLE)
+_share = _read(float, lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1")
+_hex = _read(
+    bytes.fromhex,
+    lambda data: 1 <= len(data) <= _MOST_BYTES,
+    f"1 to {_MOST_BYTES} bytes in hex, such as ff00fd",
+)
 
 
 def _show_time(total_ns: int) -> str:
@@ -120,18 +93,18 @@ def _show_angle(value: float) -> str:
 
 
 _time_of = Reader("TIME", _time(1, "longer than 0, such as 500ms"), _show_time)
-_angle_of = Reader("ANGLE", lambda text: 0.0 if text in ("0deg", "0rad") else _angle(text), _show_angle)
-TURN = Reader("ANGLE", _angle, _show_angle)
+_angle_of = Reader("ANGLE", _angle, _show_angle)
+TURN = Reader("ANGLE", _turn, _show_angle)
 """Of `by` where it is an angle."""
 READERS: Mapping[str, Reader] = {
-    "bus": Reader("NAME", _one_of(bool, "the name of a bus")),
+    "bus": Reader("NAME", _read(str, bool, "the name of a bus")),
     "servo": Reader("ID", _whole(0, 253)),
-    "from": Reader("host", _one_of("host".__eq__, "from=host for an instruction, servo=ID for a reply")),
+    "from": Reader("host", _read(str, "host".__eq__, "from=host for an instruction, servo=ID for a reply")),
     "byte": Reader("INDEX", _whole(-_MOST_BYTES, _MOST_BYTES)),
     "flip": Reader("BITS", _whole(1, 255), "{:#04x}".format),
     "keep": Reader("BYTES", _whole(1, _MOST_BYTES)),
     "by": _time_of,
-    "about": Reader("AXIS", _one_of(("x", "y", "z").__contains__, "x, y or z: an axis of the device")),
+    "about": Reader("AXIS", _read(str, ("x", "y", "z").__contains__, "x, y or z: an axis of the device")),
     "copies": Reader("NUMBER", _whole(2, 16)),
     "data": Reader("HEX", _hex, bytes.hex),
     "size": Reader("BYTES", _whole(1, _MOST_BYTES)),
@@ -148,7 +121,7 @@ READERS: Mapping[str, Reader] = {
     "within": _time_of,
     "kinds": Reader("KIND,...", lambda text: tuple(text.split(",")), ",".join),
     "count": Reader("NUMBER", _whole(1, 100_000)),
-    "at": Reader("TIME", _time(0, ""), _show_time),
+    "at": Reader("TIME", _time(0, "such as 2s, 500ms or 100us"), _show_time),
     "packet": Reader("NUMBER", _whole(1, 10**9)),
     "for": _time_of,
 }
