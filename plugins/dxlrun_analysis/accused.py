@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.kinds import COMMANDED, MOVES_WORSE
 from dxlrun_analysis.lost import CODES, HURTS, SPOILT, severe_of, subject_of
 from dxlrun_analysis.tally import RealTime, RunTotals
 
@@ -99,7 +100,7 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
     whole |= {one.subject for one in found if one.code in ("busy_machine", "bus_lost")}
     return tuple(
         replace(one, remedy="")
-        if one.code in (*CODES.values(), *_MOVES_WORSE)
+        if one.code in (*CODES.values(), *MOVES_WORSE)
         and {"machine", bus_of.get(one.subject, one.subject)} & whole
         else one
         for one in found
@@ -113,7 +114,7 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     Of a simulated part there is nothing to check or to exchange, whatever its rule proposes for a real one.
     """
     part = finding.code in _REPLIES or finding.subject not in _NO_PARTS
-    part &= finding.code != "goal_swings"  # its commands are real
+    part &= finding.code not in COMMANDED
     if not finding.remedy or not part or not totals.plan.is_simulated(finding.subject):
         return finding.remedy
     if finding.code in _OF_TIME and not totals.virtual:
@@ -124,7 +125,6 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     return "It is simulated: look at the faults that were injected, and at what the motion asks of it."
 
 
-_MOVES_WORSE = ("error_grew", "far_from_goal", "joint_shakes")
 _NO_PARTS = ("", "loop", "machine", "log")
 
 
@@ -136,7 +136,7 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
     worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
     bus_of = {subject_of(servo): servo.bus for servo in totals.servos}
     # where replies are spoilt, goals wait for a torque that is known again, and other joints follow worse
-    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code in _MOVES_WORSE}
+    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code in MOVES_WORSE}
     return tuple(
         finding
         if finding.rank != Rank.CAUSE

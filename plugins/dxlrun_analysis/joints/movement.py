@@ -16,24 +16,12 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Bins
-from dxlrun_analysis.joints.failing import (
-    AWAY,
-    AWAY_RAD,
-    BAD_S,
-    ERROR,
-    GOALS,
-    LOAD,
-    MOVED_RAD,
-    POSITION,
-    SPEED,
-    STILL_RAD,
-    SWINGS,
-    WORSE,
-    Failing,
-    Windows,
-    failure_of,
-)
+from dxlrun_analysis.joints.failing import AWAY, MOVED_RAD, WORSE, Windows, failure_of
+from dxlrun_analysis.joints.following import followed
+from dxlrun_analysis.joints.kinds import KINDS, distance, finding, finding_of
 from dxlrun_analysis.joints.planned import PlannedJoint
+from dxlrun_analysis.joints.trail import Trail
+from dxlrun_analysis.joints.wear import worn
 
 _WINDOW_S = 0.5
 _JUMP_S = 0.5
@@ -71,6 +59,13 @@ class _Jumps:
             self.count += int(jumps.sum())
         self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
 
+    def finding(self, joint: PlannedJoint, begin_ns: int) -> Finding:
+        """Return what is said of them."""
+        times = "" if self.count == 1 else f" {self.count} times"
+        most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
+        text = f"shows a position that jumped{times}, by up to {most}, faster than its model turns"
+        return finding("position_jumped", joint, text, since_s)
+
 
 class Movement:
     """Collects how the joints moved, in memory that does not grow with the log."""
@@ -80,6 +75,7 @@ class Movement:
         self._fastest = np.zeros(len(joints))
         self._jumps = [_Jumps() for _ in joints]
         self.bins = Bins(8, len(joints), begin_ns)
+        self._trail = Trail(len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
         """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
@@ -119,6 +115,9 @@ class Movement:
             np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
         ]
         self.bins.take(cycles["read_ns"], np.array(values))
+        self._trail.take(
+            cycles["read_ns"], way, np.where(driven, cycles["position"], np.nan), cycles["effort"]
+        )
 
     def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
         """Return where a swing ends, as swings a second, shape (cycles, joints)."""
@@ -147,18 +146,23 @@ class Movement:
         """Name joints that stand still, are blocked or weak, or follow worse than before."""
         short, windows = self._windows(0.0), self._windows(_WINDOW_S)
         bad = [(brief.joint, *failure_of(brief, each)) for brief, each in zip(short, windows, strict=True)]
-        shared = [joint for joint, _, failing in bad if failing is not None and failing.code in _SHARED]
+        shared = [joint for joint, _, failing in bad if failing is not None and KINDS[failing.code].shared]
         together = len(shared) > max(1, len(bad) // 2)
+        named: set[int] = set()
         for row, (joint, one, failing) in enumerate(bad):
             if self._jumps[row].count:
-                yield _jumped(joint, self._jumps[row], self.bins.begin_ns)
-            if failing is None or (together and joint in shared):
+                named.add(row)
+                yield self._jumps[row].finding(joint, self.bins.begin_ns)
+            if failing is None:
+                continue
+            named.add(row)
+            if together and joint in shared:
                 continue
             all_of_them = short if one is short[row] else windows
             peers = [each.typical(AWAY, failing.when) for each in all_of_them if each is not one]
-            usual = float(np.nanmedian(peers)) if failing.code in _SHARED and peers else math.nan
+            usual = float(np.nanmedian(peers)) if KINDS[failing.code].shared and peers else math.nan
             if not one.typical(AWAY, failing.when) < WORSE * usual:
-                yield _finding(one, failing, usual)
+                yield finding_of(one, failing, usual)
         if together:
             buses = {joint.bus for joint in shared}
             yield Finding(
@@ -168,6 +172,8 @@ class Movement:
                 "Look at what they share: the line, the supply, the load, the motion.",
                 Rank.SERVO,
             )
+        for seen in worn(followed(self._joints, self._trail.samples()), named):
+            yield finding(seen.code, self._joints[seen.row], seen.text, seen.since_s)
 
     def _windows(self, seconds: float) -> list[Windows]:
         length_s, *values = self.bins.joined(seconds)
@@ -175,108 +181,3 @@ class Movement:
             Windows(joint, length_s, *(each[:, :, row] for each in values))
             for row, joint in enumerate(self._joints)
         ]
-
-
-_REMEDIES = {
-    "jammed_joint": "Look for what blocks it: an obstacle, a cable in the joint, a broken gear.",
-    "frozen_position": "Turn it by hand without torque: a position that does not change then is the "
-    "encoder's or the servo's mistake. Else compare torque, mode and limits with the robot file "
-    "(`dxlrun servo PORT ID get`): another program may have changed them.",
-    "goes_no_further": "Compare Max and Min Position Limit (CW and CCW Angle Limit) with the robot file "
-    "(`dxlrun servo PORT ID get`), and look for what it runs into there.",
-    "speed_limit": "Compare Profile Velocity (Moving Speed), Torque Limit and Goal PWM with the model's: "
-    "`dxlrun servo PORT ID get` prints them; another tool may have left them.",
-    "torque_limit": "Compare Torque Limit, Goal Current, Goal PWM and gains with the model's: "
-    "`dxlrun servo PORT ID get` prints them.",
-    "far_from_goal": "Look for what holds it back: an obstacle, friction, too heavy a load, low gains or "
-    "limits (`dxlrun servo PORT ID get`).",
-    "joint_shakes": "Look for play in gears and horn; lower its gains, or its load's inertia.",
-    "goal_swings": "See which clients and controllers command it (`/commands` in the log), and let only one.",
-    "error_grew": "Compare its gains and limits with the model's (`dxlrun servo PORT ID get`), and turn it "
-    "by hand: a horn or a gear may slip.",
-}
-
-
-_MAY_BE = {
-    "frozen_position": ": what it reads is not its position, or it does not try: without torque, in another "
-    "mode or at a limit of its own"
-}
-_SHARED = ("error_grew", "far_from_goal", "speed_limit", "torque_limit")
-"""What a joint that is not at fault may show too, where others do."""
-_RANKS = {"jammed_joint": Rank.SERVO_CAUSE, "goal_swings": Rank.CAUSE}
-"""A blocked one may pull down the supply, or shut itself down; commands are the matter of their sender."""
-
-
-def _finding(one: Windows, failing: Failing, peers: float) -> Finding:
-    joint, code, when = one.joint, failing.code, failing.when
-    error, before = one.typical(AWAY, when), one.typical(AWAY, failing.usual)
-    load, usual = one.typical(LOAD, when), one.typical(LOAD, failing.usual & (one.mean[SPEED] > 0))
-    part = f"and went {one.moved(when):.0%} of its way"
-    exerted = "; its load is not read"
-    if not math.isnan(load):
-        otherwise = "" if math.isnan(usual) else f", {usual / joint.top_effort:.0%} otherwise"
-        exerted = f" ({load / joint.top_effort:.0%} of its torque{otherwise})"
-    if code == "torque_limit":
-        most = np.nanquantile(one.most[LOAD, when], 0.9) / joint.top_effort
-        what = f"exerted no more than {most:.0%} of its torque, {_text(joint, error)} from its goal, {part}"
-        exerted = ": its torque is limited, or its gain is low"
-    elif code == "speed_limit":
-        speed = np.nanquantile(np.abs(np.diff(one.mean[POSITION], prepend=np.nan))[when], 0.9) / one.length_s
-        what = f"moved at no more than {_text(joint, speed)}/s, {_text(joint, error)} from its goal, {part}"
-        exerted += ": its speed or its torque is limited, or it is stiff"
-    elif code == "far_from_goal":
-        what = f"was {_text(joint, error)} from its goal for {failing.seconds:.1f} s, {part}"
-    elif code == "error_grew" and one.reach(POSITION, when) > STILL_RAD * joint.share:
-        worse = f"{error / before:.0f} times worse" if before > joint.tick else "worse"
-        rest = "" if math.isnan(peers) else f"; other joints: {_text(joint, peers)}"
-        what = (
-            f"followed {worse} than before: {_text(joint, error)} away (before: {_text(joint, before)}{rest})"
-        )
-        what += f", {part}"
-    elif code == "goal_swings":
-        hertz = one.typical(GOALS, when) / 2
-        what = f"is sent to and fro {hertz:.0f} times a second by its commands, and is {_text(joint, error)}"
-        what, exerted = f"{what} from them on average", ""
-    elif code == "joint_shakes":
-        hertz = one.typical(SWINGS, when) / 2
-        what = f"shakes {hertz:.0f} times a second around its goal, {_text(joint, error)} on average"
-    else:
-        place = _text(joint, float(np.nanmedian(one.mean[POSITION, when])))
-        did = "stood still, to the tick," if code == "frozen_position" else "stood still"
-        did += {
-            "jammed_joint": f" at {place}, as if blocked,",
-            "goes_no_further": f" at {place} each time,",
-        }.get(code, "")
-        most = np.nanmax(np.abs([one.least[ERROR, when], one.most[ERROR, when]]))
-        what = f"{did} for {failing.seconds:.1f} s although its goal was up to {_text(joint, most)} away"
-    name = joint.name if code == "goal_swings" else f"{joint.name} ({joint.servos})"
-    away = when & (one.mean[AWAY] > AWAY_RAD * joint.share)  # it may have stood where it was to stand
-    since_s = float(np.flatnonzero(away if away.any() else when)[0]) * one.length_s
-    return Finding(
-        code,
-        joint.name,
-        f"{name} {what}{exerted}; from {since_s:.1f} s of the run on{_MAY_BE.get(code, '')}.",
-        _REMEDIES[code],
-        Rank.CAUSE if failing.seconds < BAD_S else _RANKS.get(code, Rank.SERVO),
-        3.0,
-    )
-
-
-def _jumped(joint: PlannedJoint, jumps: _Jumps, begin_ns: int) -> Finding:
-    times = "" if jumps.count == 1 else f" {jumps.count} times"
-    most, since_s = _text(joint, jumps.longest), (jumps.first_ns - begin_ns) * 1e-9
-    return Finding(
-        "position_jumped",
-        joint.name,
-        f"The position of {joint.name} ({joint.servos}) jumped{times}, by up to {most}, faster than its "
-        f"model turns, from {since_s:.1f} s of the run on: a gear or horn slips, its encoder is loose, or "
-        "another tool changed its offset or direction.",
-        "Turn it by hand without torque and watch its position; compare Homing Offset and Drive Mode with "
-        "the robot file (`dxlrun servo PORT ID get`).",
-        Rank.CAUSE,
-        4.0,
-    )
-
-
-def _text(joint: PlannedJoint, distance: float) -> str:
-    return f"{distance * 1e3:.1f} mm" if joint.logged.linear else f"{math.degrees(distance):.1f} deg"

@@ -49,6 +49,8 @@ class PlannedJoint:
     """m of a linear joint for each rad of its servo; 1 of one that turns"""
     softness: float = 1.0
     """So many times lower than its model's is the gain in the robot file, from 1 to 3"""
+    alike: str = ""
+    """Models and registers: joints that have the same ones follow alike"""
     logged: JointPlan = UNKNOWN_JOINT
 
 
@@ -81,6 +83,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
                 sum(one.share for one in mine) if joint.linear else 1.0,
                 max(_softness(one) for one in mine),
+                ", ".join(sorted(f"{one.servo.model} {one.servo.registers}" for one in mine)),
                 joint,
             )
         )

@@ -12,18 +12,13 @@ import numpy as np
 from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.bins import Series
+from dxlrun_analysis.joints.kinds import KINDS
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Plot
 from dxlrun_analysis.page.joints import shown_in
 from dxlrun_analysis.report import Report
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
-_MOVEMENT = frozenset(
-    (
-        *("frozen_position", "jammed_joint", "goes_no_further", "speed_limit", "torque_limit"),
-        *("far_from_goal", "error_grew"),
-    )
-)
 _SUPPLY = frozenset(("own_supply", "undervoltage"))
 _PLOTS = {
     "machine-busy": "busy_machine",
@@ -55,9 +50,9 @@ def finding_plots(canvas: Canvas, report: Report) -> list[Plot]:
             plots += _by_place(canvas, number, finding, report.servos)
             continue
         of = next((trend for trend in report.trends if trend.joint == finding.subject), None)
-        if of is None or finding.code not in _MOVEMENT | _SUPPLY:
+        if of is None or finding.code not in KINDS.keys() | _SUPPLY:
             continue
-        moves = finding.code in _MOVEMENT
+        moves = finding.code in KINDS
         unit, scale = shown_in(units[of.joint]) if moves else ("V", 1.0)
         label = f"{'error' if moves else 'voltage'}, {unit}"
         others = [

@@ -16,22 +16,9 @@ from tests.analysis.stranger.campaign import CASES, PAIRS
 from tests.analysis.stranger.expectation import Case, judged
 from tests.conftest import SEED as COMMIT
 
-_LOAD = "its position follows as before: only its load tells"
-_GOOD = "the run is good, and no joint is told of"
 _SWINGS = "it swings too little for the rule of what swings by itself"
 UNNAMED = {
-    ("gain_lost", "ax_single"): "it is 4.5 deg away at most, on a side where it was not before",
-    ("horn_slips", "mx_two"): _LOAD,
-    ("horn_slips", "x_three"): _LOAD,
     ("corroded_crimp", "mx_two"): "its voltage is 2 V lower nearly from the start, as if it measured less",
-    ("foot_slips", "mx_bulk"): _GOOD,
-    ("foot_slips", "x_sync"): _GOOD,
-    ("rubber_band", "ax_single"): _GOOD,
-    ("rubber_band", "x_three"): _GOOD,
-    ("play_in_the_gear", "mx_bulk"): _GOOD,
-    ("play_in_the_gear", "x_fast"): _GOOD,
-    ("dry_bearing_on_a_busy_machine", "mx_bulk"): _GOOD,
-    ("dry_bearing_on_a_busy_machine", "x_fast"): _GOOD,
     ("own_gain_too_high", "x_fast"): _SWINGS,
     ("own_gain_too_high", "x_three"): _SWINGS,
 }

@@ -1,0 +1,200 @@
+"""Joints that follow, but otherwise than they did, or than the others: what a mechanic sees of them.
+
+- *play* and *friction*: at each turn a joint stands still until its goal is back by degrees, and is as far
+  behind in both directions. Where that takes torque, something rubs; else something gives.
+- *friction* is also what takes an eighth of its torque more in both directions, and twice as much as before.
+- *softer*: it is behind in both directions by more than at its first turns, and does not stand still.
+- *pulled*: it is off by 2 deg more than before, or takes an eighth of its torque more or less, at the same
+  places; on one side the more the further it goes, it is held back there by a spring; where it takes next to
+  none any more, it carries nothing.
+- *jerked*: it is thrown off its way again and again, within 80 ms, while its goals are even.
+
+All of it three times as much as in any other joint that moved: where others show it too, it is the motion,
+the ground or the supply. A joint that other rules name is left to them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence, Set
+from typing import NamedTuple
+
+import numpy as np
+
+from dxlrun.channels.cycle import Floats
+from dxlrun_analysis.joints.following import STROKE_RAD, Followed, Turn, Visit
+
+_OTHERS = 3.0
+"""So many times what any other joint shows."""
+_BEHIND_RAD = 0.03
+"""1.7 deg"""
+_FEWEST_TURNS = 2
+_FASTER = 1.2
+_STOOD = 1.2
+"""Part of how far it is behind by which the goal goes back before a joint that has play does."""
+_FEWEST_ALIKE = 3
+"""With so many of its kind a joint needs no time before."""
+_SOFTER = 2.0
+"""So many times its delay at its first turns."""
+_LATE_S = 0.03
+_OFF_RAD = 0.035
+"""2 deg"""
+_LOAD = 0.12
+"""Of its torque"""
+_PULLED_S = 0.5
+_FEWEST_VISITS = 3
+_ALIKE = 0.8
+"""Part of the changes of its load that are of one sense"""
+_NOTHING = 1 / 3
+"""Part of its load below which it carries nothing any more."""
+_ALONG = 0.5
+"""Correlation"""
+_JERK_RAD = 0.021
+"""1.2 deg"""
+_JERKS = 4
+_APART_S = 0.15
+
+
+class Worn(NamedTuple):
+    """What one joint shows."""
+
+    code: str
+    row: int
+    since_s: float
+    text: str
+    """What it does, behind its name"""
+
+
+def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
+    """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
+    sound = [one for one in joints if one.row not in named]
+    turns = [one.turns() for one in sound]
+    visits = [list(one.visits(_OFF_RAD / 2, _LOAD / 2)) for one in sound]
+    jerks = [one.jerks() for one in sound]
+    for at, one in enumerate(sound):
+        others = [other for other in range(len(sound)) if other != at]
+        found = (
+            _turns_badly(one, turns[at], [turn for other in others for turn in turns[other]])
+            or _takes_more(one, turns[at], [turns[other] for other in others])
+            or _pulled(one, visits[at], [visit for other in others for visit in visits[other]], turns[at])
+            or _jerked(one, jerks[at], [jerks[other] for other in others])
+        )
+        if found is not None:
+            yield found
+
+
+def _turns_badly(one: Followed, turns: list[Turn], others: list[Turn]) -> Worn | None:
+    theirs = max((turn.behind for turn in others), default=0.0)
+    least = max(_BEHIND_RAD, _OTHERS * theirs)
+    bad = [turn for turn in turns if turn.behind > least]
+    if not bad or (len(bad) < _FEWEST_TURNS and bad[0].behind < 2 * least):
+        return None
+    worst = max(bad, key=lambda turn: turn.behind)
+    usual = [turn for turn in turns if turn.at_s < bad[0].at_s and turn.behind < _BEHIND_RAD / 2]
+    behind, stood = (float(np.median([turn[at] for turn in bad])) for at in (1, 3))
+    stands = stood > max(_STOOD * behind, _OTHERS * max((turn.stood for turn in others), default=0.0))
+    text = f"is {_deg(worst.behind)} behind in both directions{_beside(theirs, others)}"
+    if stands and (usual or one.alike >= _FEWEST_ALIKE):
+        text += f", and stands still at each turn until its goal is {_deg(stood)} back"
+        code, takes = _rubs(worst, usual, others)
+        return Worn(code, one.row, bad[0].at_s, text + takes)
+    late_s, *before_s = (one.lag_s + turn.behind / turn.speed for turn in (worst, *usual))
+    if stands or not before_s or late_s < max(_SOFTER * max(before_s), max(before_s) + _LATE_S):
+        return None
+    return Worn("softer_joint", one.row, bad[0].at_s, f"{text}, and was not at its first turns")
+
+
+def _rubs(worst: Turn, usual: list[Turn], others: list[Turn]) -> tuple[str, str]:
+    """Return what makes a joint stand still at its turns, and the torque that it takes."""
+    if math.isnan(worst.load):
+        return "lost_motion", ""
+    before = max(0.0, usual[0].load if usual else float(np.median([turn.load for turn in others])))
+    compared = f"{before:.0%} {'before' if usual else 'in the others'}"
+    rubs = worst.load > max(before + _LOAD, 1.5 * before)
+    takes = f", which takes {max(0.0, worst.load):.0%} of its torque ({compared})"
+    return ("friction" if rubs else "play"), takes
+
+
+def _takes_more(one: Followed, turns: list[Turn], others: list[list[Turn]]) -> Worn | None:
+    theirs = max((more for other in others for _, _, more in _loaded(other)), default=0.0)
+    bad = [each for each in _loaded(turns) if each[2] > max(_LOAD, each[1], _OTHERS * theirs)]
+    if len(bad) < _FEWEST_TURNS:
+        return None
+    worst, before, _ = max(bad, key=lambda each: each[2])
+    text = f"takes {worst.load:.0%} of its torque in both directions (before: {before:.0%})"
+    return Worn("friction", one.row, bad[0][0].at_s, text)
+
+
+def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
+    """Yield turns with the most that the movement took before, nearly as fast, and how much more it takes."""
+    for at, turn in enumerate(turns):
+        before = [each.load for each in turns[:at] if each.speed >= turn.speed / _FASTER]
+        if before and not math.isnan(turn.load):
+            most = max(0.0, *before[:_FEWEST_TURNS])
+            yield turn, most, turn.load - most
+
+
+def _pulled(one: Followed, visits: list[Visit], others: list[Visit], turns: list[Turn]) -> Worn | None:
+    rubs = 2 * max((abs(turn.behind) for turn in turns[:2]), default=0.0)
+    theirs = max((each.change for each in others), default=0.0)
+    least = max(_OFF_RAD, rubs, _OTHERS * theirs)
+    off = [each for each in visits if each.change > least]
+    theirs_load = max((each.load_change for each in others), default=0.0)
+    loaded = [each for each in visits if each.load_change > max(_LOAD, _OTHERS * theirs_load)]
+    bad = off if _lasts(off) else loaded
+    if not _lasts(bad):
+        return None
+    since_s = bad[0].at_s
+    loads = np.array([(each.load, each.load_was) for each in bad if math.isfinite(each.load_was)])
+    load, was = np.median(np.abs(loads), axis=0).tolist() if len(loads) else (math.nan, math.nan)
+    grew = np.diff(np.abs(loads)).ravel() if len(loads) else np.zeros(1)
+    alike = abs(load - was) > _LOAD / 2 and abs(grew.sum()) >= _ALIKE * np.abs(grew).sum()
+    takes = f"takes {load:.0%} of its torque at places where it took {was:.0%} before"
+    if alike and load < _NOTHING * was:
+        return Worn("carries_nothing", one.row, since_s, takes)
+    if bad is loaded:
+        return Worn("off_its_way", one.row, since_s, takes) if alike else None
+    most = _deg(max(each.change for each in bad))
+    text = f"is off by up to {most} more than before at the same places{_beside(theirs, others)}"
+    side = _one_side(bad, [each for each in visits if each.at_s > since_s and each not in bad])
+    text += f", the more the further it goes {side}" if side else ""
+    text += f", with {load:.0%} of its torque instead of {was:.0%}" if alike else ""
+    return Worn("pulled_joint" if side else "off_its_way", one.row, since_s, text)
+
+
+def _lasts(visits: list[Visit]) -> bool:
+    return len(visits) >= _FEWEST_VISITS and sum(each.seconds for each in visits) >= _PULLED_S
+
+
+def _one_side(bad: list[Visit], good: list[Visit]) -> str:
+    """Return on which side of what the places are where a joint is off; empty: on no side, or on both."""
+    if len(good) < _FEWEST_VISITS:
+        return ""
+    places, off = np.array([(each.place, each.off - each.was) for each in bad]).T
+    sound = np.array([each.place for each in good])
+    if np.ptp(places) < STROKE_RAD or abs(off.sum()) < 0.9 * np.abs(off).sum():
+        return ""
+    along = float(np.corrcoef(places, np.abs(off))[0, 1])
+    above, below = np.median(places) > np.quantile(sound, 0.9), np.median(places) < np.quantile(sound, 0.1)
+    if above and along > _ALONG:
+        return f"beyond {math.degrees(places.min()):.0f} deg"
+    return f"below {math.degrees(places.max()):.0f} deg" if below and along < -_ALONG else ""
+
+
+def _jerked(one: Followed, jerks: Floats, others: list[Floats]) -> Worn | None:
+    theirs = max((float(np.nanmax(each, initial=0.0)) for each in others), default=0.0)
+    times = one.at_s[np.nan_to_num(jerks) > max(_JERK_RAD, _OTHERS * theirs)]
+    count = int((np.diff(times, prepend=-math.inf) > _APART_S).sum())
+    if count < _JERKS:
+        return None
+    most = _deg(float(np.nanmax(jerks)))
+    text = f"is thrown off its way {count} times while its goals are even, by up to {most} within 80 ms"
+    return Worn("jerked_joint", one.row, float(times[0]), text + _beside(theirs, others))
+
+
+def _beside(theirs: float, others: Sequence[object]) -> str:
+    return f" (other joints: at most {_deg(max(0.0, theirs))})" if others else ""
+
+
+def _deg(rad: float) -> str:
+    return f"{math.degrees(rad):.1f} deg"

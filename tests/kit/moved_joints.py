@@ -1,0 +1,74 @@
+"""Joints of constructed arrays: what they were to do and what they did, and what is found of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dxlrun.channels.cycle import Torque
+from dxlrun_analysis.finding import Finding
+from dxlrun_analysis.joints.movement import Movement
+from dxlrun_analysis.joints.planned import PlannedJoint
+
+Floats = npt.NDArray[np.float64]
+DT = 0.02
+TIME = np.arange(600) * DT
+"""12 s"""
+FAULT = TIME >= 5.0
+SWING = 0.8 * np.sin(3.5 * TIME)
+LOAD = 0.2 + 0.1 * np.sin(7 * TIME)
+TICK = 0.005
+FIELDS = ("position", "velocity", "effort", "goal_effort", "goal_position")
+
+
+def behind(way: Floats, cycles: int = 2, gain: float = 1.0) -> Floats:
+    """A joint that follows its way some cycles late, and in part."""
+    return gain * np.concatenate([np.full(cycles, way[0]), way[:-cycles]])
+
+
+@dataclass
+class Joint:
+    """What a joint was to do, and what it did."""
+
+    way: Floats = field(default_factory=lambda: SWING)
+    position: Floats = field(default_factory=lambda: behind(SWING))
+    load: Floats | float = field(default_factory=lambda: LOAD)
+    torque: Any = Torque.ON
+    velocity: float = 1.0
+    """NaN: not read"""
+    planned: dict[str, Any] = field(default_factory=dict)
+
+
+def findings(*joints: Joint, name: str = "j") -> list[Finding]:
+    """Judge joints; all others beside them follow well."""
+    kind = [("read_ns", np.int64), *((field, np.float64, len(joints)) for field in FIELDS)]
+    kind += [("age_ns", np.int64, len(joints)), ("torque", np.uint8, len(joints))]
+    cycles = np.zeros(len(TIME), [*kind, ("valid", np.bool_, len(joints))])
+    cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
+    cycles["valid"], cycles["goal_effort"] = True, np.nan
+    planned = []
+    for row, joint in enumerate(joints):
+        tick = joint.planned.get("tick", TICK)
+        cycles["position"][:, row] = np.round(joint.position / tick) * tick
+        cycles["velocity"][:, row] = joint.velocity * np.gradient(joint.position, DT)
+        cycles["effort"][:, row], cycles["torque"][:, row] = joint.load, joint.torque
+        cycles["goal_position"][:, row] = joint.way
+        facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
+        planned.append(PlannedJoint(f"{name}{row}", **facts))
+    movement = Movement(planned, int(cycles["read_ns"][0]))
+    ways = np.array([joint.way for joint in joints]).T
+    for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
+        known = min(begin, 2)
+        part = slice(begin - known, begin + 150)
+        movement.take(cycles[part], ways[part], known)
+    return list(movement.findings())
+
+
+def only(*joints: Joint) -> Finding:
+    """The finding about the first joint, which is the only one."""
+    (finding,) = findings(*joints, Joint(), Joint())
+    assert finding.subject == "j0"
+    return finding
