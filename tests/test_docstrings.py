@@ -6,6 +6,7 @@ import inspect
 import math
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,8 @@ def test_the_client_asks_and_sends(monkeypatch: pytest.MonkeyPatch) -> None:
 
         def __exit__(self, *_: object) -> None: ...
 
-        def states(self) -> dict[str, object]:
-            return {"joints": {}}
+        def states(self) -> SimpleNamespace:
+            return SimpleNamespace(joints=("pan",), position=[0.1])
 
         def send(self, *words: object) -> None:
             asked.append(inspect.signature(RemoteRobot.send).bind(self, *words))

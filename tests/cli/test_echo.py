@@ -11,6 +11,8 @@ import pytest
 
 from dxlrun.cli.steering import echo as module
 from dxlrun.cli.steering.echo import fields
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import TopicMessage, TopicState
 
 MESSAGE: dict[str, object] = {
@@ -47,7 +49,7 @@ class Robot:
             TopicState("/events", "dxlrun_msgs/msg/Event", (), 3, None),
         ]
 
-    def listen(self, topic: str, rate: float | None) -> Iterator[TopicMessage]:
+    def listen(self, topic: str, *, rate: float | None) -> Iterator[TopicMessage]:
         self.asked.append((topic, rate))
         yield from self.messages
         if self.after is not None:
@@ -64,8 +66,12 @@ def running(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     return start
 
 
+CODEC = Codec(MessageType("mine/msg/State", "float64 share\n"))
+
+
 def message(number: int, lost: int = 0) -> TopicMessage:
-    return TopicMessage("/arm/state", number, 1.5, {"share": float(number)}, lost)
+    data, kind = CODEC.pack(float(number)), CODEC.message
+    return TopicMessage("/arm/state", kind.name, number, 1_500_000_000, 0, lost, data, kind.text)
 
 
 def test_rows_of_joints_have_their_names_and_other_rows_do_not() -> None:

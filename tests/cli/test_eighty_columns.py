@@ -10,10 +10,12 @@ from typing import Any, NoReturn
 
 import pytest
 
+from dxlrun.channels.cycle import CycleRecord
 from dxlrun.cli.steering import steer, watch
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.output import terminal
 from dxlrun.output.table import Column, Table
+from dxlrun.remote.joints import states_of
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import run_summary
 from dxlrun.testing import plan_of, simulated_robot
@@ -99,18 +101,21 @@ def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
         {name: getattr(one, name) for name in ("name", "kind", "states", "commands", "ranges")}
         for one in loop.sources
     ]
-    state = dict.fromkeys(
-        ("position", "velocity", "effort", "goal_position", "goal_velocity", "temperature", "voltage"), -123.4
-    )
-    state |= {"torque": "released", "hardware_error": 0x24, "valid": True}
+    record = CycleRecord(loop.layout)
+    for values in (
+        record.states.motion,
+        record.goals.values,
+        record.states.temperature,
+        record.states.voltage,
+    ):
+        values[:] = -123.4
+    record.states.torque[:], record.states.hardware_error[:], record.states.valid[:] = 4, 0x24, True
+    record.sources.values[:], record.sources.age_ns[:] = -1.2345, 123_400_000
+    record.controller_ns[:] = 100_000
+    places = {one.name: place for place, one in enumerate(loop.controllers)}
     watched: Any = SimpleNamespace(
         info={"controllers": listed},
-        states={
-            "joints": {joint.name: state for joint in loop.joints},
-            "updates": {one.name: 1e-4 for one in loop.controllers},
-            "sources": {f"{one.name}/{each}": -1.2345 for one in loop.sources for each in one.states},
-            "source_ages": {one.name: {"valid": True, "age": 0.1234} for one in loop.sources},
-        },
+        states=states_of(plan, record, places),
     )
     terminal.show(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
     terminal.show(steer.groups({"groups": plan.groups}))

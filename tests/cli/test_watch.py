@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import io
 import json
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from msgspec.structs import replace
 from rich.console import Console
 
 from dxlrun import DxlrunError
+from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.cli.steering import watch
 from dxlrun.cli.steering.steer import Chosen
+from dxlrun.description.modes import Mode
 from dxlrun.output.table import Sentence
+from dxlrun.remote.joints import states_of
+from dxlrun.remote.live.states import RobotStates
 
 
 class Robot:
@@ -39,44 +46,37 @@ class Robot:
             {"name": "arm", "active": True, "into": ["arm_pid"], **one},
             {"name": "spare", "active": False, "into": [], **one},
         ]
-        units = dict.fromkeys(self.names, "A")
         known = {"rate": 50.0, "paused": False, "cycles": 7, "skipped": 2, "joints": self.names}
-        return {**known, "effort_units": units, "controllers": controllers}
+        return {**known, "controllers": controllers}
 
-    def states(self) -> dict[str, Any]:
+    def states(self) -> RobotStates:
         self.asked += 1
         if self.asked > self.looks:
             raise DxlrunError(f"{self.name} no longer answers: gone")
-        row = {
-            "position": 0.5,
-            "velocity": -1e-9,
-            "effort": 0.123,
-            "valid": True,
-            "age": 0.0,
-            "goal_position": 0.6,
-            "goal_velocity": None,
-            "goal_effort": None,
-            "goal_pwm": None,
-            "temperature": 41.0,
-            "voltage": 11.8,
-            "hardware_error": 0,
-            "mode": "position",
-            "torque": "on",
-        }
-        rows = {name: dict(row) for name in self.names}
-        rows[self.names[1]] |= {"torque": "released"}
-        rows[self.names[2]] |= {"torque": "off", "hardware_error": 0x20}
-        rows[self.names[3]] |= {"torque": "lost", "valid": False, "temperature": None, "position": None}
-        rows[self.names[4]] |= {"valid": False, "goal_position": None, "goal_velocity": 1.0}
-        number = 50 * self.asked
-        times = {"cycle": number, "time": 100.0 + self.asked, "late": 0.0001 * self.asked}
-        others: dict[str, Any] = {}
+        rows = len(self.names)
+        sources = {"foot": ("force.x", "force.y"), "imu": ("voltage",)} if self.sources else {}
+        layout = CycleLayout(self.names, ("arm_pid", "arm", "spare"), (), sources)
+        record = CycleRecord(layout)
+        states, goals = record.states, record.goals
+        woken_ns = (100 + self.asked) * 1_000_000_000
+        record.wake(50 * self.asked, woken_ns - 100_000 * self.asked, woken_ns, 0)
+        states.position[:], states.velocity[:], states.effort[:] = 0.5, -1e-9, 0.123
+        states.valid[:], states.age_ns[:], goals.position[:] = True, 0, 0.6
+        states.temperature[:], states.voltage[:] = 41.0, 11.8
+        states.mode[:], states.torque[:] = Mode.POSITION, Torque.ON
+        states.torque[1:4] = Torque.RELEASED, Torque.OFF, Torque.LOST
+        states.hardware_error[2], states.temperature[3], states.position[3] = 0x20, np.nan, np.nan
+        states.valid[3:5] = False
+        goals.position[4], goals.velocity[4] = np.nan, 1.0
         if self.sources:
-            found = {"foot/force.x": 12.5, "foot/force.y": None, "imu/voltage": 11.9}
-            ages = {"foot": {"valid": False, "age": 1.25}, "imu": {"valid": True, "age": 0.002}}
-            others = {"sources": found, "source_ages": ages}
-        updates = {"arm": 25e-6, "arm_pid": 0.0, "spare": 0.0}
-        return {**times, "updates": updates, "joints": rows, **others}
+            record.sources.values[:] = 12.5, np.nan, 11.9
+            record.sources.valid[:], record.sources.age_ns[:] = (False, True), (1_250_000_000, 2_000_000)
+        record.controller_ns[1] = 25_000
+        plan: Any = SimpleNamespace(
+            loop=SimpleNamespace(joints=[SimpleNamespace(linear=False)] * rows), servos_by_joint={}
+        )
+        found = states_of(plan, record, {name: place for place, name in enumerate(layout.controllers)})
+        return replace(found, effort_units=("A",) * rows)
 
     def events(self, after: int) -> dict[str, Any]:
         one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
 
@@ -55,13 +56,14 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def states(self) -> dict[str, Any]:
+    def states(self) -> SimpleNamespace:
         self.looks += 1
         if self.looks > 5:
             raise KeyboardInterrupt
-        age = 0.3 if self.looks == 3 else 0.01
+        age_ns = 300_000_000 if self.looks == 3 else 10_000_000
         names = ("left_shoulder", "left_elbow")
-        return {"joints": {name: {"position": 0.1 * self.looks, "age": age} for name in names}}
+        positions, ages_ns = np.full(2, 0.1 * self.looks), np.full(2, age_ns)
+        return SimpleNamespace(joints=names, position=positions, age_ns=ages_ns)
 
     def stream(self, controller: str, kind: str, lease: float) -> Robot:
         assert (controller, kind) == ("follow", "positions")

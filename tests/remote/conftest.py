@@ -7,6 +7,7 @@ from contextlib import suppress
 from types import SimpleNamespace
 from typing import ClassVar
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.replies import FRAME_LENGTH, Frame
 
 PERIOD_NS = 20_000_000
 
@@ -163,6 +165,8 @@ class Desk:
         self.taken = []
         self.places = []  # names of the controllers that were loaded
         self.ended = 0
+        self.record.cycle = -1
+        self.cycles.append(ring.RecordKind.CYCLE, self.record.raw)
         self.finish_cycle()
 
     # The loop
@@ -208,6 +212,19 @@ class Desk:
             self.link.collect()
             await asyncio.sleep(0)
         return asked.result()
+
+    @staticmethod
+    def frames(stream):
+        """Return all frames that a stream has."""
+        data = stream.frames()
+        while stream.behind:
+            data += stream.frames()
+        found = []
+        while data:
+            end = FRAME_LENGTH.size + FRAME_LENGTH.unpack_from(data)[0]
+            found.append(msgspec.msgpack.decode(data[FRAME_LENGTH.size : end], type=Frame))
+            data = data[end:]
+        return found
 
     async def request(
         self, method, path, body=b"", *, headers=(), chunks=None, client=("process 1", 0), heard=None

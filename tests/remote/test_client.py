@@ -8,7 +8,7 @@ import pytest
 
 import dxlrun
 from dxlrun.remote import client as module
-from dxlrun.remote.sockets import MOST_BYTES, listen
+from dxlrun.remote.sockets import MOST_BYTES, SocketLink, listen
 
 
 def answer(body, status=b"200 OK"):
@@ -71,7 +71,7 @@ def peer(place):
 
     def make(*answers):
         peers.append(Peer(answers))
-        robot = module.RemoteRobot("pair", peers[-1].path, "anna")
+        robot = module.RemoteRobot("pair", SocketLink(peers[-1].path, "anna"))
         peers[-1].robot = robot
         return peers[-1]
 
@@ -97,7 +97,7 @@ def test_arrays_of_numpy_are_sent_as_lists_and_names_cannot_leave_their_place(pe
 def test_a_clients_name_may_be_any_text(place):
     with listen("pair")[0]:
         robot = dxlrun.connect(client="Jürgen 机器\r\nX-Evil: 1")
-    sent = robot._headers["X-Dxlrun-Client"].encode("latin-1").decode()
+    sent = robot.link._headers["X-Dxlrun-Client"].encode("latin-1").decode()
     assert sent == "Jürgen 机器X-Evil: 1"
 
 
@@ -140,7 +140,7 @@ def test_a_refusal_is_raised_with_its_sentence(peer):
     ids=["hang up", "rubbish", "no JSON", "a list", "cut off"],
 )
 def test_what_may_have_been_received_is_never_sent_again(peer, said, monkeypatch):
-    monkeypatch.setattr(module, "TIMEOUT_S", 0.2)
+    monkeypatch.setattr("dxlrun.remote.sockets.TIMEOUT_S", 0.2)
     one = peer(said, OK)
     with pytest.raises(dxlrun.DxlrunError, match=r"pair (no longer answers|answers in a way)") as caught:
         one.robot.send("head", "go", {})
@@ -151,7 +151,7 @@ def test_what_may_have_been_received_is_never_sent_again(peer, said, monkeypatch
 def test_a_connection_that_was_closed_while_idle_is_opened_anew(peer):
     one = peer(OK, OK)
     one.robot.pause()
-    one.robot._connection.sock.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
+    one.robot.link._connection.sock.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
     one.robot.resume()
     assert (len(one.heard), one.connections) == (2, 2)
 
@@ -159,7 +159,7 @@ def test_a_connection_that_was_closed_while_idle_is_opened_anew(peer):
 def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch):
     one = peer(OK, OK)
     one.robot.pause()
-    monkeypatch.setattr(module, "_IDLE_S", -1.0)
+    monkeypatch.setattr("dxlrun.remote.sockets._IDLE_S", -1.0)
     one.robot.resume()
     assert (len(one.heard), one.connections) == (2, 2)
 
@@ -199,10 +199,10 @@ def test_a_stop_that_a_living_robot_never_answers_is_an_error(peer, monkeypatch)
 
 
 def test_a_queue_of_connections_that_stays_full_is_an_error_with_its_reason(place, monkeypatch):
-    monkeypatch.setattr(module, "TIMEOUT_S", 0.05)
+    monkeypatch.setattr("dxlrun.remote.sockets.TIMEOUT_S", 0.05)
     listener, path = listen("pair")
     listener.listen(0)
     with listener, socket.socket(socket.AF_UNIX) as waiting:
         waiting.connect(str(path))
         with pytest.raises(dxlrun.DxlrunError, match=r"pair no longer answers: .* full for 0\.05 s"):
-            module.RemoteRobot("pair", path, "anna").pause()
+            module.RemoteRobot("pair", SocketLink(path, "anna")).pause()

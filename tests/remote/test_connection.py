@@ -18,7 +18,7 @@ import pytest
 from dxlrun.remote import server
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS, serve
-from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.remote.sockets import MOST_BYTES, SocketLink
 
 STOP = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
 GO = b"POST /controllers/left/commands/go HTTP/1.1\r\nHost: x\r\n"
@@ -119,7 +119,7 @@ def test_stop_is_taken_from_another_process_while_one_floods_the_socket_with_con
             try:
                 flood.stdout.readline()
                 for _ in range(STOPS):
-                    RemoteRobot("pair", Path(door.path), "test").stop(wait=False)
+                    RemoteRobot("pair", SocketLink(Path(door.path), "test")).stop(wait=False)
             finally:
                 flood.kill()
 

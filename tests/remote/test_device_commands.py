@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
 from dxlrun.testing import plan_of
 
 ROBOT = """\
@@ -101,9 +103,10 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     assert (
         content["refused"] == "there is no joint board; it is no servo: `dxlrun get board` prints its states"
     )
-    for topic in ("foot", "foot/force.x"):
-        _, content = board.ask("GET", f"/topics/{topic}")
-        assert [(one["number"], one["message"]) for one in content["messages"]] == [(2, shown)]
-    assert board.ask("GET", "/topics/foot?after=2")[1]["messages"] == []
-    assert board.ask("GET", "/topics/foot/nothing")[0] == 404
+    opened, sample = board.frames(board.link.listen(["/foot"], newest=False))
+    assert (opened.type, sample.number) == ("dxlrun_msgs/msg/SourceStates", 2)
+    message = Codec(MessageType(opened.type, opened.definition)).unpack(sample.data)
+    assert (message["valid"], message["age_ns"], message["name"]) == (True, 3_000_000, ["force.x"])
+    assert message["value"].tolist() == [12.5]
+    assert board.ask("GET", "/stream?topic=/foot/nothing")[0] == 404
     assert {"/foot", "/board"} <= {one["name"] for one in board.ask("GET", "/topics")[1]["topics"]}

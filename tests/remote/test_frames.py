@@ -1,7 +1,6 @@
 """Frames of a running robot: the gateway gives the URDF, the client computes where a frame lies now."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,14 +19,13 @@ URDF = """<robot name="pair">
 </robot>"""
 
 
-class Client(RemoteRobot):
-    """A client whose requests go to the gateway without a socket."""
+class DeskLink:
+    """Requests to the gateway without a socket."""
 
     def __init__(self, desk):
-        super().__init__("pair", Path("none"), "tester")
         self.asked, self._desk = [], desk
 
-    def _exchange(self, method, path, content):
+    def exchange(self, method, path, body):
         self.asked.append(path)
         status, answer = self._desk.ask(method, path)
         return status, json.dumps(answer).encode()
@@ -39,22 +37,23 @@ def with_urdf(desk, imu=""):
     desk.record, desk.link._record = CycleRecord(layout), CycleRecord(layout)
     loop = replace(desk.link.plan.loop, urdf=URDF)
     desk.link.plan = replace(desk.link.plan, loop=loop, frames=FramesPlan(30.0, ("pan", "tilt"), imu))
-    return Client(desk)
+    link = DeskLink(desk)
+    return RemoteRobot("pair", link), link
 
 
 def test_a_pose_is_that_of_the_newest_cycle(desk):
-    robot = with_urdf(desk)
+    robot, link = with_urdf(desk)
     for pan, tilt in ((np.pi / 2, 0.5), (0.0, -0.25)):
         desk.record.states.position[:] = (pan, tilt)
         desk.finish_cycle()
         found = robot.pose("tilt", "base_link")
         assert found.translation == pytest.approx(((1 + tilt) * np.cos(pan), (1 + tilt) * np.sin(pan), 0))
     assert robot.frames().pose("tilt", "pan", {"tilt": 3.0}).translation == (4, 0, 0)
-    assert robot.asked.count("/frames") == 1  # the tree stays as it is
+    assert link.asked.count("/frames") == 1  # the tree stays as it is
 
 
 def test_what_is_not_known_has_no_pose(desk):
-    robot = with_urdf(desk)
+    robot, _ = with_urdf(desk)
     desk.record.states.position[:] = (np.nan, 0.5)
     desk.finish_cycle()
 
@@ -66,7 +65,7 @@ def test_what_is_not_known_has_no_pose(desk):
 
 
 def test_the_body_turns_with_its_imu(desk):
-    robot = with_urdf(desk, "imu")
+    robot, _ = with_urdf(desk, "imu")
     desk.record.states.position[:] = (0.0, 0.0)
     desk.finish_cycle()
     with pytest.raises(ValueError, match="a position is not known"):
@@ -75,9 +74,10 @@ def test_the_body_turns_with_its_imu(desk):
     desk.finish_cycle()
 
     assert robot.pose("pan", "odom").rpy == pytest.approx((np.pi / 2, 0, 0))
-    assert desk.ask("GET", "/states")[1]["sources"]["imu/orientation.x"] == 2.0
+    states = robot.states()
+    assert (states.source_states[0], states.source_state[0]) == ("imu/orientation.x", 2.0)
 
 
 def test_a_robot_without_a_urdf_says_so(desk):
     with pytest.raises(dxlrun.DxlrunError, match="pair has no URDF; its robot file names one by `model:"):
-        Client(desk).frames()
+        RemoteRobot("pair", DeskLink(desk)).frames()

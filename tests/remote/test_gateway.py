@@ -552,12 +552,13 @@ def test_states_are_those_of_the_newest_cycle_and_what_is_not_there_is_null(desk
     desk.record.states.hardware_error[1] = 0x20
     desk.finish_cycle()
     status, told = desk.ask("GET", "/states")
-    assert (status, told["cycle"], told["time"]) == (200, 1, 1.02)
-    pan, tilt = told["joints"]["pan"], told["joints"]["tilt"]
-    assert (pan["position"], pan["valid"], pan["age"]) == (0.5, True, 0.0)
-    assert (tilt["position"], tilt["valid"], tilt["age"]) == (None, False, 0.04)
-    assert (pan["mode"], pan["temperature"], pan["hardware_error"]) == ("effort", 41.0, 0)
-    assert (tilt["mode"], tilt["temperature"], tilt["hardware_error"]) == ("unknown", None, 0x20)
+    assert (status, told["cycle"], told["time_ns"]) == (200, 1, 1_020_000_000)
+    assert (told["joints"], told["position"], told["valid"]) == (["pan", "tilt"], [0.5, None], [True, False])
+    assert (told["age_ns"], told["mode"]) == ([0, 40_000_000], ["effort", "unknown"])
+    assert (told["temperature"], told["hardware_error"]) == ([41.0, None], [0, 0x20])
+    pan, tilt = (desk.ask("GET", f"/joints/{name}")[1] for name in told["joints"])
+    assert (pan["position"], pan["valid"], pan["age"], pan["mode"]) == (0.5, True, 0.0, "effort")
+    assert (tilt["position"], tilt["valid"], tilt["age"], tilt["temperature"]) == (None, False, 0.04, None)
 
 
 def test_states_show_the_references_by_their_names(desk):
@@ -566,8 +567,8 @@ def test_states_show_the_references_by_their_names(desk):
     desk.record, desk.link._record = CycleRecord(layout), CycleRecord(layout)
     desk.record.reference[:] = (0.25, np.nan)
     desk.finish_cycle()
-    references = desk.ask("GET", "/states")[1]["references"]
-    assert references == {"spare/pan/position": 0.25, "spare/pan/effort": None}
+    found = desk.ask("GET", "/states")[1]
+    assert (found["references"], found["reference"]) == ([*names], [0.25, None])
 
 
 def test_events_of_both_processes_are_returned_whole_and_once(desk):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import asyncio
 import os
+import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -16,7 +18,12 @@ import pytest
 
 import dxlrun
 from dxlrun.log.reader import read_log
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import RemoteRobot
+from dxlrun.remote.live.listening import Listening
+from dxlrun.remote.live.topics import framed
+from dxlrun.remote.replies import Opened, RunEnded, Sample
 from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\
@@ -77,68 +84,154 @@ def dxlrun_controllers():
     return {"count": Counting}
 """
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
+LISTENER = "import dxlrun; [print(one.number, flush=True) for one in dxlrun.connect().listen('/cycle')]"
 DEADLINE_S = 60.0
 
 
-def answer(*numbers: int, lost: int = 0) -> dict[str, object]:
-    messages = [{"number": n, "time": n * 0.1, "message": {"amount": None}} for n in numbers]
-    return {
-        "topic": "/arm/state", "type": "mine/msg/State", "joints": ["pan"], "messages": messages,
-        "last": numbers[-1] if numbers else 0, "lost": lost,
-    }  # fmt: skip
+class Link:
+    """A link whose streams have what the test writes; its robot may have ended."""
+
+    alive = True
+
+    def __init__(self, first: bytes = b"", status: int = 200) -> None:
+        self.first, self.status = first, status
+        self.asked: list[str] = []
+        self.ended = False
+
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        raise NotImplementedError
+
+    def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
+        self.asked.append(path)
+        self.gateway, end = socket.socketpair()
+        return self.status, self.first, end
+
+    def ends(self) -> bool:
+        return self.ended
+
+    def close(self) -> None:
+        self.gateway.close()
+
+
+KIND = MessageType("mine/msg/State", "float64 amount\n")
+CODEC = Codec(KIND)
+OPENED = framed(Opened(0, "/arm/state", KIND.name, KIND.text, ("pan",), 10**9))
+OTHER = framed(Opened(1, "/leg/state", KIND.name, KIND.text, (), 10**9))
+
+
+def sent(*numbers: int, place: int = 0) -> bytes:
+    return b"".join(framed(Sample(place, n, n * 1000, CODEC.pack(float(n)))) for n in numbers)
 
 
 @pytest.fixture
-def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[RemoteRobot, list[str]]]:
-    """Return a client whose requests get these answers, and then find no robot any more."""
+def robot() -> Iterator[Callable[[Link], RemoteRobot]]:
+    """Return a client of a link."""
+    used: list[Link] = []
 
-    def make(*answers: dict[str, object]) -> tuple[RemoteRobot, list[str]]:
-        asked: list[str] = []
-        rest = list(answers)
+    def make(link: Link) -> RemoteRobot:
+        used.append(link)
+        return RemoteRobot("publisher", link)
 
-        def exchange(_: RemoteRobot, method: str, path: str, content: object) -> tuple[int, bytes]:
-            asked.append(path)
-            if not rest:
-                raise dxlrun.DxlrunError("publisher no longer answers")
-            return 200, json.dumps(rest.pop(0)).encode()
-
-        monkeypatch.setattr(RemoteRobot, "_exchange", exchange)
-        return RemoteRobot("publisher", tmp_path / "none.sock", "test"), asked
-
-    return make
+    yield make
+    for link in used:
+        link.close()
 
 
-def test_every_message_comes_once_and_what_is_missing_is_counted(robot: Any) -> None:
-    client, asked = robot(answer(7), answer(8, 9), answer(), answer(15, 16, lost=5))
-    found = [(one.number, one.lost) for one in client.listen("arm/state")]
-    assert found == [(7, 0), (8, 0), (9, 0), (15, 5), (16, 0)]
-    last = [7, 9, 9, 16]
-    assert asked == ["/topics/arm/state", *(f"/topics/arm/state?after={n}&wait=2" for n in last)]
+def test_every_message_comes_once_and_what_is_missing_is_counted_for_each_topic(robot: Any) -> None:
+    link = Link(OPENED + OTHER + sent(7) + sent(100, place=1)[:5])
+    listening = iter(robot(link).listen("arm/state", "/leg/state"))
+    first = next(listening)
+    assert (first.topic, first.type, first.number, first.lost) == ("/arm/state", "mine/msg/State", 7, 0)
+    assert (first.time_ns, first.wall_ns, first.joints) == (7000, 10**9 + 7000, ("pan",))
+    assert first.message == {"amount": 7.0}
+    rest = sent(100, place=1)[5:] + framed_nothing() + sent(8, 9, 15) + sent(103, place=1) + sent(16)
+    link.gateway.sendall(rest + framed(RunEnded()))
+    assert [(one.topic[1:4], one.number, one.lost) for one in listening] == [
+        ("leg", 100, 0), ("arm", 8, 0), ("arm", 9, 0), ("arm", 15, 5), ("leg", 103, 2), ("arm", 16, 0),
+    ]  # fmt: skip
+    assert link.asked == ["/stream?topic=/arm/state&topic=/leg/state"]
 
 
-def test_at_a_rate_the_newest_comes_each_time(robot: Any) -> None:
-    client, asked = robot(answer(7), answer(30), answer(30), answer(31, 32))
-    found = [(one.number, one.joints, one.message) for one in client.listen("/arm/state", rate=1e6)]
-    assert [number for number, *_ in found] == [7, 30, 32]
-    assert found[0][1:] == (("pan",), {"amount": None})
-    assert asked[:4] == [*["/topics/arm/state"] * 3, "/topics/arm/state?after=30&wait=2"]
+def framed_nothing() -> bytes:
+    """Return what shows that the gateway is alive."""
+    return bytes(4)
+
+
+def test_of_the_newest_what_has_come_meanwhile_is_left_out_and_counted(robot: Any) -> None:
+    link = Link(OPENED + sent(7))
+    listening = iter(robot(link).listen("/arm/state", rate=100.0))
+    assert next(listening).number == 7
+    link.gateway.sendall(sent(*range(8, 20)))
+    link.gateway.sendall(sent(20))
+    assert [(one.number, one.lost) for one in (next(listening),)] == [(20, 12)]
+    assert link.asked == ["/stream?topic=/arm/state&newest=true&rate=100"]
 
 
 def test_the_newest_message_may_be_none(robot: Any) -> None:
-    client, _ = robot(answer(), answer(4))
-    assert client.newest("/arm/state") is None
-    assert client.newest("/arm/state").number == 4
+    assert robot(Link(OPENED + framed(RunEnded()))).newest("/arm/state") is None
+    assert robot(Link(OPENED + sent(4) + framed(RunEnded()))).newest("/arm/state").number == 4
 
 
-def test_a_gateway_that_fails_while_the_run_goes_on_is_an_error(
-    robot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_async_programs_get_the_same_beside_other_work(robot: Any) -> None:
+    link = Link(OPENED)
+
+    async def listen() -> list[int]:
+        found, other = [], asyncio.ensure_future(publish())
+        async for message in robot(link).listen("/arm/state"):
+            found.append(message.number)
+        await other
+        return found
+
+    async def publish() -> None:
+        for number in range(1, 4):
+            await asyncio.sleep(0)
+            link.gateway.sendall(sent(number))
+        link.gateway.sendall(framed(RunEnded()))
+
+    assert asyncio.run(listen()) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("way", ["for", "async for"])
+def test_a_gateway_that_fails_while_the_run_goes_on_is_an_error_and_else_an_end(robot: Any, way: str) -> None:
     """That of a run that ends removes its socket; of one that is killed it is left."""
-    client, _ = robot(answer(7))
-    (tmp_path / "none.sock").touch()
-    monkeypatch.setattr("dxlrun.remote.client._ENDING_S", 0.05)
-    with pytest.raises(dxlrun.DxlrunError, match="no longer answers"):
-        list(client.listen("/arm/state"))
+    found: list[int] = []
+
+    def listen(link: Link) -> None:
+        listening = robot(link).listen("/arm/state")
+        link.gateway.close()
+        if way == "for":
+            found.extend(message.number for message in listening)
+        else:
+            asyncio.run(collect(listening))
+
+    async def collect(listening: Listening) -> None:
+        found.extend([message.number async for message in listening])
+
+    with pytest.raises(dxlrun.DxlrunError, match="publisher no longer answers: the connection was closed"):
+        listen(Link(OPENED + sent(7)))
+    link = Link(OPENED + sent(8))
+    link.ended = True
+    listen(link)
+    assert found[-1] == 8
+
+
+@pytest.mark.parametrize("way", ["for", "async for"])
+def test_a_gateway_that_hangs_is_an_error(robot: Any, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dxlrun.remote.live.listening.TIMEOUT_S", 0.05)
+
+    async def collect(listening: Listening) -> None:
+        assert [message.number async for message in listening] == []
+
+    listening = robot(Link(OPENED)).listen("/arm/state")
+    with pytest.raises(dxlrun.DxlrunError, match=r"no longer answers: nothing came for 0\.05 s"):
+        list(listening) if way == "for" else asyncio.run(collect(listening))
+
+
+def test_a_refusal_is_that_of_each_request(robot: Any) -> None:
+    answer = b'{"refused": "there is no topic /arm", "code": "unknown_topic", "fields": {}}'
+    with pytest.raises(dxlrun.Refused, match="there is no topic /arm") as refused:
+        robot(Link(answer, 404)).listen("/arm")
+    assert (refused.value.code, refused.value.exit_code) == ("unknown_topic", 2)
 
 
 @pytest.fixture
@@ -179,9 +272,16 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
         with pytest.raises(dxlrun.Refused, match="there is no topic /count/states; there are /count/state"):
             robot.newest("/count/states")
         found = []
+        sleeper = robot.listen("/count/state", "/joint_states")  # takes nothing before the end
+        killed = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE)
+        assert killed.stdout is not None
+        killed.stdout.readline()
         for message in robot.listen("/count/state"):
             found.append(message)
-            if len(found) == 20:
+            if len(found) == 10:
+                killed.send_signal(signal.SIGKILL)
+                killed.communicate()
+            if len(found) == 30:
                 with dxlrun.connect() as other:
                     other.stop(wait=False)
     code, said = running.wait(DEADLINE_S), (tmp_path / "stderr").read_text()
@@ -189,9 +289,15 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
     (log,) = (tmp_path / "logs").glob("*.mcap")
     topic = read_log(log).topics["/count/state"]
     assert topic.column("number").tolist() == [*range(len(topic.data) - 1), -1]
-    numbers = [one.number for one in found]
-    assert numbers[-1] - numbers[0] + 1 == len(numbers) + sum(one.lost for one in found)
-    assert all(one.message["number"] in (one.number - 1, -1) for one in found)
+    late = list(sleeper)
+    states = [one for one in late if one.topic == "/joint_states"]
+    for each in (found, [one for one in late if one.topic == "/count/state"], states):
+        numbers = [one.number for one in each]
+        assert numbers[-1] - numbers[0] + 1 == len(numbers) + sum(one.lost for one in each)
+    assert found[-1].number == len(topic.data)
+    assert [one.data for one in found] == [topic.data[one.number - 1] for one in found]
+    woken_ns = read_log(log).cycles["woken_ns"]
+    assert [one.time_ns for one in states] == [int(woken_ns[one.number - 1]) for one in states]
     seconds = topic.column("header.stamp.sec") + topic.column("header.stamp.nanosec") * 1e-9
     assert abs(seconds[-1] - time.time()) < DEADLINE_S  # wall time
     monkeypatch.syspath_prepend(tmp_path)

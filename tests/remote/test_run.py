@@ -180,7 +180,7 @@ def test_clients_can_read_what_became_of_their_commands(steered):
     told = {one["name"]: (one["active"], one["rate"]) for one in info["controllers"]}
     assert told == {"hold": (False, 100.0), "solo": (True, 100.0), "more": (True, 50.0)}
     assert (info["rate"], info["paused"], info["joints"]) == (100.0, False, ["pan", "tilt"])
-    assert set(steered.states["joints"]) == {"pan", "tilt"}
+    assert steered.states.joints == ("pan", "tilt")
     names = [event["name"] for event in steered.events["events"]]
     assert "stale_command" in names
     assert names.count("steered") == 6

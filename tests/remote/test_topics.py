@@ -1,8 +1,7 @@
-"""Live topics at the gateway: the newest, all behind a number, and what a slow client misses."""
+"""Live topics at the gateway: what a stream has, from where on, and what a client that sleeps misses."""
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,14 @@ import pytest
 
 from dxlrun import Floats
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.messages import Topic, TopicMessage
+from dxlrun.channels.messages import Topic
 from dxlrun.messages import Header
+from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
-from dxlrun.remote.topics import ANSWER_BYTES, KEPT_BYTES, KEPT_MESSAGES, MOST_PER_ANSWER, LiveTopic
+from dxlrun.messages.definition import MessageType
+from dxlrun.remote.live.topics import MOST_RECORDS
+from dxlrun.remote.preparation import RefusedRequest
+from dxlrun.remote.replies import Opened, Sample
 
 
 @dataclass
@@ -36,18 +39,25 @@ def publish(desk, number, first, last, text=""):
 
 @pytest.fixture
 def number(desk):
-    return desk.messages.announce(TOPIC)
+    """The number of an announced topic."""
+    number = desk.messages.announce(TOPIC)
+    desk.link.collect()
+    return number
 
 
-def numbers(answer):
-    return [one["number"] for one in answer["messages"]]
+def samples(desk, stream):
+    return [one for one in desk.frames(stream) if isinstance(one, Sample)]
+
+
+def numbers(desk, stream):
+    return [one.number for one in samples(desk, stream)]
 
 
 def test_all_topics_are_listed_with_their_types_and_rates(desk, number):
     publish(desk, number, 1, 5)
     status, found = desk.ask("GET", "/topics")
     assert status == 200
-    state, events, joints = found["topics"]
+    state, *others = found["topics"]
     assert state == {
         "name": "/left/state",
         "type": "mine/msg/State",
@@ -55,121 +65,130 @@ def test_all_topics_are_listed_with_their_types_and_rates(desk, number):
         "count": 5,
         "rate": pytest.approx(100.0),
     }
-    assert (events["name"], events["type"]) == ("/events", "dxlrun_msgs/msg/Event")
-    assert (joints["name"], joints["type"]) == ("/joint_states", "sensor_msgs/msg/JointState")
-
-
-def test_the_newest_message_is_json_and_nan_is_null(desk, number):
-    assert desk.ask("GET", "/topics/left/state")[1]["messages"] == []
-    publish(desk, number, 1, 3)
-    _, found = desk.ask("GET", "/topics/left/state")
-    assert found["messages"] == [
-        {
-            "number": 3,
-            "time": pytest.approx(0.03),
-            "message": {
-                "header": {"stamp": {"sec": 3, "nanosec": 0}, "frame_id": ""},
-                "error": [3.0, None],
-                "text": "",
-            },
-        }
+    assert [(one["name"], one["type"], one["count"]) for one in others] == [
+        ("/events", "dxlrun_msgs/msg/Event", 0),
+        ("/cycle", "dxlrun_msgs/msg/Cycle", 1),
+        ("/joint_states", "sensor_msgs/msg/JointState", 1),
     ]
-    assert (found["last"], found["lost"], found["joints"]) == (3, 0, ["pan", "tilt"])
 
 
-def test_a_client_gets_each_message_once_in_answers_of_bounded_length(desk, number):
-    publish(desk, number, 1, 2 * MOST_PER_ANSWER + 5)
-    seen, last = [], 0
-    for _ in range(3):
-        _, found = desk.ask("GET", f"/topics/left/state?after={last}")
-        assert found["lost"] == 0
-        seen += numbers(found)
-        last = found["last"]
-    assert seen == list(range(1, 2 * MOST_PER_ANSWER + 6))
-    assert desk.ask("GET", f"/topics/left/state?after={last}")[1]["messages"] == []
+def test_a_stream_begins_with_what_the_topic_is_and_its_newest_message(desk, number):
+    assert numbers(desk, desk.link.listen(["/left/state"], newest=False)) == []
+    publish(desk, number, 1, 3)
+    opened, sample = desk.frames(desk.link.listen(["/left/state"], newest=False))
+    assert opened == Opened(0, "/left/state", DECLARED.type.name, DECLARED.type.text, ("pan", "tilt"), 0)
+    assert (sample.place, sample.number, sample.time_ns) == (0, 3, 30_000_000)
+    message = Codec(MessageType(opened.type, opened.definition)).unpack(sample.data)
+    assert message["error"].tolist() == [3.0, pytest.approx(np.nan, nan_ok=True)]
 
 
-def test_a_slow_client_is_told_how_many_it_missed(desk, number):
-    publish(desk, number, 1, KEPT_MESSAGES + 100)
-    _, found = desk.ask("GET", "/topics/left/state?after=10")
-    assert numbers(found)[0] == 101
-    assert found["lost"] == 90
-
-
-def test_long_messages_are_kept_within_their_bytes():
-    live = LiveTopic(TOPIC)
-    data = DECLARED.pack(State(Header(), np.zeros(0), "x" * 60_000), (0, 0))
-    for index in range(100):
-        live.keep(TopicMessage(index, 0, data))
-    kept = live.after(0)
-    assert live.count == 100
-    assert kept.lost >= 100 - KEPT_BYTES // 60_000
-    assert sum(map(len, [one.data for one in live._kept])) <= KEPT_BYTES
-
-
-def test_an_answer_has_no_more_bytes_than_it_may():
-    live = LiveTopic(TOPIC)
-    data = DECLARED.pack(State(Header(), np.zeros(0), "x" * 60_000), (0, 0))
-    for index in range(10):
-        live.keep(TopicMessage(index, 0, data))
-    first = live.after(0)
-    assert [one.number for one in first.messages] == list(range(1, first.last + 1))
-    assert first.last <= ANSWER_BYTES // 60_000 + 1
-    assert live.after(first.last).messages[0].number == first.last + 1
-
-
-def test_a_request_waits_for_the_next_message(desk, number):
+def test_each_message_comes_once_to_each_of_two_clients_at_their_own_pace(desk, number):
     publish(desk, number, 1, 1)
-
-    async def waits():
-        asked = asyncio.ensure_future(desk.request("GET", "/topics/left/state?after=1&wait=5"))
-        for _ in range(3):
-            await asyncio.sleep(0)
-        assert not asked.done()
-        publish(desk, number, 2, 2)
-        return await asked
-
-    status, found = asyncio.run(waits())
-    assert (status, numbers(found)) == (200, [2])
+    quick, slow = (desk.link.listen(["/left/state"], newest=False) for _ in range(2))
+    seen = []
+    for last in range(2, 2 * MOST_RECORDS, 5):
+        publish(desk, number, last, last + 4)
+        seen += numbers(desk, quick)
+    assert seen == numbers(desk, slow) == list(range(1, last + 5))
+    assert numbers(desk, slow) == []
 
 
-def test_events_and_the_states_of_the_joints_are_topics_too(desk):
+def test_of_much_a_part_is_taken_at_once_so_that_others_are_served(desk, number):
+    publish(desk, number, 1, 1)
+    stream = desk.link.listen(["/left/state"], newest=False)
+    publish(desk, number, 2, 3 * MOST_RECORDS)
+    stream.frames()
+    assert stream.behind
+    assert numbers(desk, stream)[-1] == 3 * MOST_RECORDS
+    assert not stream.behind
+
+
+def test_the_numbers_show_exactly_what_a_client_that_slept_has_missed(desk, number):
+    """The ring has room for less than what is published meanwhile; other topics share it."""
+    other = desk.messages.announce(Topic("/right/state", DECLARED.type))
+    publish(desk, number, 1, 1)
+    stream = desk.link.listen(["/left/state"], newest=False)
+    assert numbers(desk, stream) == [1]
+    for index in range(2, 60):
+        publish(desk, other, index, index, "x" * 30_000)
+        publish(desk, number, index, index)
+    found = numbers(desk, stream)
+    assert found[0] > 2
+    assert found == list(range(found[0], 60))
+
+
+def test_of_the_newest_only_the_last_comes_of_each_topic(desk, number):
+    stream = desk.link.listen(["/joint_states", "/left/state"], newest=True)
+    assert [(one.place, one.number) for one in samples(desk, stream)] == [(0, 1)]
+    publish(desk, number, 1, 9)
+    for _ in range(4):
+        desk.finish_cycle()
+    assert [(one.place, one.number) for one in samples(desk, stream)] == [(1, 9), (0, 5)]
+
+
+def test_events_and_every_cycle_are_topics_too(desk):
     desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "first")
     desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "second")
-    _, found = desk.ask("GET", "/topics/events")
-    assert [one["message"]["text"] for one in found["messages"]] == ["second"]
-    _, found = desk.ask("GET", "/topics/events?after=0")
-    assert [one["message"]["text"] for one in found["messages"]] == ["first", "second"]
+    desk.link.collect()
+    stream = desk.link.listen(["/events", "/joint_states", "/cycle"], newest=False)
+    event, states, cycle = desk.frames(stream)[:3]
+    codecs = [Codec(MessageType(one.type, one.definition)) for one in (event, states, cycle)]
+    desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "third")
+    desk.link.collect()
+    (sample,) = samples(desk, stream)
+    assert codecs[0].unpack(sample.data)["text"] == "third"
     desk.record.states.position[:] = (0.5, np.nan)
     desk.finish_cycle()
-    _, found = desk.ask("GET", "/topics/joint_states")
-    (message,) = found["messages"]
-    assert message["message"]["name"] == ["pan", "tilt"]
-    assert message["message"]["position"] == [0.5, None]
-    assert desk.ask("GET", f"/topics/joint_states?after={message['number']}")[1]["messages"] == []
+    states, cycle = samples(desk, stream)
+    assert (states.number, cycle.number) == (2, 2)
+    assert codecs[1].unpack(states.data)["name"] == ["pan", "tilt"]
+    assert codecs[1].unpack(states.data)["position"].tolist()[0] == 0.5
+    assert cycle.data[4:] == bytes(desk.record.raw)
+    assert codecs[2].unpack(cycle.data)["position"].tolist()[0] == 0.5
+    assert samples(desk, stream) == []
+
+
+def test_cycles_that_are_missing_show_in_the_numbers_though_their_own_numbers_skip_too(desk):
+    """A loop that skips periods leaves out numbers of cycles: those are no messages."""
+    stream = desk.link.listen(["/joint_states"], newest=False)
+    assert numbers(desk, stream) == [1]
+    desk.ended += 100
+    desk.finish_cycle()
+    assert numbers(desk, stream) == [2]
+    for _ in range(40):  # more than the ring holds
+        desk.finish_cycle()
+    found = numbers(desk, stream)
+    assert found[0] > 3
+    assert found == list(range(found[0], 43))
 
 
 def test_an_unknown_topic_is_refused_with_those_that_exist(desk, number):
-    publish(desk, number, 1, 1)
-    status, found = desk.ask("GET", "/topics/left/states")
+    with pytest.raises(RefusedRequest) as refused:
+        desk.link.listen(["/joint_states", "/left/states"], newest=False)
+    assert str(refused.value) == (
+        "there is no topic /left/states; there are /left/state, /events, /cycle, /joint_states"
+    )
+    status, found = desk.ask("GET", "/stream?topic=/left/states")
     assert (status, found["code"]) == (404, "unknown_topic")
-    expected = "there is no topic /left/states; there are /left/state, /events, /joint_states"
-    assert found["refused"] == expected
-    assert desk.ask("GET", "/topics/left/state?wait=60")[0] == 422
+    assert desk.ask("GET", "/stream")[0] == 422
+    assert desk.ask("GET", "/stream?topic=/events&rate=-1")[0] == 422
 
 
 def test_the_numbers_go_on_when_a_controller_is_loaded_again(desk, number):
     publish(desk, number, 1, 3)
+    stream = desk.link.listen(["/left/state"], newest=False)
     publish(desk, desk.messages.announce(TOPIC), 4, 4)
-    _, found = desk.ask("GET", "/topics/left/state?after=0")
-    assert numbers(found) == [4]
+    found = desk.frames(stream)
+    assert [type(one) for one in found] == [Opened, Sample, Opened, Sample]
+    assert [one.number for one in found if isinstance(one, Sample)] == [3, 4]
+    assert numbers(desk, desk.link.listen(["/left/state"], newest=False)) == [4]
 
 
 def test_a_damaged_record_takes_nothing_along(desk, number):
     publish(desk, number, 1, 1)
+    stream = desk.link.listen(["/left/state"], newest=False)
     desk.message_ring.append(7, b"short")
     desk.message_ring.append(8, b"short")
-    desk.messages.message(99, 0, b"of no topic")
+    desk.message_ring.append(8, bytes(8) + b"\x63" + bytes(30))  # of topic 99, which there is not
     publish(desk, number, 2, 2)
-    _, found = desk.ask("GET", "/topics/left/state?after=0")
-    assert numbers(found) == [1, 2]
+    assert numbers(desk, stream) == [1, 2]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dxlrun.errors import ProcessFault
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.sockets import sockets
+from dxlrun.remote.sockets import SocketLink, sockets
 
 _CODE = """
 import ctypes, signal, sys
@@ -60,7 +60,7 @@ class OwnRun:
                 raise ProcessFault("\n".join(self._sentences()) or "the run ended before it began")
             for name, path in sockets().items():
                 if _parent_of_listener(path) == self._process.pid:
-                    robot = RemoteRobot(name, path, "experiment")
+                    robot = RemoteRobot(name, SocketLink(path, "experiment"))
                     if robot.info()["cycles"]:
                         return robot
                     robot.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from itertools import starmap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -125,8 +126,9 @@ class Rig:
     def joints(self) -> Mapping[str, JointNow]:
         """Return the joints as they are in the newest cycle."""
         with self._asking() as robot:
-            rows = robot.states()["joints"]
-        return {str(name): _now_of(row) for name, row in rows.items()} if isinstance(rows, dict) else {}
+            states = robot.states()
+        rows = zip(states.position.tolist(), states.goal_position.tolist(), states.torque, strict=True)
+        return dict(zip(states.joints, starmap(JointNow, rows), strict=True))
 
     def load(self, name: str, entry: Mapping[str, object]) -> None:
         """Load a controller, in a pause of its own."""
@@ -259,13 +261,3 @@ def require_whole(recording: RecordingPlan, robot: str) -> None:
             f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "
             "log; take `keep` out of its `recording`"
         )
-
-
-def _now_of(state: Mapping[str, object]) -> JointNow:
-    """Return a joint's state as it is in JSON: a number that is not known is none."""
-    position, goal = (state.get(name) for name in ("position", "goal_position"))
-    return JointNow(
-        float(position) if isinstance(position, int | float) else float("nan"),
-        float(goal) if isinstance(goal, int | float) else float("nan"),
-        str(state.get("torque")),
-    )

@@ -2,62 +2,92 @@
 
 from __future__ import annotations
 
+import asyncio
+import itertools
+import os
+import selectors
+import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from starlette.types import Message
 
-from dxlrun.channels.answers import Done, Refusal, Waiting
-from dxlrun.channels.commands import LOOP, Command
-from dxlrun.channels.events import Event, EventCode, GoalReport, decode_event
-from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.channels import heartbeat, mailbox, ring
+from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
+from dxlrun.channels.events import LONGEST_EVENT, Event, decode_event
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.mailbox import Mailbox
+from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD
+from dxlrun.channels.ring import Payload, RecordKind, RingWriter
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.joints import joint_state
-from dxlrun.remote.preparation import Preparation, RefusedRequest
-from dxlrun.remote.replies import Executed, GoalState, NotDone
+from dxlrun.remote.gateway import GatewayApp
+from dxlrun.remote.job import Descriptors
+from dxlrun.remote.link import Link
+from dxlrun.remote.preparation import Preparation
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab.guided.rig import Cycles, Rig, RunGone
 
-_ANSWER_S = 10.0
-"""Of virtual time, in which a command must be answered."""
-ORIGIN = "experiment"
+ORIGIN = b"experiment"
+_EVENTS_CAPACITY = 1 << 20
+"""Bytes; the gateway looks after each cycle."""
 EachCycle = Callable[[int], None]
 
 
 def virtual_rig(plan: Plan, *, log: Path | None = None, each_cycle: EachCycle = lambda cycle: None) -> Rig:
     """Return the rig of a robot on virtual time; see RobotOnVirtualTime."""
-    robot = RobotOnVirtualTime(plan, log=log, each_cycle=each_cycle)
-    return Rig(
-        robot, plan, robot.new, log=log, end=lambda: robot.simulated.failures, now_s=lambda: robot.now_s
-    )
+    link = RobotOnVirtualTime(plan, log=log, each_cycle=each_cycle)
+    robot = RemoteRobot(plan.robot, link)
+    return Rig(robot, plan, link.new, log=log, end=lambda: link.simulated.failures, now_s=lambda: link.now_s)
 
 
-class RobotOnVirtualTime(RemoteRobot):
-    """A robot whose loop runs in a thread, in turns with the experiment: one of both waits.
+class RobotOnVirtualTime:
+    """Link to a robot whose loop runs in a thread, in turns with the experiment: one of both waits.
 
-    It does what an experiment asks of a running one. So an experiment is written as if the robot ran beside
-    it, and two runs do exactly the same. `each_cycle` gets the number of each cycle, in the robot's
-    turn: tests inject faults there.
+    The gateway of a run answers, in the experiment's turn: where it would wait, the robot runs a cycle. So an
+    experiment is written as if the robot ran beside it, and two runs do exactly the same. `each_cycle` gets
+    the number of each cycle, in the robot's turn: tests inject faults there.
     """
 
     def __init__(self, plan: Plan, *, log: Path | None, each_cycle: EachCycle) -> None:
-        super().__init__(plan.robot, Path(), ORIGIN)
-        self.simulated = VirtualRobot(plan, log=log, watch=self._watch)
+        self.name = plan.robot
         self.each_cycle = each_cycle
-        self._plan = plan
         self._cycles: list[bytes] = []
         self._events: list[Event] = []
         loop = plan.loop
+        size = loop.layout.size
+        memory = Descriptors(
+            heartbeat=heartbeat.create(),
+            cycles=ring.create("cycles", cycle_capacity(loop.period_ns, size), size),
+            events=ring.create("events", _EVENTS_CAPACITY, LONGEST_EVENT),
+            guardian=ring.create("guardian", _EVENTS_CAPACITY, LONGEST_EVENT),
+            mailbox=mailbox.create(MOST_CONTROLLERS),
+            answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
+            messages=ring.create("messages", LEAST_CAPACITY, LONGEST_RECORD),
+        )
+        self._heartbeat = Heartbeat(memory.heartbeat)
+        messages = RingWriter(memory.messages)
+        self._rings = {
+            RecordKind.CYCLE: RingWriter(memory.cycles),
+            RecordKind.EVENT: RingWriter(memory.events),
+            RecordKind.TOPIC: messages,
+            RecordKind.MESSAGE: messages,
+        }
+        self.simulated = VirtualRobot(plan, log=log, watch=self._watch)
+        self.simulated.robot.loop.steering.inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
+        self.gateways_link = Link(plan, memory)
+        for descriptor in astuple(memory):
+            os.close(descriptor)
         joints = {joint.name: joint for joint in loop.joints}
-        self._preparation = Preparation(joints, load_plugins(), loop.sources, loop.urdf)
-        self._loaded = {one.name: (one, place) for place, one in enumerate(loop.controllers)}
-        self._rate = 1e9 / loop.period_ns
-        self._number = 0
-        self.ends: dict[int, GoalReport] = {}
+        preparation = Preparation(joints, load_plugins(), loop.sources, plan.urdf, plan.groups)
+        log_path = str(log) if log else None
+        seconds = itertools.count()  # one a request: an experiment may make as many as it likes
+        self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()
+        self._waiting = _VirtualTime(lambda: self.now_s, self._turn)
         self._due: Callable[[], bool] = lambda: True
         """Ends the robot's turn."""
         self._robots_turn, self._our_turn = threading.Semaphore(0), threading.Semaphore(0)
@@ -67,6 +97,7 @@ class RobotOnVirtualTime(RemoteRobot):
         self._our_turn.acquire()
         if self._error is not None:
             raise self._error
+        self._heartbeat.enter(Phase.RUNNING)
 
     # The robot's turn
 
@@ -79,17 +110,16 @@ class RobotOnVirtualTime(RemoteRobot):
             self._our_turn.release()
 
     def _watch(self, kind: RecordKind, payload: Payload) -> None:
+        if kind in self._rings:
+            self._rings[kind].append(kind, payload)
         if kind is RecordKind.EVENT:
-            event = decode_event(payload)
-            self._events.append(event)
-            if event.code == EventCode.GOAL_ENDED:
-                report = msgspec.json.decode(event.data, type=GoalReport)
-                self.ends[report.goal] = report
+            self._events.append(decode_event(payload))
         elif kind is RecordKind.CYCLE:
             cycle = self.simulated.record.cycle
             if cycle < 0:  # the record before the first cycle
                 return
             self._cycles.append(bytes(payload))
+            self._heartbeat.cycle(self.simulated.cycles + 1, self.simulated.skipped)
             self.each_cycle(cycle)
             if self._due():
                 self._our_turn.release()
@@ -104,20 +134,25 @@ class RobotOnVirtualTime(RemoteRobot):
 
     def until(self, due: Callable[[], bool]) -> None:
         """Let the robot run until a cycle at whose end `due` is true. Raises RunGone when it ends before."""
-        if not self._thread.is_alive():
-            raise RunGone(self._why())
+        self._require_running()
         self._due = due
         self._robots_turn.release()
         self._our_turn.acquire()
         if self._error is not None or self.simulated.result is not None:
             self._thread.join()
             if not due():
-                raise RunGone(self._why())
+                self._require_running()
 
-    def _why(self) -> str:
-        result = self.simulated.result
-        detail = str(self._error or (result.detail if result else ""))
-        return f"the run of {self.name} ended{f': {detail}' if detail else ''}"
+    def _require_running(self) -> None:
+        if not self._thread.is_alive():
+            result = self.simulated.result
+            detail = str(self._error or (result.detail if result else ""))
+            raise RunGone(f"the run of {self.name} ended{f': {detail}' if detail else ''}")
+
+    def _turn(self) -> None:
+        """Let the robot run a cycle, and the gateway take what that left."""
+        self.until(lambda: True)
+        self.gateways_link.collect()
 
     def new(self) -> tuple[Cycles, Sequence[Event]]:
         """Return the cycles and events since the last call."""
@@ -125,81 +160,45 @@ class RobotOnVirtualTime(RemoteRobot):
         events, self._cycles, self._events = self._events, [], []
         return cycles, events
 
-    def _exchange(self, method: str, path: str, content: Mapping[str, object] | None) -> tuple[int, bytes]:
-        """Do what the gateway does with a request: the link of this robot."""
-        words = path.partition("?")[0].split("/")[1:]
-        try:
-            return 200, msgspec.json.encode(self._reply(method, words, path, content or {}))
-        except RefusedRequest as error:
-            refusal = error.refusal
-            return 409, msgspec.json.encode(NotDone(refusal.text, refusal.code, refusal.fields))
+    # What a client asks
 
-    def _reply(self, method: str, words: list[str], path: str, content: Mapping[str, object]) -> object:
-        match words:
-            case ["robot"]:
-                return self._info()
-            case ["states"]:
-                names = enumerate(joint.name for joint in self._plan.loop.joints)
-                return {"joints": {name: joint_state(self.simulated.record, row) for row, name in names}}
-            case ["goals", number]:
-                return self._goal(int(number), float(path.partition("?wait=")[2] or 0))
-            case ["goals", number, "cancel"]:
-                done = self._done(LOOP, "cancel", {"goal": int(number)})
-            case ["controllers"]:
-                others = {name: plan for name, (plan, _) in self._loaded.items()}
-                plan = self._preparation.controller(content, others, self._rate)
-                done = self._done(LOOP, "load", plan)
-                self._loaded[plan.name] = (plan, done.place or 0)
-            case ["controllers", name] if method == "DELETE":
-                done = self._done(LOOP, "unload", {"controller": name})
-                del self._loaded[name]
-            case ["controllers", name, "commands", kind]:
-                prepared = self._preparation.command(
-                    self._loaded[name][0], kind, msgspec.json.encode(content)
-                )
-                prepared.require_within_limits()
-                done = self._done(name, kind, prepared.data, prepared.request)
-            case [kind]:  # switch, rate, pause, resume
-                done = self._done(LOOP, kind, content or b"")
-                self._rate = float(str(content.get("rate", self._rate)))
-            case _:
-                raise NotImplementedError(path)
-        return Executed(done.cycle, done.goals)
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Let the gateway answer a request; raises RunGone where that takes a cycle of a run that ended."""
+        self.gateways_link.collect()
+        return self._waiting.run_until_complete(self._answer(method, path, body or b""))
 
-    def _info(self) -> dict[str, object]:
-        active = int(self.simulated.record.active)
-        controllers = [
-            {"name": one.name, "active": active >> place & 1, "joints": one.joints, "command": one.command}
-            for one, place in self._loaded.values()
-        ]
-        return {"rate": self._rate, "paused": False, "controllers": controllers}
+    async def _answer(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
+        path, _, query = path.partition("?")
+        scope = {
+            "type": "http",
+            "method": method,
+            "path": path,
+            "query_string": query.encode(),
+            "headers": [(b"x-dxlrun-client", ORIGIN)],
+        }
+        answer: list[Message] = []
 
-    def _goal(self, number: int, wait_s: float) -> object:
-        """Return how a goal ended, as soon as it has or after so long; that it runs where it has not."""
-        due_s = self.now_s + wait_s
-        if number not in self.ends:
-            self.until(lambda: number in self.ends or self.now_s >= due_s)
-        return self.ends.get(number, GoalState(number))
+        async def receive() -> Message:
+            return {"type": "http.request", "body": body}
 
-    def _done(self, controller: str, kind: str, content: object, request: bytes = b"") -> Done:
-        """Put a command into the inbox and return its last answer; raises RefusedRequest."""
-        self._number += 1
-        number, answers = self._number, self.simulated.inbox.answers
-        data = content if isinstance(content, bytes) else msgspec.json.encode(content)
-        self.simulated.inbox.waiting.append(Command(number, controller, kind, data, ORIGIN, request=request))
-        limit_s = self.now_s + _ANSWER_S
+        async def send(message: Message) -> None:
+            answer.append(message)
 
-        def answered() -> bool:
-            answer = answers.get(number)
-            return (answer is not None and not isinstance(answer, Waiting)) or self.now_s > limit_s
+        await self._gateway(scope, receive, send)
+        return answer[0]["status"], b"".join(message["body"] for message in answer[1:])
 
-        self.until(answered)
-        answer = answers.pop(number, None)
-        if isinstance(answer, Done):
-            return answer
-        if isinstance(answer, Refusal):
-            raise RefusedRequest(answer)
-        raise RunGone(f"the loop of {self.name} did not answer within {_ANSWER_S:g} s")
+    def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
+        """There are none: messages would come only while a request waits. Raises OSError."""
+        raise OSError("a run on virtual time has no streams; its log has every message")
+
+    @property
+    def alive(self) -> bool:
+        """True while it runs."""
+        return self._thread.is_alive()
+
+    def ends(self) -> bool:
+        """Return whether it has ended."""
+        return not self.alive
 
     def close(self) -> None:
         """End the run."""
@@ -208,3 +207,30 @@ class RobotOnVirtualTime(RemoteRobot):
             self._due = lambda: False
             self._robots_turn.release()
             self._thread.join()
+        self._waiting.close()
+
+
+class _VirtualTime(asyncio.SelectorEventLoop):
+    """Event loop on virtual time: where it would wait, `turn` lets that pass."""
+
+    def __init__(self, now_s: Callable[[], float], turn: Callable[[], None]) -> None:
+        self._now_s = now_s
+        super().__init__(_Turns(turn))
+
+    def time(self) -> float:
+        """Return virtual time, s."""
+        return self._now_s()
+
+
+class _Turns(selectors.SelectSelector):
+    """Selector that never waits."""
+
+    def __init__(self, turn: Callable[[], None]) -> None:
+        super().__init__()
+        self._turn = turn
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Return what is ready; where nothing could be yet, after a turn."""
+        if timeout is None or timeout > 0:
+            self._turn()
+        return super().select(0)

@@ -2,6 +2,7 @@
 
 A topic is announced once, with its definition, before its first message; the number that it gets then is in
 front of its messages. It is not used again: a controller that is loaded in the run announces its topics, too.
+Each message has its number among those of its topic's name, so a reader knows how many it missed.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ LEAST_CAPACITY = 1 << 20
 """Bytes of a ring: for the topics of the runtime, and of controllers that are loaded in the run."""
 MOST_CAPACITY = 64 << 20
 
-_HEADER = struct.Struct("<qIxxxx")
-"""Time, number of the topic; the message follows, or of a topic what it is, as JSON."""
+_HEADER = struct.Struct("<qqq")
+"""Time, number of the topic and of the message; the message follows, or of a topic what it is, as JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,8 @@ class TopicMessage:
     """Wake-up of the cycle that published it, ns of the run's clock."""
     topic: int
     """Number of the topic, in the order of announcement."""
+    number: int
+    """Of the message among those of its topic, from 1; of a topic how many its name has had before."""
     data: bytes
     """CDR."""
 
@@ -62,22 +65,28 @@ class MessageSink(Protocol):
 class MessageRing:
     """Appends topics and messages to a ring."""
 
-    __slots__ = ("_announced", "_writer")
+    __slots__ = ("_counts", "_numbers", "_writer")
 
     def __init__(self, writer: Appender) -> None:
         self._writer = writer
-        self._announced = 0
+        self._counts: list[int] = []
+        """Messages so far, by the topic's number."""
+        self._numbers: dict[str, int] = {}
+        """Of each name the newest topic."""
 
     def announce(self, topic: Topic) -> int:
-        """Append a topic; return its number."""
-        number = self._announced
-        self._announced += 1
-        self._writer.append(RecordKind.TOPIC, _HEADER.pack(0, number) + msgspec.json.encode(topic))
+        """Append a topic; return its number. The messages of a name are counted on."""
+        number, before = len(self._counts), self._numbers.get(topic.name)
+        count = 0 if before is None else self._counts[before]
+        self._counts.append(count)
+        self._numbers[topic.name] = number
+        self._writer.append(RecordKind.TOPIC, _HEADER.pack(0, number, count) + msgspec.json.encode(topic))
         return number
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
         """Append one message."""
-        self._writer.append(RecordKind.MESSAGE, _HEADER.pack(t_ns, topic) + data)
+        self._counts[topic] = number = self._counts[topic] + 1
+        self._writer.append(RecordKind.MESSAGE, _HEADER.pack(t_ns, topic, number) + data)
 
 
 class NoMessages:
@@ -100,10 +109,10 @@ def decode_topic(payload: Payload) -> tuple[int, Topic]:
 def decode_message(payload: Payload) -> TopicMessage:
     """Return the message of a record. Raises ValueError when it is none."""
     try:
-        t_ns, topic = _HEADER.unpack_from(payload)
+        t_ns, topic, number = _HEADER.unpack_from(payload)
     except struct.error as error:
         raise ValueError(f"a message ends inside its header: {error}") from error
-    return TopicMessage(t_ns, topic, bytes(payload[_HEADER.size :]))
+    return TopicMessage(t_ns, topic, number, bytes(payload[_HEADER.size :]))
 
 
 LONGEST_RECORD = LONGEST_MESSAGE + _HEADER.size

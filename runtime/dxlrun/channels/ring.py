@@ -224,6 +224,11 @@ class RingReader(_Ring):
         """Where the next record is expected."""
         self._number = 0
 
+    @property
+    def passed(self) -> int:
+        """How many records were appended before `position`, as the last one shows; modulo 2^32."""
+        return self._number
+
     def read(self) -> Record | Gap | None:
         """Return the next record, a Gap where records were lost, or None when there is nothing new.
 

@@ -123,9 +123,7 @@ class LogReader:
         with _readable(self.path):
             for messages in gathered(walk.messages(), SLICE_BYTES):
                 self.share = walk.share
-                part = slicer.take(messages)
-                del messages  # what looks at the part does not need their memory
-                yield part
+                yield slicer.take(messages)
             yield slicer.rest()
         if packets or self._about is None:
             self._about = slicer.about()

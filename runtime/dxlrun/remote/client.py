@@ -11,15 +11,11 @@ One connection, one request at a time, of one thread.
 from __future__ import annotations
 
 import http.client
-import itertools
 import json
 import math
 import os
-import select
-import socket
-import struct
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -31,27 +27,29 @@ from msgspec.structs import asdict
 
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote import replies
+from dxlrun.remote.live.listening import Listening, TopicMessage
 from dxlrun.remote.replies import (
     Changed,
     Clamped,
     Goals,
     GoalState,
-    Messages,
     NotDone,
     Parameter,
     Parameters,
     Topics,
     TopicState,
 )
-from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
+from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, running, sockets
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import FrameTree
+    from dxlrun.remote.live.states import RobotStates
 
 __all__ = [
     "Executed",
     "GoalState",
+    "Listening",
     "RemoteGoal",
     "RemoteRobot",
     "Stream",
@@ -61,14 +59,8 @@ __all__ = [
     "running",
 ]
 
-TIMEOUT_S = 10.0
-"""How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
 LEASE_S = 0.2
-_IDLE_S = 20.0
-"""The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
 _STOP_S = 30.0
-_ENDING_S = 1.0
-"""How long a gateway that closed a connection may take to be gone, when the run has ended."""
 _POLL_S = 2.0
 _FEEDBACK_S = 0.1
 """How long one request waits for the end of a goal, without and with progress to report."""
@@ -122,55 +114,6 @@ Executed: TypeAlias = replies.Executed[RemoteGoal]
 """The reply to a command that the robot executed."""
 
 
-@dataclass(frozen=True, slots=True)
-class TopicMessage:
-    """A message of a topic, as it was received."""
-
-    topic: str
-    number: int
-    """Counted from 1 by the robot."""
-    time: float
-    """s of the run's clock"""
-    message: dict[str, object]
-    """Its fields; numbers that are none (NaN, infinite) are None."""
-    lost: int
-    """Messages that were not received between this one and the one before, because this end was too slow."""
-    joints: tuple[str, ...] = ()
-    """Whose rows its arrays have; empty: of none."""
-
-
-class _Connection(http.client.HTTPConnection):
-    """HTTP over a Unix socket."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=TIMEOUT_S)
-        self._path = path
-
-    def connect(self) -> None:
-        """Connect to the socket's path; where its queue of connections is full, wait in the Linux kernel's.
-
-        Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
-        EAGAIN), so a process that floods the queue only delays this one.
-        """
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
-        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
-        try:
-            self.sock.connect(str(self._path))
-        except BlockingIOError:
-            raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
-        self.sock.settimeout(self.timeout)
-
-    @property
-    def hung_up(self) -> bool:
-        """True when the other end has closed it; it sends nothing unasked, so any byte means that too."""
-        if self.sock is None:
-            return False
-        look = select.poll()
-        look.register(self.sock, select.POLLIN)
-        return bool(look.poll(0))
-
-
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     """Return a running robot, by its name; without one, the only one that runs.
 
@@ -188,30 +131,24 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
         raise DxlrunError(
             f"no robot {robot} runs that can be steered; " + (f"these do: {names}" if names else "start it")
         )
-    return RemoteRobot(robot, found[robot], client or f"python {os.getpid()}")
+    return RemoteRobot(robot, SocketLink(found[robot], client or f"python {os.getpid()}"))
 
 
 class RemoteRobot:
     """A running robot.
 
         with dxlrun.connect() as robot:
-            print(robot.states()["joints"])
+            states = robot.states()
+            print(dict(zip(states.joints, states.position)))
             robot.send("head", "posvel", {"positions": [0.1, 0.0], "velocities": [1.0, 1.0]})
 
     Everything raises Refused with the reason, and DxlrunError when the robot is gone.
     """
 
-    def __init__(self, name: str, path: Path, client: str) -> None:
-        self.name = name
-        self._path = path
-        self._connection = _Connection(path)
+    def __init__(self, name: str, link: RobotLink) -> None:
+        """`link`: how it is reached, see RobotLink."""
+        self.name, self.link = name, link
         self._frames: FrameTree | None = None
-        self._used = time.monotonic()
-        shown = "".join(letter for letter in client if letter.isprintable())
-        self._headers = {
-            "X-Dxlrun-Client": shown.encode().decode("latin-1"),  # UTF-8 in what HTTP takes for Latin-1
-            "Content-Type": "application/json",
-        }
 
     def __enter__(self) -> RemoteRobot:
         return self
@@ -223,7 +160,7 @@ class RemoteRobot:
 
     def close(self) -> None:
         """Close the connection; the robot keeps running."""
-        self._connection.close()
+        self.link.close()
 
     # Looking
 
@@ -231,11 +168,11 @@ class RemoteRobot:
         """Return rate, cycles, log, and the controllers with the commands that they take."""
         return self._ask("GET", "/robot", dict[str, object])
 
-    def states(self) -> dict[str, object]:
-        """Return the newest cycle: of each joint position (rad), velocity (rad/s), effort, age (s), goals,
-        temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode; of
-        devices, sensors and controllers each state by `SOURCE/STATE`, SI units, validity and age (s)."""
-        return self._ask("GET", "/states", dict[str, object])
+    def states(self) -> RobotStates:
+        """Return the newest cycle: arrays with a row for each joint, device state, controller; SI units."""
+        from dxlrun.remote.live.states import RobotStates, array  # numpy: most commands ask for none
+
+        return self._ask("GET", "/states", RobotStates, hook=array)
 
     def frames(self) -> FrameTree:
         """Return the robot's frames after its URDF: `pose` computes where one lies at any positions.
@@ -261,15 +198,11 @@ class RemoteRobot:
         By the newest cycle, and the newest orientation of the IMU that turns the body. Raises LookupError for
         an unknown frame, ValueError when a joint between the two was never read.
         """
-        tree = self.frames()
-        states = self.states()
-        joints, sources = states.get("joints"), states.get("sources")
-        if not isinstance(joints, dict) or not isinstance(sources, dict):
-            raise DxlrunError(f"{self.name} answers in an unknown way; is it another version of dxlrun?")
-        nan = math.nan
-        known = {name: row["position"] for name, row in joints.items() if name in tree.moved}
-        positions = {name: nan if value is None else float(value) for name, value in known.items()}
-        return tree.pose(of, relative_to, positions, tree.orientation(sources))
+        tree, states = self.frames(), self.states()
+        positions = dict(zip(states.joints, states.position.tolist(), strict=True))
+        moved = {name: value for name, value in positions.items() if name in tree.moved}
+        sources = dict(zip(states.source_states, states.source_state.tolist(), strict=True))
+        return tree.pose(of, relative_to, moved, tree.orientation(sources))
 
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""
@@ -283,43 +216,29 @@ class RemoteRobot:
 
     def newest(self, topic: str) -> TopicMessage | None:
         """Return the newest message of a topic; None when it had none yet."""
-        found = self._messages(topic, "")
-        return found[-1] if found else None
+        with self._listen((topic,), "&once=true") as found:
+            return next(iter(found), None)
 
-    def listen(self, topic: str, rate: float | None = None) -> Iterator[TopicMessage]:
-        """Return the messages of a topic as they come, from the newest on, until the run ends.
+    def listen(self, *topics: str, newest: bool = False, rate: float | None = None) -> Listening:
+        """Listen to topics: their messages as they come, from the newest on, until the run ends.
 
-        Every message comes, unless this end is slower than the topic: `lost` counts what is missing then.
-        With `rate` (Hz) at most so many a second come, the newest each time. Raises Refused for an unknown
-        topic.
+            for message in robot.listen("/joint_states"):
+                print(message.number, message.lost, message.message["position"])
+
+        Every message comes, where this end is no more than some ten seconds behind: `lost` counts those
+        that do not. With `newest` what is older is left out when this end is slower, with `rate` (Hz) at most
+        so many looks a second are taken. `async for` does the same. Raises Refused for an unknown topic.
         """
-        last, query = 0, ""
-        while True:
-            began = time.monotonic()
-            try:
-                found = self._messages(topic, query)
-            except Refused:
-                raise
-            except DxlrunError:
-                if not self._ends():
-                    raise
-                return
-            new = [message for message in found if message.number > last]
-            for message in new if rate is None else new[-1:]:
-                last = message.number
-                yield message
-            query = f"?after={last}&wait={_POLL_S:g}"
-            if rate is not None and new:
-                time.sleep(max(0.0, began + 1 / rate - time.monotonic()))
-                query = ""
+        query = f"&newest=true&rate={rate:g}" if rate is not None else "&newest=true" if newest else ""
+        return self._listen(topics, query)
 
-    def _messages(self, topic: str, query: str) -> list[TopicMessage]:
-        found = self._ask("GET", f"/topics/{quote(topic.lstrip('/'))}{query}", Messages)
-        lost = itertools.chain((found.lost,), itertools.repeat(0))
-        return [
-            TopicMessage(found.topic, one.number, one.time, one.message, missing, found.joints)
-            for one, missing in zip(found.messages, lost, strict=False)
-        ]
+    def _listen(self, topics: Sequence[str], query: str) -> Listening:
+        names = "&".join(f"topic={quote('/' + topic.lstrip('/'))}" for topic in topics)
+        status, first, end = self._reached(lambda: self.link.stream(f"/stream?{names}{query}"))
+        if status >= 400:
+            end.close()
+            raise self._refused(status, first)
+        return Listening(self.name, self.link, end, first, newest="newest" in query)
 
     # Goals
 
@@ -507,24 +426,12 @@ class RemoteRobot:
                 raise DxlrunError(f"{self.name} closed every connection for {_STOP_S:g} s")
             time.sleep(0.02)
         self.close()
-        while wait and alive(self._path):
+        while wait and self.link.alive:
             if time.monotonic() > until:
                 raise DxlrunError(f"{self.name} did not end within {_STOP_S:g} s")
             time.sleep(0.05)
 
     # Inside
-
-    def _ends(self) -> bool:
-        """Return whether the run has ended, or ends within a second: its gateway removes its socket then.
-
-        Of a gateway that was killed it is left, or it listens still.
-        """
-        until = time.monotonic() + _ENDING_S
-        while self._path.exists():
-            if time.monotonic() > until:
-                return False
-            time.sleep(0.02)
-        return True
 
     def _stopping(self) -> bool:
         """Ask once to stop; False when the connection was closed by a gateway that is alive."""
@@ -533,7 +440,7 @@ class RemoteRobot:
         except Refused:
             raise
         except DxlrunError as error:
-            if alive(self._path):
+            if self.link.alive:
                 if isinstance(error.__cause__, ConnectionError):
                     return False
                 raise
@@ -547,39 +454,39 @@ class RemoteRobot:
         return Executed(**asdict(done) | {"goals": goals})
 
     def _ask(
-        self, method: str, path: str, reply: type[Reply], content: Mapping[str, object] | None = None
+        self,
+        method: str,
+        path: str,
+        reply: type[Reply],
+        content: Mapping[str, object] | None = None,
+        hook: Callable[[type, object], object] | None = None,
     ) -> Reply:
         """Ask, and return the reply; raises Refused."""
-        status, answer = self._exchange(method, path, content)
+        body = None if content is None else _json(content)
+        status, answer = self._reached(lambda: self.link.exchange(method, path, body))
+        if status >= 400:
+            raise self._refused(status, answer)
         try:
-            if status < 400:
-                return msgspec.json.decode(answer, type=reply)
-            refused = msgspec.json.decode(answer, type=NotDone)
+            return msgspec.json.decode(answer, type=reply, dec_hook=hook)
         except msgspec.MsgspecError as error:
             raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
-        wrong = status in _WRONG_INPUT
-        sentence = refused.refused or f"HTTP status {status}"
-        raise Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
-    def _exchange(self, method: str, path: str, content: Mapping[str, object] | None) -> tuple[int, bytes]:
-        """Ask once; return status and answer. Nothing is sent twice: the first may have been received."""
-        body = None if content is None else _json(content)
-        idle = time.monotonic() - self._used > _IDLE_S
-        if idle or self._connection.hung_up:
-            self.close()
+    def _refused(self, status: int, answer: bytes) -> DxlrunError:
+        """Return the exception for an answer that is a refusal."""
         try:
-            self._connection.request(method, path, body, self._headers)
-            response = self._connection.getresponse()
-            answer = response.read()
+            refused = msgspec.json.decode(answer, type=NotDone)
+        except msgspec.MsgspecError:
+            return DxlrunError(f"{self.name} answers in a way that this version does not know")
+        sentence, wrong = refused.refused or f"HTTP status {status}", status in _WRONG_INPUT
+        return Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
+
+    def _reached(self, ask: Callable[[], Reply]) -> Reply:
+        """Return an answer of the link; raises DxlrunError when there is none."""
+        try:
+            return ask()
         except (http.client.HTTPException, OSError, ValueError) as error:
-            self.close()
             why = str(error) or type(error).__name__
             raise DxlrunError(f"{self.name} no longer answers: {why}") from error
-        except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
-            self.close()
-            raise
-        self._used = time.monotonic()
-        return response.status, answer
 
 
 def _listed(names: str | Sequence[str]) -> list[str]:

@@ -3,7 +3,7 @@
     GET  /robot                                 the run, its controllers and the commands that they take
     GET  /states                                the newest cycle
     GET  /events?after=N                        what happened since event N
-    GET  /topics, GET /topics/NAME?after=N&wait=2        all of them; messages behind number N, or the newest
+    GET  /topics, GET /stream?topic=NAME&topic=NAME      all of them; messages as they come, see replies.Frame
     POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
     POST /controllers/NAME/commands/position?in=2 {JOINT: ...}   some joints by name; in: s, of a trajectory
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
@@ -33,7 +33,7 @@ import math
 import time
 import traceback
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -44,7 +44,7 @@ from msgspec.structs import replace
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
 from dxlrun.channels.answers import Code, Done, Field, Refusal
@@ -61,17 +61,18 @@ from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
 from dxlrun.remote.joints import (
     effort_units,
-    finite,
     joint_row,
-    joint_state,
     position_unit,
     prepared_reading,
     prepared_reboot,
     prepared_register,
     prepared_torque,
     read_register,
+    states_of,
 )
 from dxlrun.remote.link import Link, Loaded
+from dxlrun.remote.live.states import RobotStates, encoded
+from dxlrun.remote.live.topics import TopicStream, framed
 from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
 from dxlrun.remote.named_commands import DEVICE_COMMANDS, device_command, joint_command
 from dxlrun.remote.parameters import Change, changed, parameters_of
@@ -83,9 +84,19 @@ from dxlrun.remote.preparation import (
     refused,
     unknown_controllers,
 )
-from dxlrun.remote.replies import Changed, Clamped, Executed, Goals, NotDone, Parameters, Topics, Written
+from dxlrun.remote.replies import (
+    FRAME_LENGTH,
+    Changed,
+    Clamped,
+    Executed,
+    Goals,
+    NotDone,
+    Parameters,
+    RunEnded,
+    Topics,
+    Written,
+)
 from dxlrun.remote.sockets import MOST_BYTES
-from dxlrun.remote.topics import source_state
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
@@ -100,8 +111,11 @@ BODY_S = 10.0
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
 LONGEST_WAIT_S = 5.0
-"""For the end of a goal, or a message; a client that waits longer asks again."""
-_LOOK_S = 0.01
+"""For the end of a goal; a client that waits longer asks again."""
+_SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.001, 0.02
+"""Between two looks of a stream into the rings: half a period of the loop, within these."""
+BEAT_S = 2.0
+"""After so long without a message a stream shows that the gateway is alive."""
 _ENDING_S = 0.5
 """How long the results of goals may take when the run ends."""
 LONGEST_WAY_S = 3600.0
@@ -221,7 +235,7 @@ class GatewayApp:
             route("/frames", self.frames, "GET", looks),
             route("/events", self.events, "GET", looks),
             route("/topics", self.topics, "GET", looks),
-            route("/topics/{name:path}", self.topic, "GET", looks),
+            route("/stream", self.stream, "GET", looks),
             route("/goals", self.goals, "GET", looks),
             route("/goals/{number}", self.goal, "GET", looks),
             route("/goals/{number}/cancel", self.cancel, "POST", operations),
@@ -298,29 +312,11 @@ class GatewayApp:
 
     async def states(self, request: Request) -> Response:
         """Return the newest cycle; numbers that are not known are null."""
-        record = self._newest()
-        joints = self._link.plan.loop.joints
-        rows = {joint.name: joint_state(record, row) for row, joint in enumerate(joints)}
-        updates = {
-            one.plan.name: int(record.controller_ns[one.place]) * 1e-9
-            for one in self._link.controllers.values()
-            if one.place < len(record.controller_ns)
-        }
-        late = (record.woken_ns - record.scheduled_ns) * 1e-9
-        times = {"time": record.woken_ns * 1e-9, "late": late, "updates": updates}
-        references = zip(record.layout.references, map(finite, record.reference.tolist()), strict=True)
-        sources = zip(record.layout.source_states, map(finite, record.sources.values.tolist()), strict=True)
-        ages = {
-            name: {"valid": bool(valid), "age": age_ns * 1e-9 if age_ns >= 0 else None}
-            for name, valid, age_ns in zip(
-                record.layout.sources,
-                record.sources.valid.tolist(),
-                record.sources.age_ns.tolist(),
-                strict=True,
-            )
-        }
-        others = {"references": dict(references), "sources": dict(sources), "source_ages": ages}
-        return _json({"cycle": record.cycle, **times, "joints": rows, **others})
+        return Response(encoded(self._states()), media_type="application/json")
+
+    def _states(self) -> RobotStates:
+        places = {name: one.place for name, one in self._link.controllers.items()}
+        return states_of(self._link.plan, self._newest(), places)
 
     def _newest(self) -> CycleRecord:
         """Return the newest cycle; raises RefusedRequest before the first."""
@@ -356,14 +352,34 @@ class GatewayApp:
         """Return all topics, with their types and rates."""
         return _json(Topics((*self._link.topic_states(),)))
 
-    async def topic(self, request: Request) -> Response:
-        """Return the messages behind number `after`, without it the newest; `wait` so long for one, s."""
-        wait = waiting(request)
-        after = int(number(request, "after", 0.0)) if "after" in request.query_params else None
-        topic, until = f"/{request.path_params['name']}", time.monotonic() + wait
-        while not (found := self._link.messages(topic, after)).messages and time.monotonic() < until:
-            await asyncio.sleep(_LOOK_S)
-        return _json(found)
+    async def stream(self, request: Request) -> Response:
+        """Stream the messages of topics as frames, see `Frame`, until the run ends."""
+        topics, rate = request.query_params.getlist("topic"), number(request, "rate", MOST_LOOKS)
+        if not topics or rate <= 0:
+            raise invalid(
+                "name a topic, and a rate above 0 Hz; write for example /stream?topic=/joint_states"
+            )
+        stream = self._link.listen(topics, newest="newest" in request.query_params)
+        once = "once" in request.query_params
+        return StreamingResponse(self._frames(stream, rate, once), media_type="application/octet-stream")
+
+    async def _frames(self, stream: TopicStream, rate: float, once: bool) -> AsyncIterator[bytes]:
+        look_s = min(_LONGEST_LOOK_S, max(_SHORTEST_LOOK_S, 0.5 / self._link.rate))
+        sent = due = time.monotonic()
+        while True:
+            ended, now = once or self._link.ended, time.monotonic()
+            frames = stream.frames() if now >= due or ended else b""
+            if frames:
+                due = now + 1 / rate
+            elif now - sent > BEAT_S:
+                frames = FRAME_LENGTH.pack(0)
+            if frames:
+                sent = now
+                yield frames
+            if ended and not stream.behind:
+                break
+            await asyncio.sleep(0 if stream.behind else look_s)
+        yield framed(RunEnded())
 
     async def goals(self, request: Request) -> Response:
         """Return the goals that run, and the last that ended."""
@@ -566,13 +582,12 @@ class GatewayApp:
 
     async def joint(self, request: Request) -> Response:
         """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
-        plan, joint, record = self._link.plan, request.path_params["name"], self._newest()
-        if (source := source_state(record, joint)) is not None:
-            return _json({"source": joint, "cycle": record.cycle, **source})
-        row = joint_row(plan, joint, (*record.layout.sources, *record.layout.source_states))
-        state = joint_state(record, row)
+        plan, joint, states = self._link.plan, request.path_params["name"], self._states()
+        if (source := states.source(joint)) is not None:
+            return _json({"source": joint, "cycle": states.cycle, **source})
+        joint_row(plan, joint, (*states.sources, *states.source_states))
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
-        return _json({"joint": joint, "cycle": record.cycle, **state, **units})
+        return _json({"joint": joint, "cycle": states.cycle, **states.joint(joint), **units})
 
     async def torque(self, request: Request) -> Response:
         """Switch the torque of joints on or off, and answer when it was read back."""

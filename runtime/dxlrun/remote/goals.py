@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -38,9 +39,10 @@ class GoalBook:
         self._take(msgspec.json.decode(event.data, type=GoalState), event.t_ns * 1e-9)
 
     def take_message(self, message: object, time_s: float) -> None:
-        """Note a message of the topic /goals, as JSON has it: progress, or what a lost event had."""
+        """Note a message of the topic /goals: progress, or what a lost event had."""
         with suppress(msgspec.ValidationError):
             found = msgspec.convert(message, GoalState)
+            found = found if found.error is None or math.isfinite(found.error) else replace(found, error=None)
             known = self.running.get(found.number)
             if found.status != "running":
                 self._take(found, time_s)

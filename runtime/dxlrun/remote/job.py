@@ -27,3 +27,5 @@ class GatewayJob:
     memory: Descriptors
     log: str | None
     """Where the log is written, from the root; None: there is none."""
+    epoch_offset_ns: int = 0
+    """Wall time minus the run's clock."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypedDict
+
+import numpy as np
 
 from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord, Torque
@@ -18,6 +18,7 @@ from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import ServoPlan
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.preparation import refused
 
 _LONGEST = 80
@@ -26,49 +27,42 @@ _MOST_NAMES = 5
 """In a refusal."""
 
 
-class JointState(TypedDict):
-    """A joint in the newest cycle, SI units; None: not known."""
-
-    position: float | None
-    velocity: float | None
-    effort: float | None
-    valid: bool
-    age: float
-    goal_position: float | None
-    goal_velocity: float | None
-    goal_effort: float | None
-    goal_pwm: float | None
-    temperature: float | None
-    voltage: float | None
-    hardware_error: int
-    mode: str
-    torque: str
-
-
-def joint_state(record: CycleRecord, row: int) -> JointState:
-    """Return a joint's state in a cycle."""
-    states, goals = record.states, record.goals
-    return {
-        "position": finite(states.position[row]),
-        "velocity": finite(states.velocity[row]),
-        "effort": finite(states.effort[row]),
-        "valid": bool(states.valid[row]),
-        "age": int(states.age_ns[row]) * 1e-9,
-        "goal_position": finite(goals.position[row]),
-        "goal_velocity": finite(goals.velocity[row]),
-        "goal_effort": finite(goals.effort[row]),
-        "goal_pwm": finite(goals.pwm[row]),
-        "temperature": finite(states.temperature[row]),
-        "voltage": finite(states.voltage[row]),
-        "hardware_error": int(states.hardware_error[row]),
-        "mode": Mode(int(states.mode[row])).name.lower(),
-        "torque": Torque(int(states.torque[row])).name.lower(),
-    }
-
-
-def finite(value: float) -> float | None:
-    """Return a number of JSON: NaN is none."""
-    return float(value) if math.isfinite(value) else None
+def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -> RobotStates:
+    """Return the states of a cycle; `controllers` with their places in its record."""
+    layout, states, goals, sources = record.layout, record.states, record.goals, record.sources
+    efforts = effort_units(plan)
+    timed = {name: place for name, place in controllers.items() if place < len(record.controller_ns)}
+    return RobotStates(
+        cycle=record.cycle,
+        time_ns=record.woken_ns,
+        late_ns=record.woken_ns - record.scheduled_ns,
+        joints=layout.joints,
+        units=tuple("m" if joint.linear else "rad" for joint in plan.loop.joints),
+        effort_units=tuple(efforts.get(name, "") for name in layout.joints),
+        position=states.position,
+        velocity=states.velocity,
+        effort=states.effort,
+        valid=states.valid,
+        age_ns=states.age_ns,
+        goal_position=goals.position,
+        goal_velocity=goals.velocity,
+        goal_effort=goals.effort,
+        goal_pwm=goals.pwm,
+        temperature=states.temperature,
+        voltage=states.voltage,
+        hardware_error=states.hardware_error.astype(np.int64),
+        mode=tuple(Mode(mode).name.lower() for mode in states.mode.tolist()),
+        torque=tuple(Torque(torque).name.lower() for torque in states.torque.tolist()),
+        references=layout.references,
+        reference=record.reference,
+        source_states=layout.source_states,
+        source_state=sources.values,
+        sources=layout.sources,
+        source_valid=sources.valid,
+        source_age_ns=sources.age_ns,
+        controllers=tuple(timed),
+        update_ns=record.controller_ns[[*timed.values()]],
+    )
 
 
 def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 
 import msgspec
 
@@ -20,14 +21,14 @@ from dxlrun.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
 from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader
 from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.goals import GOALS_TOPIC
-from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
+from dxlrun.messages.cdr import Codec
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
+from dxlrun.remote.live.topics import LiveTopics, TopicStream
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.replies import Messages, TopicState
-from dxlrun.remote.topics import LiveTopics, events_after, joint_states, source_messages
+from dxlrun.remote.replies import TopicState
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
@@ -52,6 +53,9 @@ _HELD = {
 """Events of a controller -> whether its joints are held afterwards because its stream ended."""
 
 
+_codec = lru_cache(Codec)
+
+
 @dataclass(slots=True)
 class Loaded:
     """A controller and its place: the bit by which the cycles show that it is active."""
@@ -74,16 +78,18 @@ class _Pending:
 class Link:
     """What the gateway knows of the loop, and how it sends commands; one asyncio loop, no threads."""
 
-    def __init__(self, plan: Plan, memory: Descriptors) -> None:
+    def __init__(self, plan: Plan, memory: Descriptors, epoch_offset_ns: int = 0) -> None:
+        """`epoch_offset_ns` + time of the run's clock is wall time."""
         self.plan = plan
         self.rate = 1e9 / plan.loop.period_ns
         self.paused = False
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
         self.events: deque[tuple[int, Event]] = deque()
-        self.topics = LiveTopics(memory.messages)
+        self.topics = LiveTopics(
+            memory.messages, memory.cycles, plan.loop.layout, self.events, epoch_offset_ns
+        )
         self.goals = GoalBook()
-        self._feedback = 0
         self._cycles = RingReader(memory.cycles)
         self._record = CycleRecord(plan.loop.layout)
         self._event_rings = (RingReader(memory.events), RingReader(memory.guardian))
@@ -114,29 +120,25 @@ class Link:
         record = self.newest()
         return record is not None and bool(record.active >> loaded.place & 1)
 
+    @property
+    def ended(self) -> bool:
+        """True when the loop has ended in order."""
+        return self.heartbeat.phase is Phase.DONE
+
     def topic_states(self) -> list[TopicState]:
-        """Return what there is to listen to: the loop's topics, its events, and the states of joints and
-        sources."""
-        sources = (f"/{name}" for name in self._record.layout.sources)
-        derived = (self._derived(name, None) for name in (EVENT_TOPIC, JOINT_STATES_TOPIC, *sources))
-        states = [TopicState(one.topic, one.type, one.joints, one.last, None) for one in derived if one]
-        return [*(one.state() for one in self.topics.topics.values()), *states]
+        """Return what there is to listen to: the loop's topics, its events, and what each cycle has."""
+        self.newest()
+        return self.topics.states(max(0, self._cycles.passed - 1))
 
-    def messages(self, topic: str, after: int | None) -> Messages:
-        """Return the messages of a topic behind this number; None: the newest. Raises RefusedRequest."""
-        if (live := self.topics.topics.get(topic)) is not None:
-            return live.after(after)
-        if (found := self._derived(topic, after)) is not None:
-            return found
-        known = ", ".join(one.name for one in self.topic_states())
-        raise RefusedRequest(Refusal(Code.UNKNOWN_TOPIC, {"topic": topic, "topics": known}))
-
-    def _derived(self, topic: str, after: int | None) -> Messages | None:
-        if topic == EVENT_TOPIC:
-            return events_after(self.events, after)
-        if topic == JOINT_STATES_TOPIC:
-            return joint_states(self.newest(), self._record.layout.joints, after)
-        return source_messages(self.newest(), topic.removeprefix("/"), after)
+    def listen(self, topics: Sequence[str], *, newest: bool) -> TopicStream:
+        """Return a stream of the messages of topics; raises RefusedRequest."""
+        known = [one.name for one in self.topic_states()]
+        for topic in topics:
+            if topic not in known:
+                raise RefusedRequest(
+                    Refusal(Code.UNKNOWN_TOPIC, {"topic": topic[:80], "topics": ", ".join(known)})
+                )
+        return TopicStream(self.topics, topics, newest=newest)
 
     # Commands
 
@@ -232,7 +234,7 @@ class Link:
         for number, answer in self._answers.new():
             if number in self._pending:  # else it answers a set-point of a stream
                 self._resolve(number, answer)
-        self.topics.collect()
+        reports = [one for one in self.topics.collect() if one[0].name == GOALS_TOPIC]
         idle: frozenset[str] = frozenset()
         idle_s = 0.0
         for ring in self._event_rings:
@@ -244,7 +246,9 @@ class Link:
                 if isinstance(record, Record) and record.kind == RecordKind.EVENT:
                     with suppress(ValueError):
                         self._keep(decode_event(record.payload))
-        self._take_goals()
+        for topic, message in reports:
+            with suppress(ValueError):  # none of ours: the loop encodes them
+                self.goals.take_message(_codec(topic.type).unpack(message.data), message.t_ns * 1e-9)
         for goal in [one for one in self.goals.running.values() if one.controller in idle]:
             if goal.accepted < idle_s:
                 self.goals.end(goal.number, Outcome.ABORTED, LOST, idle_s)
@@ -254,15 +258,6 @@ class Link:
         record = self.newest()
         idle = (one.plan.name for one in self.controllers.values() if not self.active(one))
         return (0.0, frozenset()) if record is None else (record.woken_ns * 1e-9, frozenset(idle))
-
-    def _take_goals(self) -> None:
-        """Note what has been published of goals since the last call."""
-        topic = self.topics.topics.get(GOALS_TOPIC)
-        while topic is not None and self._feedback < topic.count:
-            found = topic.after(self._feedback)
-            self._feedback = max(found.last, self._feedback + 1)
-            for message in found.messages:
-                self.goals.take_message(message.message, message.time)
 
     def _resolve(self, number: int, answer: Answer) -> None:
         pending = self._pending[number]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from typing import Generic, TypeVar
 
@@ -146,27 +147,40 @@ class Topics(msgspec.Struct, frozen=True):
     topics: tuple[TopicState, ...]
 
 
-class Message(msgspec.Struct, frozen=True):
-    """One message of a topic."""
+class Opened(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=0):
+    """What a topic of a stream is; before its first message, and again when another controller has it."""
 
-    number: int
-    """Counted from 1; what is missing was not kept long enough."""
-    time: float
-    """s of the run's clock"""
-    message: dict[str, object]
-
-
-class Messages(msgspec.Struct, frozen=True):
-    """What a client gets that listens to a topic."""
-
-    topic: str
+    place: int
+    """Of the topic in the stream, by which its messages name it."""
+    name: str
     type: str
+    definition: str
+    """The type's, as ROS 2 writes it (`ros2msg`)."""
     joints: tuple[str, ...]
-    messages: tuple[Message, ...]
-    last: int
-    """Where the client goes on."""
-    lost: int
-    """Messages between those it has and these that are not kept any more."""
+    epoch_offset_ns: int
+    """Wall time minus the run's clock."""
+
+
+class Sample(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=1):
+    """One message of a stream."""
+
+    place: int
+    number: int
+    """Counted from 1 by the loop; numbers that do not come are missing."""
+    time_ns: int
+    """Of the run's clock."""
+    data: bytes
+    """CDR"""
+
+
+class RunEnded(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=2):
+    """The end of a stream whose run has ended in order."""
+
+
+Frame = Opened | Sample | RunEnded
+"""What a stream has, as MessagePack, each behind its length (uint32, little-endian); length 0: the gateway is
+alive."""
+FRAME_LENGTH = struct.Struct("<I")
 
 
 class NotDone(msgspec.Struct, frozen=True):

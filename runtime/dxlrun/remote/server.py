@@ -40,7 +40,8 @@ MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
 """Connections of one process: three processes that flood leave a quarter of all to others."""
 SILENCE_S = 30.0
-"""After so long without a byte from the other side, whatever it waits for, a connection is closed."""
+"""A connection is closed after so long without a byte from the other side, or in which it took none of what
+waits for it."""
 
 _CREDENTIALS = struct.Struct("3i")
 
@@ -56,7 +57,7 @@ def main() -> None:
     channel = MessageChannel(control, Decoder(Finish))  # carries nothing here: the gateway ends with it
     plan: Plan = from_json(process.whole(job.plan))
     try:
-        link = Link(plan, job.memory)
+        link = Link(plan, job.memory, job.epoch_offset_ns)
         joints = {joint.name: joint for joint in plan.loop.joints}
         preparation = Preparation(joints, load_plugins(), plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
@@ -164,13 +165,25 @@ class Connection(H11Protocol):
         self.last_byte_s = self.loop.time()
         super().data_received(data)
 
+    def resume_writing(self) -> None:
+        """Go on with an answer of which the other side has taken some."""
+        self.last_byte_s = self.loop.time()
+        super().resume_writing()
+
     @property
     def busy(self) -> bool:
         """True while one of its requests is answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
+    @property
+    def listening(self) -> bool:
+        """True while it has a stream, which has no end of its own."""
+        return self.cycle is not None and self.cycle.response_started and not self.cycle.response_complete
+
     def _check(self) -> None:
         """Close it when it was silent for too long, else look again when that may be."""
+        if self.listening and not self.transport.get_write_buffer_size():
+            self.last_byte_s = self.loop.time()
         silent_s = self.loop.time() - self.last_byte_s
         if silent_s >= SILENCE_S:
             self.transport.abort()  # not close: that would wait for a reader that may never read

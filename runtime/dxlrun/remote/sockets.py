@@ -1,4 +1,4 @@
-"""Sockets of running robots: where they are, and which robots run; used by gateway and client.
+"""Sockets of running robots: where they are, which robots run, and a client's connection to one.
 
 A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where this user owns that, else
 in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell that differ in the variable do not find
@@ -8,18 +8,29 @@ each other's runs: set it alike.
 from __future__ import annotations
 
 import fcntl
+import http.client
 import os
+import select
 import socket
 import stat
+import struct
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol
 
 from dxlrun.errors import DxlrunError
 
 SUFFIX = ".sock"
 MOST_BYTES = 1 << 20
 """The longest body of a request; longer ones are refused before they are read."""
+TIMEOUT_S = 10.0
+"""How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
+_IDLE_S = 20.0
+"""The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
+_ENDING_S = 1.0
+"""How long a gateway that closed a connection may take to be gone, when the run has ended."""
 LONGEST_PATH = 107
 """Bytes; what Linux takes as the name of a Unix socket (unix(7)), without the final zero."""
 
@@ -122,3 +133,134 @@ def sockets() -> dict[str, Path]:
             elif path.is_socket():
                 path.unlink(missing_ok=True)
     return found
+
+
+class RobotLink(Protocol):
+    """How a client reaches a robot; everything raises OSError or ValueError when that does not answer."""
+
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Make one request; return status and answer."""
+        ...
+
+    def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
+        """Make a request whose answer goes on; return status, first bytes, and where the others come."""
+        ...
+
+    @property
+    def alive(self) -> bool:
+        """True while the robot can be asked."""
+        ...
+
+    def ends(self) -> bool:
+        """Return whether a stream that was closed is of a run that has ended."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection."""
+        ...
+
+
+class _Connection(http.client.HTTPConnection):
+    """HTTP over a Unix socket."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=TIMEOUT_S)
+        self._path = path
+
+    def connect(self) -> None:
+        """Connect to the socket's path; where its queue of connections is full, wait in the Linux kernel's.
+
+        Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
+        EAGAIN), so a process that floods the queue only delays this one.
+        """
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
+        try:
+            self.sock.connect(str(self._path))
+        except BlockingIOError:
+            raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
+        self.sock.settimeout(self.timeout)
+
+    @property
+    def hung_up(self) -> bool:
+        """True when the other end has closed it; it sends nothing unasked, so any byte means that too."""
+        if self.sock is None:
+            return False
+        look = select.poll()
+        look.register(self.sock, select.POLLIN)
+        return bool(look.poll(0))
+
+
+class SocketLink:
+    """One connection for requests, one at a time, and one more for each stream.
+
+    Everything raises OSError or http.client.HTTPException when the gateway does not answer.
+    """
+
+    def __init__(self, path: Path, client: str) -> None:
+        self._path = path
+        self._connection = _Connection(path)
+        self._used = time.monotonic()
+        shown = "".join(letter for letter in client if letter.isprintable())
+        self._headers = {
+            "X-Dxlrun-Client": shown.encode().decode("latin-1"),  # UTF-8 in what HTTP takes for Latin-1
+            "Content-Type": "application/json",
+        }
+
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Ask once; return status and answer. Nothing is sent twice: the first may have been received."""
+        idle = time.monotonic() - self._used > _IDLE_S
+        if idle or self._connection.hung_up:
+            self.close()
+        try:
+            self._connection.request(method, path, body, self._headers)
+            response = self._connection.getresponse()
+            answer = response.read()
+        except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
+            self.close()
+            raise
+        self._used = time.monotonic()
+        return response.status, answer
+
+    def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
+        """Return status, first bytes and the connection of an answer that ends with the connection."""
+        connection = _Connection(self._path)
+        connection.connect()
+        end: socket.socket = connection.sock
+        try:
+            end.sendall(f"GET {path} HTTP/1.0\r\n\r\n".encode())
+            answer = b""
+            while b"\r\n\r\n" not in answer:
+                if not (more := end.recv(4096)):
+                    raise ConnectionResetError("the connection was closed")
+                answer += more
+            head, _, first = answer.partition(b"\r\n\r\n")
+            status = int(head.split(None, 2)[1])
+            while status >= 400 and (more := end.recv(4096)):
+                first += more
+        except BaseException:
+            end.close()
+            raise
+        return status, first, end
+
+    def close(self) -> None:
+        """Close the connection; the robot keeps running."""
+        self._connection.close()
+
+    @property
+    def alive(self) -> bool:
+        """True while a gateway listens at the socket."""
+        return alive(self._path)
+
+    def ends(self) -> bool:
+        """Return whether the run has ended, or ends within a second: its gateway's socket is removed then.
+
+        Of a gateway that was killed it is left, or it listens still.
+        """
+        until = time.monotonic() + _ENDING_S
+        while self._path.exists():
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.02)
+        return True

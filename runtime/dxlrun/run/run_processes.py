@@ -153,7 +153,7 @@ def start_recorder(
     return child
 
 
-def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
+def start_gateway(log: Path | None, memory: RunMemory, epoch_offset_ns: int = 0) -> Child[GatewayMessage]:
     """Start the gateway; it reports its socket when it is ready, and the run does not wait for that.
 
     Raises OSError when the system has no process left.
@@ -167,7 +167,7 @@ def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
         memory.answers,
         memory.messages,
     )
-    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None)
+    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None, epoch_offset_ns)
     return _executed(
         "gateway", "dxlrun.remote", job, [memory.plan, *astuple(shared)], memory, Decoder(GatewayMessage)
     )

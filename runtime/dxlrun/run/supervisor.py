@@ -136,6 +136,8 @@ class _Run:
     out: Console
     kept: KeptStates = field(default_factory=KeptStates)
     """What controllers kept in earlier runs."""
+    offset_ns: int = field(default_factory=epoch_offset_ns)
+    """Wall time minus the run's clock."""
     simulation: Child[SimulationMessage] | None = None
     recorder: Child[RecorderMessage] | None = None
     guardian: Child[GuardianMessage] | None = None
@@ -183,9 +185,8 @@ class _Run:
         for index in range(len(self.plan.loop.sensors)):
             sensor = start_sensor(self.plan, index, self.memory)
             self.sensors.append(_SensorProcess(self.plan, index, self.memory, sensor))
-        offset_ns = epoch_offset_ns()
         if self.log:
-            header = log_header(self.plan, offset_ns, virtual=False, kept=self.kept)
+            header = log_header(self.plan, self.offset_ns, virtual=False, kept=self.kept)
             self.recorder = start_recorder(self.log, header, self.memory, self.plan.recording)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
@@ -195,7 +196,7 @@ class _Run:
         self.hold()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
-            self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=offset_ns
+            self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=self.offset_ns
         )
         self.guardian = start_guardian(self.job, others)
         started = self.guardian.ready()
@@ -283,7 +284,7 @@ class _Run:
         if self.gateway is None:
             if self.steerable and heartbeat.phase is Phase.RUNNING:
                 try:
-                    self.gateway = start_gateway(self.log, self.memory)
+                    self.gateway = start_gateway(self.log, self.memory, self.offset_ns)
                 except OSError as error:
                     self._without_gateway(f"did not start ({error.strerror or error})")
         elif message := self.gateway.poll(0):

@@ -60,7 +60,7 @@ def measures(stage):
         file.write_text(robot_text(model, **keys))
         rig = stage.rig(file)
         if each_cycle is not None:
-            rig.robot.each_cycle = lambda cycle: each_cycle(rig, cycle)
+            rig.robot.link.each_cycle = lambda cycle: each_cycle(rig, cycle)
         experiment = (
             Characterize(measurements, tolerance) if isinstance(measurements, Sequence) else measurements
         )

@@ -80,7 +80,7 @@ def test_a_trace_has_the_times_at_which_the_servo_had_goals_and_positions(measur
     """On a slow bus, by its ledger: when the last bytes of reads and goals had passed the wire."""
     done = measures(OneSegment(), model, protocol=PROTOCOLS[model], baud_rate=57_600, rate=40)
     trace, origin_ns = done.result
-    sent = [entry for entry in done.rig.robot.simulated.ledger.entries if entry.direction == "in"]
+    sent = [entry for entry in done.rig.robot.link.simulated.ledger.entries if entry.direction == "in"]
     for instruction, times in ((READ, trace.time), (SYNC_WRITE, trace.sent[1:][np.diff(trace.goal) != 0])):
         ends = np.array(
             [
@@ -102,7 +102,7 @@ def least_period_ns(done: Any, write_time_ns: int) -> float:
     By the ledger: in each cycle a read is followed by a goal, which is the longer instruction.
     """
     byte_ns = 1e10 / done.rig.plan.buses[0].baud_rate
-    sent = [entry for entry in done.rig.robot.simulated.ledger.entries if entry.direction == "in"][500:]
+    sent = [entry for entry in done.rig.robot.link.simulated.ledger.entries if entry.direction == "in"][500:]
     ends = [entry.t_ns + len(entry.data) * byte_ns for entry in sent]
     between = [
         later - earlier
@@ -223,7 +223,7 @@ def test_a_response_that_few_loop_rates_show_is_within_its_interval(measures, mo
 def test_acceleration_and_braking_are_those_of_the_profile(measures, model, register, ticks):
     registers = f"{{{register}: {ticks}}}"
     done = measures(["speed"], model, protocol=PROTOCOLS[model], registers=registers, reach=1.2)
-    truth = ticks * done.rig.robot.simulated.buses[0].servo(1).registers.table.items[register].scale
+    truth = ticks * done.rig.robot.link.simulated.buses[0].servo(1).registers.table.items[register].scale
     assert done.figure(speeds.ACCELERATION).value == pytest.approx(truth, rel=FIVE_PERCENT)
     assert done.figure(speeds.BRAKING).value == pytest.approx(truth, rel=FIVE_PERCENT)
 
@@ -231,7 +231,7 @@ def test_acceleration_and_braking_are_those_of_the_profile(measures, model, regi
 @pytest.mark.parametrize("model", [pytest.param(model, marks=campaign) for model in PROTOCOLS])
 def test_the_top_speed_without_a_profile_is_the_motors(measures, model):
     done = measures(["speed"], model, protocol=PROTOCOLS[model])
-    motor = motor_of(done.rig.robot.simulated.buses[0].servo(1).registers.table)
+    motor = motor_of(done.rig.robot.link.simulated.buses[0].servo(1).registers.table)
     figure = done.figure(speeds.TOP)
     # its goals go as fast as the manual's no-load speed, which most of these motors have: either may limit it
     assert figure.value == pytest.approx(motor.no_load_speed, rel=FIVE_PERCENT)

@@ -27,12 +27,12 @@ ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 def happen(rig: Any, fault: str) -> None:
     """Let a fault happen now."""
     script = FaultScript(())
-    script.attach(rig.robot.simulated.buses)
-    script.add(parse_fault(fault), rig.robot.simulated.clock.now_ns())
+    script.attach(rig.robot.link.simulated.buses)
+    script.add(parse_fault(fault), rig.robot.link.simulated.clock.now_ns())
 
 
 def in_half_a_second(rig: Any, act: Callable[[], object]) -> None:
-    rig.robot.simulated.buses[0].at(rig.robot.simulated.clock.now_ns() + 500_000_000, act)
+    rig.robot.link.simulated.buses[0].at(rig.robot.link.simulated.clock.now_ns() + 500_000_000, act)
 
 
 def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage):
@@ -74,7 +74,7 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage):
 
     def off():
         data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
-        rig.robot.simulated.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
+        rig.robot.link.gateways_link._mailbox.post(Command(1_000_000, LOOP, "torque", data, "a person"))
 
     def segments(joint):
         in_half_a_second(rig, off)
@@ -134,7 +134,7 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage):
 
     def segments(joint):
         yield stage.sine(joint, 400)
-        in_half_a_second(rig, rig.robot.simulated.stop.request)
+        in_half_a_second(rig, rig.robot.link.simulated.stop.request)
         yield stage.sine(joint, 400, 3.0)
 
     done = perform(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
@@ -169,7 +169,9 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage):
 def test_an_abort_before_the_first_segment_moves_nothing(stage):
     places = []
     rig = stage.rig(stage.arm)
-    rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[1]))
+    rig.robot.link.each_cycle = lambda cycle: places.append(
+        float(rig.robot.link.simulated.record.goals.position[1])
+    )
 
     def far(joint):
         yield Segment("far", 0.01, {joint.name: np.full(10, joint.upper)})
@@ -188,7 +190,7 @@ def test_an_abort_in_a_motion_cancels_its_goal(stage):
 
     _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint, 400, 10.0)]), abort)
     assert done.why == "aborted by a key"
-    assert [report.status for report in rig.robot.ends.values()] == ["cancelled"]
+    assert [goal.status for goal in rig.robot.goals()] == ["cancelled"]
 
 
 def many(stage: Any, rng: random.Random) -> Any:
@@ -222,7 +224,9 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     at_s = rig.now_s + rng.uniform(0.0, 9.0)
     lost_s = rig.now_s + rng.uniform(0.0, 9.0)
     if seed % 3 == 2:  # and a servo that is lost, and back before all is restored
-        rig.robot.simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
+        rig.robot.link.simulated.buses[0].at(
+            round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms")
+        )
 
     def abort():
         return "aborted by a key" if rig.now_s >= at_s else None
@@ -230,6 +234,6 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     _, done = stage.perform(rig, "elbow", many(stage, rng), abort)
     assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
     assert all(part.whole for part in done.recorded[:-1])
-    assert not rig.robot.simulated.inbox.waiting
-    rig.robot.until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
-    assert abs(rig.robot.simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"
+    assert not rig.robot.link.simulated.robot.loop.steering.inbox.take()
+    rig.robot.link.until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
+    assert abs(rig.robot.link.simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"

@@ -94,7 +94,9 @@ def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage):
 def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage):
     rig = stage.rig(stage.single)
     places = []
-    rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[0]))
+    rig.robot.link.each_cycle = lambda cycle: places.append(
+        float(rig.robot.link.simulated.record.goals.position[0])
+    )
 
     def segments(joint):
         yield Segment("far", 1 / 320, {joint.name: np.full(10, joint.upper)})

@@ -53,7 +53,7 @@ def echo(
                 show(topics(states))
             return 0
         try:
-            for number, message in enumerate(robot.listen(topic, rate), 1):
+            for number, message in enumerate(robot.listen(topic, rate=rate), 1):
                 print_message(message, as_json=chosen.as_json)
                 if number == count:
                     break
@@ -75,20 +75,24 @@ def topics(states: Sequence[TopicState]) -> Table:
 
 def print_message(message: TopicMessage, *, as_json: bool) -> None:
     """Print one message: JSON in one line, or its fields in lines of their own behind `---`."""
+    import msgspec
+
+    time = message.time_ns * 1e-9
+    plain = msgspec.json.decode(msgspec.json.encode(message.message, enc_hook=lambda array: array.tolist()))
     if as_json:
         show_json_line(
             {
                 "topic": message.topic,
                 "number": message.number,
-                "time": message.time,
+                "time": time,
                 "lost": message.lost,
-                "message": message.message,
+                "message": plain,
             }
         )
         return
     lost = f", {message.lost} missed before it" if message.lost else ""
-    head = f"--- {message.topic} {message.number}, {message.time:.3f} s{lost}"
-    show("\n".join([head, *fields(message.message, message.joints)]))
+    head = f"--- {message.topic} {message.number}, {time:.3f} s{lost}"
+    show("\n".join([head, *fields(plain, message.joints)]))
 
 
 def fields(message: Mapping[str, object], joints: Sequence[str]) -> list[str]:

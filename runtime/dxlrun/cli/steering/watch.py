@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import select
 import sys
 import time
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from dxlrun.remote.client import RemoteRobot
+    from dxlrun.remote.live.states import RobotStates
 
 REFRESH_S = 0.2
 _RATE_S = 1.0
@@ -36,8 +38,8 @@ class Watched:
     """What is known of a running robot: newest states, controllers and events."""
 
     robot: RemoteRobot
+    states: RobotStates = field(init=False)
     info: Row = field(default_factory=dict)
-    states: Row = field(default_factory=dict)
     events: list[Row] = field(default_factory=list)
     rate: float | None = None
     """Cycles per second, measured."""
@@ -49,14 +51,14 @@ class Watched:
     def look(self) -> None:
         """Ask the robot; raises DxlrunError when it is gone."""
         self.info = cast("Row", self.robot.info())
-        self.states = cast("Row", self.robot.states())
+        self.states = self.robot.states()
         found = cast("Row", self.robot.events(self._last))
         self._last = found["last"]
         self.events += found["events"]
         self.events.sort(key=lambda event: event["time"])  # those of the guardian come later
         del self.events[:-_LONGEST_EVENTS]
-        cycle, now = self.states["cycle"], self.states["time"]
-        self.latest = max(self.latest, self.states["late"])
+        cycle, now = self.states.cycle, self.states.time_ns * 1e-9
+        self.latest = max(self.latest, self.states.late_ns * 1e-9)
         if not self._cycle[1]:
             self._cycle = cycle, now
         elif now - self._cycle[1] >= _RATE_S:
@@ -65,6 +67,8 @@ class Watched:
 
     def json(self) -> Row:
         """Return what one line of JSON has."""
+        from dxlrun.remote.live.states import encoded
+
         kept = ("name", "active", "held", "rate", "joints")
         rows = self.info["controllers"]
         controllers = [{key: row[key] for key in kept if key in row} for row in rows]
@@ -74,7 +78,7 @@ class Watched:
             "robot": self.robot.name,
             **known,
             "measured_rate": self.rate,
-            **self.states,
+            **json.loads(encoded(self.states)),
             "controllers": controllers,
             "events": events,
         }
@@ -196,12 +200,12 @@ class _Pressed:
 
 def headline(watched: Watched) -> Sentence:
     """Return the state of the run in one line."""
-    info, late = watched.info, watched.states["late"]
+    info, late = watched.info, watched.states.late_ns * 1e-9
     rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
     paused = ", paused" if info["paused"] else ""
     skipped = info["skipped"]
     text = (
-        f"{watched.robot.name}: {info['rate']:g} Hz{rate}{paused}, cycle {watched.states['cycle']}, "
+        f"{watched.robot.name}: {info['rate']:g} Hz{rate}{paused}, cycle {watched.states.cycle}, "
         f"late {late * 1e3:.2f} ms (max {watched.latest * 1e3:.2f}), {skipped} skipped"
     )
     return Sentence(text, "warning" if skipped or paused else "plain")
@@ -211,13 +215,10 @@ def joints(watched: Watched) -> Table:
     """Return a row for each joint: goal, position, velocity, effort, temperature, voltage, what is wrong."""
     numbers = (Column(name) for name in ("goal", "deg", "deg/s", "effort", "deg C", "V"))
     columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
-    units = watched.info.get("effort_units", {})
-    rows = watched.states["joints"]
-    ways = watched.info.get("units", {})
+    states = watched.states
+    rows = zip(states.joints, states.effort_units, states.units, strict=True)
     return Table.of(
-        "",
-        columns,
-        (_joint(name, row, units.get(name, ""), linear=ways.get(name) == "m") for name, row in rows.items()),
+        "", columns, (_joint(name, states.joint(name), unit, linear=way == "m") for name, unit, way in rows)
     )
 
 
@@ -251,14 +252,13 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
 
 def sources(watched: Watched) -> Table:
     """Return a row for each device, sensor, and controller that provides states: these, and their age."""
-    states = watched.states.get("sources", {})
-    ages = watched.states.get("source_ages", {})
-    found: dict[str, list[str]] = {name: [] for name in ages}
-    for name, value in states.items():
-        source, _, state = name.partition("/")
-        found[source].append(f"{state} {'-' if value is None else format(value, '.4g')}")
     columns = [Column("source", "name"), Column("age"), Column("states", "text")]
-    return Table.of("", columns, ((name, _age(ages[name]), ", ".join(said)) for name, said in found.items()))
+    rows = []
+    for name in watched.states.sources:
+        row = cast("Row", watched.states.source(name) or {"valid": False, "age": None, "states": {}})
+        said = (f"{key} {'-' if one is None else format(one, '.4g')}" for key, one in row["states"].items())
+        rows.append((name, _age(row), ", ".join(said)))
+    return Table.of("", columns, rows)
 
 
 def _age(row: Row) -> Cell:
@@ -269,12 +269,12 @@ def _age(row: Row) -> Cell:
 
 def controllers(watched: Watched) -> Table:
     """Return a row for each controller: what it does, its rate, and how long its update took."""
-    updates = watched.states["updates"]
+    updates = dict(zip(watched.states.controllers, watched.states.update_ns.tolist(), strict=True))
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
         (Column("state", "name"), lambda one: Cell(state(one), "good" if one["active"] else "plain")),
         (Column("rate", form="{:g} Hz"), "rate"),
-        (Column("update", form="{:.0f} us"), lambda one: updates.get(one["name"], 0.0) * 1e6 or None),
+        (Column("update", form="{:.0f} us"), lambda one: updates.get(one["name"], 0) * 1e-3 or None),
         (Column("into", "text"), lambda one: ", ".join(one.get("into", ()))),
     ]
     return Table.listing("", columns, watched.info["controllers"])
@@ -287,7 +287,7 @@ def event_lines(watched: Watched, most: int) -> list[Sentence]:
         severity = event["severity"]
         tone: Tone = "error" if severity >= 40 else "warning" if severity >= 30 else "plain"
         text = " ".join(str(event["text"]).split())
-        ago = watched.states["time"] - event["time"]
+        ago = watched.states.time_ns * 1e-9 - event["time"]
         lines.append(Sentence(f"{ago:5.1f} s ago, {event['source']}: {text}", tone))
     return lines
 

@@ -1,0 +1,171 @@
+"""Listening: messages of topics of a running robot as they come, for blocking and for asyncio programs."""
+
+from __future__ import annotations
+
+import asyncio
+import select
+import socket
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import suppress
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from dxlrun.errors import DxlrunError
+from dxlrun.remote.replies import FRAME_LENGTH, Frame, Opened, Sample
+from dxlrun.remote.sockets import TIMEOUT_S, RobotLink
+
+if TYPE_CHECKING:
+    from dxlrun.messages.cdr import Codec, Value
+
+_CHUNK = 1 << 18
+_decode = msgspec.msgpack.Decoder(Frame).decode
+
+
+class TopicMessage(msgspec.Struct, frozen=True):
+    """A message of a topic, as it was received."""
+
+    topic: str
+    type: str
+    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
+    number: int
+    """Counted from 1 by the robot."""
+    time_ns: int
+    """Of the run's clock."""
+    wall_ns: int
+    """The same as wall time."""
+    lost: int
+    """Messages of the topic between this one and the one before that did not come."""
+    data: bytes
+    """CDR, little-endian"""
+    definition: str
+    """Of the type, as ROS 2 writes it (`ros2msg`)."""
+    joints: tuple[str, ...] = ()
+    """Whose rows its arrays have; empty: of none."""
+
+    @property
+    def message(self) -> Mapping[str, Value]:
+        """Its fields; sequences of numbers are arrays, nested messages mappings. Decoded at each access."""
+        return _codec(self.type, self.definition).unpack(self.data)
+
+
+@lru_cache
+def _codec(kind: str, definition: str) -> Codec:
+    from dxlrun.messages.cdr import Codec  # numpy: most clients listen to nothing
+    from dxlrun.messages.definition import MessageType
+
+    return Codec(MessageType(kind, definition))
+
+
+class Listening:
+    """Messages as they come, from the newest on, until the run ends: `for` or `async for`, then closed.
+
+    A stream of `newest` messages leaves out what has come meanwhile when this end is slower; `lost` counts
+    it. Raises DxlrunError when the gateway is gone while the run is not.
+    """
+
+    def __init__(self, name: str, link: RobotLink, end: socket.socket, first: bytes, *, newest: bool) -> None:
+        self._name, self._link, self._end, self._newest = name, link, end, newest
+        end.setblocking(False)
+        self._bytes = bytearray(first)
+        self._topics: dict[int, Opened] = {}
+        self._last: dict[int, int] = {}
+        """Number of the newest message, by the topic's place."""
+        self._ended = False
+
+    def __enter__(self) -> Listening:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._end.close()
+
+    def __iter__(self) -> Iterator[TopicMessage]:
+        look = select.poll()
+        look.register(self._end, select.POLLIN)
+        try:
+            while not self._ended:
+                yield from self._arrived()
+                if not self._ended and not look.poll(TIMEOUT_S * 1e3):
+                    raise self._gone(f"nothing came for {TIMEOUT_S:g} s")
+        finally:
+            self.close()
+
+    async def __aiter__(self) -> AsyncIterator[TopicMessage]:
+        receive = asyncio.get_running_loop().sock_recv
+        try:
+            while not self._ended:
+                for message in self._arrived():
+                    yield message
+                if not self._ended:
+                    async with asyncio.timeout(TIMEOUT_S):
+                        self._bytes += await receive(self._end, _CHUNK)
+        except TimeoutError:
+            raise self._gone(f"nothing came for {TIMEOUT_S:g} s") from None
+        finally:
+            self.close()
+
+    def _arrived(self) -> Iterator[TopicMessage]:
+        """Yield the messages that have come."""
+        closed = False
+        with suppress(BlockingIOError):
+            while (more := self._received()) and self._newest:  # else the rest is taken later
+                pass
+            closed = not more
+        samples = self._samples()
+        if self._newest:
+            samples = [*{sample.place: sample for sample in samples}.values()]
+        for sample in samples:
+            topic, last = self._topics[sample.place], self._last.get(sample.place, sample.number - 1)
+            self._last[sample.place] = sample.number
+            yield TopicMessage(
+                topic.name,
+                topic.type,
+                sample.number,
+                sample.time_ns,
+                sample.time_ns + topic.epoch_offset_ns,
+                sample.number - last - 1,
+                sample.data,
+                topic.definition,
+                topic.joints,
+            )
+        if closed and not self._ended:
+            if not self._link.ends():
+                raise self._gone("the connection was closed")
+            self._ended = True
+
+    def _received(self) -> bytes:
+        """Take bytes that came and return them; none: the connection is closed."""
+        try:
+            more = self._end.recv(_CHUNK)
+        except ConnectionError:
+            return b""
+        self._bytes += more
+        return more
+
+    def _samples(self) -> list[Sample]:
+        """Return the messages that are whole; note topics, and the end of the run."""
+        found, at = [], 0
+        while len(self._bytes) - at >= FRAME_LENGTH.size:
+            begin = at + FRAME_LENGTH.size
+            end = begin + FRAME_LENGTH.unpack_from(self._bytes, at)[0]
+            if end > len(self._bytes):
+                break
+            if end > begin:
+                frame = _decode(self._bytes[begin:end])
+                if isinstance(frame, Opened):
+                    self._topics[frame.place] = frame
+                elif isinstance(frame, Sample):
+                    found.append(frame)
+                else:
+                    self._ended = True
+            at = end
+        del self._bytes[:at]
+        return found
+
+    def _gone(self, why: str) -> DxlrunError:
+        return DxlrunError(f"{self._name} no longer answers: {why}")

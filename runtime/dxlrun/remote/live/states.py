@@ -1,0 +1,106 @@
+"""States of a running robot in one cycle: arrays with the names and units of their rows."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_OF_JOINTS = (
+    *("position", "velocity", "effort", "valid", "goal_position", "goal_velocity", "goal_effort"),
+    *("goal_pwm", "temperature", "voltage", "hardware_error", "mode", "torque"),
+)
+
+
+class RobotStates(msgspec.Struct, frozen=True):
+    """The newest cycle. Arrays have a row for each name, in its order; NaN: not known, or not commanded."""
+
+    cycle: int
+    time_ns: int
+    """Wake-up of the cycle, ns of the run's clock."""
+    late_ns: int
+    """How much later than its deadline that was."""
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    """Of each joint's positions, `rad` or `m`; velocities are these a second."""
+    effort_units: tuple[str, ...]
+    """`Nm`, `N`, `A`; empty: the fraction of the servo's maximum."""
+    position: Floats
+    velocity: Floats
+    effort: Floats
+    valid: Bools
+    """True where this cycle's reply arrived intact."""
+    age_ns: Integers
+    """Time since the reply that the row shows; -1 while none ever came."""
+    goal_position: Floats
+    goal_velocity: Floats
+    goal_effort: Floats
+    goal_pwm: Floats
+    temperature: Floats
+    """deg C"""
+    voltage: Floats
+    hardware_error: Integers
+    """Bits of the servo's Hardware Error Status."""
+    mode: tuple[str, ...]
+    torque: tuple[str, ...]
+    """`on`, `doubt`, `off`, `released`, `lost`, `rebooting`"""
+    references: tuple[str, ...]
+    reference: Floats
+    """What controllers command of each other."""
+    source_states: tuple[str, ...]
+    """States of devices, sensors, and controllers that provide some: `imu/orientation.x`."""
+    source_state: Floats
+    """SI units"""
+    sources: tuple[str, ...]
+    source_valid: Bools
+    source_age_ns: Integers
+    controllers: tuple[str, ...]
+    update_ns: Integers
+    """How long each controller's update took in this cycle; 0: it had none."""
+
+    def joint(self, name: str) -> dict[str, object]:
+        """Return the row of a joint by names of fields, `age` in s; None: not known. Raises ValueError."""
+        row = self.joints.index(name)
+        found = {field: _plain(getattr(self, field)[row]) for field in _OF_JOINTS}
+        return {**found, "age": int(self.age_ns[row]) * 1e-9}
+
+    def source(self, name: str) -> dict[str, object] | None:
+        """Return states, `valid` and `age`, s, of a device, a sensor or a controller; None: there is no such.
+
+        `name`: its own, or that of one state, `imu/orientation.x`.
+        """
+        owner = name.partition("/")[0]
+        values = zip(self.source_states, self.source_state.tolist(), strict=True)
+        states = {
+            full.partition("/")[2]: _plain(value)
+            for full, value in values
+            if name in (full, full.partition("/")[0])
+        }
+        if not states:
+            return None
+        place = self.sources.index(owner)
+        age_ns = int(self.source_age_ns[place])
+        age = age_ns * 1e-9 if age_ns >= 0 else None
+        return {"valid": bool(self.source_valid[place]), "age": age, "states": states}
+
+
+def encoded(states: RobotStates) -> bytes:
+    """Return states as JSON; NaN becomes null."""
+    return msgspec.json.encode(states, enc_hook=np.ndarray.tolist)
+
+
+def array(kind: type, values: object) -> object:
+    """Return the array of a field; null becomes NaN."""
+    return np.array(values, get_args(get_args(kind)[1])[0])
+
+
+def _plain(value: object) -> object:
+    plain = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

@@ -1,0 +1,241 @@
+"""Live topics: messages of the loop's topics, of each cycle and of events, streamed to clients.
+
+Each stream reads the loop's rings at its own pace: the loop does not notice, and nothing piles up for a
+client that sleeps. What the rings have no more when it goes on, after some ten seconds, is missing in its
+numbers.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import NamedTuple
+
+import msgspec
+
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.events import Event
+from dxlrun.channels.messages import Topic, TopicMessage, decode_message, decode_topic
+from dxlrun.channels.ring import Record, RecordKind, RingReader
+from dxlrun.log.schemas import CYCLE, CYCLE_TOPIC, EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.messages.definition import MessageType
+from dxlrun.remote.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
+
+MOST_RECORDS = 64
+"""Of each ring that a stream takes at once, before the gateway looks after others."""
+_TIMES = 64
+"""Messages over which a topic's rate is measured."""
+SOURCE_STATES = MessageType(
+    "dxlrun_msgs/msg/SourceStates",
+    """# States of a device, a sensor, or a controller that provides some, SI units; NaN = not known.
+# valid: this cycle brought them; age_ns: since they were true, -1: none ever came.
+bool valid
+int64 age_ns
+string[] name
+float64[] value
+""",
+)
+_EVENT, _JOINT_STATE, _SOURCE = Codec(EVENT), Codec(JOINT_STATE), Codec(SOURCE_STATES)
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class _CycleTopic(NamedTuple):
+    """A topic with a message of every cycle."""
+
+    type: MessageType
+    joints: tuple[str, ...]
+    pack: Callable[[CycleRecord], bytes]
+
+
+class _LoopTopic:
+    """What is known of a topic of the loop."""
+
+    __slots__ = ("count", "newest", "times", "topic")
+
+    def __init__(self, topic: Topic, count: int) -> None:
+        self.topic, self.count = topic, count
+        self.newest: TopicMessage | None = None
+        self.times: deque[int] = deque(maxlen=_TIMES)
+
+    def take(self, message: TopicMessage) -> None:
+        """Note the newest message."""
+        self.newest, self.count = message, message.number
+        self.times.append(message.t_ns)
+
+    def state(self) -> TopicState:
+        """Return what the list of topics has."""
+        rate = None
+        if len(self.times) > 1 and (span_ns := self.times[-1] - self.times[0]) > 0:
+            rate = (len(self.times) - 1) * 1e9 / span_ns
+        return TopicState(self.topic.name, self.topic.type.name, self.topic.joints, self.count, rate)
+
+
+class LiveTopics:
+    """All topics of a run; `events` are those that the gateway keeps, by number."""
+
+    def __init__(
+        self,
+        messages: int,
+        cycles: int,
+        layout: CycleLayout,
+        events: deque[tuple[int, Event]],
+        epoch_offset_ns: int,
+    ) -> None:
+        self.rings = messages, cycles
+        """Descriptors of the memory of the loop's messages and cycles."""
+        self.layout, self.events, self.epoch_offset_ns = layout, events, epoch_offset_ns
+        self.of_loop: dict[str, _LoopTopic] = {}
+        self.by_number: dict[int, _LoopTopic] = {}
+        self.of_cycles = {
+            CYCLE_TOPIC: _CycleTopic(CYCLE, layout.joints, lambda record: ENCAPSULATION + record.raw),
+            JOINT_STATES_TOPIC: _CycleTopic(JOINT_STATE, layout.joints, self._joint_states),
+        } | {
+            f"/{source}": _CycleTopic(SOURCE_STATES, (), partial(_source_states, source))
+            for source in layout.sources
+        }
+        self.ring = RingReader(messages)
+
+    def collect(self) -> list[tuple[Topic, TopicMessage]]:
+        """Return the messages since the last call; the log declares what was lost on the way."""
+        found = []
+        while (record := self.ring.read()) is not None:
+            with suppress(ValueError):
+                if isinstance(record, Record) and record.kind == RecordKind.TOPIC:
+                    number, topic = decode_topic(record.payload)
+                    opened = _LoopTopic(topic, decode_message(record.payload).number)
+                    self.of_loop[topic.name] = self.by_number[number] = opened
+                elif isinstance(record, Record) and record.kind == RecordKind.MESSAGE:
+                    message = decode_message(record.payload)
+                    if (known := self.by_number.get(message.topic)) is not None:
+                        known.take(message)
+                        found.append((known.topic, message))
+        return found
+
+    def described(self, name: str) -> Topic:
+        """Return a topic; raises KeyError when there is none of this name."""
+        if name in self.of_loop:
+            return self.of_loop[name].topic
+        if name == EVENT_TOPIC:
+            return Topic(name, EVENT)
+        return Topic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
+
+    def states(self, cycles: int) -> list[TopicState]:
+        """Return what there is to listen to, after so many cycles."""
+        events = self.events[-1][0] if self.events else 0
+        return [
+            *(one.state() for one in self.of_loop.values()),
+            TopicState(EVENT_TOPIC, EVENT.name, (), events, None),
+            *(
+                TopicState(name, one.type.name, one.joints, cycles, None)
+                for name, one in self.of_cycles.items()
+            ),
+        ]
+
+    def _joint_states(self, record: CycleRecord) -> bytes:
+        states = record.states
+        stamp = divmod(max(0, record.woken_ns + self.epoch_offset_ns), 1_000_000_000)
+        return _JOINT_STATE.pack(
+            (stamp, ""), self.layout.joints, states.position, states.velocity, states.effort
+        )
+
+
+def _source_states(source: str, record: CycleRecord) -> bytes:
+    layout, sources = record.layout, record.sources
+    place, where = layout.sources.index(source), layout.source_slice(source)
+    names = tuple(name.partition("/")[2] for name in layout.source_states[where])
+    valid, age_ns = bool(sources.valid[place]), int(sources.age_ns[place])
+    return _SOURCE.pack(valid, age_ns, names, sources.values[where])
+
+
+class TopicStream:
+    """The messages of some topics for one client, from the newest on: every one, or the newest each time."""
+
+    def __init__(self, topics: LiveTopics, names: Sequence[str], *, newest: bool) -> None:
+        self.behind = False
+        """Whether more has come than was taken at once."""
+        self._places = {name: place for place, name in enumerate(dict.fromkeys(names))}
+        self._newest, self._events, self._offset_ns = newest, topics.events, topics.epoch_offset_ns
+        self._first = [self._opened(topics.described(name)) for name in self._places]
+        of_loop = [one for name, one in topics.of_loop.items() if name in self._places]
+        self._numbers = {
+            number: self._places[one.topic.name] for number, one in topics.by_number.items() if one in of_loop
+        }
+        self._first += (self._sample(one.newest) for one in of_loop if one.newest is not None)
+        messages, cycles = topics.rings
+        self._messages = RingReader(messages) if of_loop else None
+        if self._messages is not None:
+            self._messages.position = topics.ring.position
+        packers = ((place, topics.of_cycles.get(name)) for name, place in self._places.items())
+        self._packers = [(place, one.pack) for place, one in packers if one is not None]
+        self._cycles = RingReader(cycles) if self._packers else None
+        self._record = CycleRecord(topics.layout)
+        self._event = self._events[-1][0] - 1 if self._events else 0
+
+    def frames(self) -> bytes:
+        """Return what has come since the last call, as frames of a stream; of much the first part."""
+        self.behind = False
+        found = [*self._first, *self._new_messages(), *self._new_cycles(), *self._new_events()]
+        self._first = []
+        if self._newest:  # of each topic the last
+            found = [*{(type(frame), frame.place): frame for frame in found}.values()]
+        return b"".join(map(framed, found))
+
+    def _opened(self, topic: Topic) -> Opened | Sample:
+        place, kind = self._places[topic.name], topic.type
+        return Opened(place, topic.name, kind.name, kind.text, topic.joints, self._offset_ns)
+
+    def _sample(self, message: TopicMessage) -> Opened | Sample:
+        return Sample(self._numbers[message.topic], message.number, message.t_ns, message.data)
+
+    def _records(self, ring: RingReader) -> Iterator[Record]:
+        for _ in range(MOST_RECORDS):
+            if (record := ring.read()) is None:
+                return
+            if isinstance(record, Record):
+                yield record
+        self.behind = True
+
+    def _new_messages(self) -> Iterator[Opened | Sample]:
+        for record in self._records(self._messages) if self._messages is not None else ():
+            with suppress(ValueError):  # none of ours: the loop encodes them
+                if record.kind == RecordKind.TOPIC:
+                    number, topic = decode_topic(record.payload)
+                    if topic.name in self._places:
+                        self._numbers[number] = self._places[topic.name]
+                        yield self._opened(topic)
+                elif record.kind == RecordKind.MESSAGE:
+                    message = decode_message(record.payload)
+                    if message.topic in self._numbers:
+                        yield self._sample(message)
+
+    def _new_cycles(self) -> Iterator[Opened | Sample]:
+        ring = self._cycles
+        if ring is None:
+            return
+        newest = ring.newest() if self._newest or not ring.position else None
+        for record in (newest,) if newest else () if self._newest else self._records(ring):
+            if len(record.payload) == len(self._record.raw):
+                self._record.raw[:] = record.payload
+                number = ring.passed - 1  # the first record shows what was before the first cycle
+                for place, pack in self._packers if number else ():
+                    yield Sample(place, number, self._record.woken_ns, pack(self._record))
+
+    def _new_events(self) -> Iterator[Opened | Sample]:
+        if EVENT_TOPIC not in self._places or not self._events or self._events[-1][0] <= self._event:
+            return
+        for number, event in self._events:
+            if number > self._event:
+                data = event.data.decode(errors="replace")
+                texts = event.name, event.source, event.text, data
+                packed = _EVENT.pack(event.t_ns, int(event.code), int(event.severity), 0, *texts)
+                yield Sample(self._places[EVENT_TOPIC], number, event.t_ns, packed)
+        self._event = self._events[-1][0]
+
+
+def framed(frame: Frame) -> bytes:
+    """Return a frame of a stream behind its length."""
+    data = _encode(frame)
+    return FRAME_LENGTH.pack(len(data)) + data
