@@ -52,6 +52,8 @@ class Memory:
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
+        self.has_gaps = True
+        """False: where no cell belongs to an item there is nothing to read."""
         self.size = table.size  # Bytes from address 0 to the end of the last item
         self._memory = bytearray(self.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
@@ -159,6 +161,8 @@ class Memory:
         if length < 1 or address + length > self.size:
             return None
         cells = self.cells(address, length)
+        if not (cells.touched or self.has_gaps):
+            return None
         if cells.direct:
             return self._now(cells, address, length)
         places = self.places(address, length)
@@ -226,10 +230,6 @@ class Memory:
     def reaches_eeprom(self, address: int, data: bytes) -> bool:
         """Return whether a write would change the EEPROM area, also through Indirect Data."""
         return any(run.cells.eeprom for run in self.runs(address, data))
-
-    def touches(self, address: int, length: int) -> bool:
-        """Return whether any of some cells belongs to an item."""
-        return self.cells(address, length).touched
 
     def _run(self, address: int, data: bytes, cells: Cells) -> Run:
         items = cells.items

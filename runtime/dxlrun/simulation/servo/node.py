@@ -112,14 +112,17 @@ class SimulatedNode(ABC):
 
     def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
         """Return its part of the reply to an instruction that ended at `now_ns`; None for silence."""
-        if not self.receives(now_ns):
+        if not self.receives(now_ns) or not self._takes_part(read):
             return None
-        answer = self._answer_group_read(read, entry)
-        if answer is None:
+        if self.registers.get("status_return_level", 2) < 1:
+            return None
+        error, data = self._answer_read(entry.address, entry.length)
+        if read.fast and error:  # its form has no room for an error without data [i]
+            self._stays_out(read)
             return None
         # of a status packet that servos share only the first one waits its Return Delay Time
         delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
-        return ServoReply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
+        return ServoReply(self.servo_id, error | self._state(), data, delay_ns)
 
     # What kinds of nodes do differently
 
@@ -211,19 +214,6 @@ class SimulatedNode(ABC):
     def _manage(self, packet: InstructionPacket) -> int:
         """Obey what is not reading or writing; return the error, also for what it does not know."""
         return self._codec.unknown
-
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
-        """Return its part of a group read; None: it does not reply.
-
-        The form of a fast read has no room for an error without data [i].
-        """
-        if not self._takes_part(read) or self.registers.get("status_return_level", 2) < 1:
-            return None
-        answer = self._answer_read(entry.address, entry.length)
-        if read.fast and answer[0]:
-            self._stays_out(read)
-            return None
-        return answer
 
     def _stays_out(self, read: GroupRead) -> None:
         self.note(f"{self.called} does not reply to the fast read {read.instruction:#04x}")

@@ -13,7 +13,6 @@ from enum import IntFlag, unique
 from dxlrun.dynamixel.control_table import ControlItem
 from dxlrun.simulation.servo.access import OperatingMode, torque_rules, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory, Run
-from dxlrun.simulation.servo.node import Answer
 from dxlrun.simulation.servo.shaft import Shaft
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
@@ -81,6 +80,7 @@ class Protocol2Servo(SimulatedServo):
         self._shut_down = False
         self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
         super().__init__(memory, torque_rules, shaft, note)
+        memory.has_gaps = False
         memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 
     def _identify(self) -> None:
@@ -95,12 +95,6 @@ class Protocol2Servo(SimulatedServo):
         if not known:
             self._stays_out(read)
         return known
-
-    def _answer_read(self, address: int, length: int) -> Answer:
-        """Return data, or an access error where no item is."""
-        if self.registers.touches(address, length):
-            return super()._answer_read(address, length)
-        return ErrorNumber.ACCESS, b""
 
     def _manage(self, packet: InstructionPacket) -> int:
         """Obey what is not reading or writing; an instruction error for what it does not know.
