@@ -8,10 +8,9 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig
 
-from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps, Samples
+from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
 
 MS = 1_000_000
 SECOND_NS = 1_000_000_000
@@ -20,11 +19,11 @@ SECOND_NS = 1_000_000_000
 class Robot:
     """Servos that say what a test puts into their replies."""
 
-    def __init__(self, plans, events):
-        self.plans, self.events = plans, events
+    def __init__(self, *plans):
+        self.rig = make_rig(*plans)
+        self.plans, self.events, self.states = plans, self.rig.events, self.rig.states
         self.servos = [servo for plan in plans for servo in plan.servos]
-        self.states = States.empty(len(self.servos))
-        self.samples = Samples(plans, self.states, events)
+        self.samples = self.rig.hardware._samples
         self.replies = [bytearray(servo.state.length) for servo in self.servos]
         self.now_ns = SECOND_NS
 
@@ -70,12 +69,8 @@ class Robot:
         return self.states.valid.tolist(), self.states.position.tolist()
 
 
-def make_robot(*plans):
-    return Robot(plans, make_rig(make_plan((1,))).events)
-
-
 def test_signs_follow_the_joints_direction():
-    robot = make_robot(make_plan())
+    robot = Robot(make_plan())
     robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
     servo = robot.servos[0]
     direction = np.array([one.direction for one in robot.servos])
@@ -86,7 +81,7 @@ def test_signs_follow_the_joints_direction():
 
 
 def test_a_lost_row_keeps_its_own_values_and_ages():
-    robot = make_robot(make_plan())
+    robot = Robot(make_plan())
     states = robot.states
     for index in range(8):
         robot.put(index, 100 + index, 0, 0)
@@ -106,7 +101,7 @@ def test_a_lost_row_keeps_its_own_values_and_ages():
 
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.PWM, Mode.POSITION, Mode.UNKNOWN])
 def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(mode):
-    robot = make_robot(make_plan((1, 2), continuous=True))
+    robot = Robot(make_plan((1, 2), continuous=True))
     robot.states.mode[0] = mode
     robot.all_said(512, 100, 0)
     robot.states.mode[1] = Mode.VELOCITY
@@ -169,7 +164,7 @@ def test_states_are_what_the_rules_make_of_each_servo(name, order):
         servos = tuple(replace(servo, row=row) for servo, row in zip(plan.servos, mine, strict=True))
         plans.append(replace(plan, servos=servos))
         del rows[:count]
-    robot = make_robot(*plans)
+    robot = Robot(*plans)
     ones = [OneServo(plan, servo) for plan in plans for servo in plan.servos]
     middle = [rng.randrange(300, 700) for _ in ones]
     quick = 0
@@ -203,7 +198,7 @@ class TestJumps:
 
     @pytest.fixture
     def robot(self):
-        return make_robot(make_plan((1, 3)))
+        return Robot(make_plan((1, 3)))
 
     def test_a_fast_servo_is_believed(self, robot):
         for step in range(20):
@@ -225,7 +220,7 @@ class TestJumps:
         assert robot.turn(2.0, 0.0, after_ms=500)[0] == [True, True]
 
     def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self):
-        robot = make_robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
+        robot = Robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
         before = robot.turn(0.0, 0.0)[1]
         assert robot.turn(0.0, 1.5) == ([True, False], before)
 

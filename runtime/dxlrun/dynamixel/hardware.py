@@ -195,7 +195,7 @@ class DynamixelHardware:
                     self._settle(servos)
                     self._report_failures()
             if answer is Answer.LOOK:
-                self._samples.settle(self._clock.now_ns())
+                self._samples.judge(self._clock.now_ns())
         if self._look:
             self._by_kernel = None
 

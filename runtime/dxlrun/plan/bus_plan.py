@@ -28,14 +28,6 @@ class Field(msgspec.Struct, frozen=True):
     bit: int | None = None
     """Of a device's item: the only bit of it that is meant."""
 
-    def number(self, block: bytes | memoryview) -> float:
-        """Return the item as a device counts; a float32 as it is."""
-        if self.encoding == "float32":
-            value: float = struct.unpack_from("<f", block, self.offset)[0]
-            return value
-        tick = self.tick(block)
-        return tick if self.bit is None else tick >> self.bit & 1
-
     def tick(self, block: bytes | memoryview) -> int:
         """Return the item as the servo counts, out of the bytes of its block.
 

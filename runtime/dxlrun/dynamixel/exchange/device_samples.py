@@ -15,7 +15,7 @@ REPORT_AGAIN_NS = 1_000_000_000  # One device has at most one event in this time
 
 
 class DeviceSamples:
-    """Fills the states of all devices at once; blocks are in the order of the plans.
+    """What came of all devices; blocks are in the order of the plans.
 
     A device's row is valid when all its blocks came in this cycle and all their values are finite; else it
     keeps its values, is invalid, and its age grows.
@@ -34,42 +34,29 @@ class DeviceSamples:
         """Time at which the newest reply arrived; -1 while none ever did."""
         self.shown_ns = np.full(len(devices), -1, dtype=np.int64)
         """Time of the oldest reply among those that the states show, of each device; -1: they show none."""
+        self.doubted = np.zeros(len(devices), dtype=np.bool_)
+        """True where the replies of this cycle are not believed."""
         self._fields = [block.fields for block in blocks]
-        self._devices: list[tuple[str, str, int, slice, list[int]]] = []
+        self._devices: list[tuple[str, str, slice, list[int]]] = []
         first = 0
         for plan, device in devices:
             here = slice(first, first + len(device.blocks))
             first = here.stop
             columns = [field.column for block in device.blocks for field in block.fields]
-            self._devices.append((device.name, plan.label(device), device.source, here, columns))
+            self._devices.append((device.name, plan.label(device), here, columns))
         self._reported_ns = [-REPORT_AGAIN_NS] * len(devices)
 
-    def take(self, block: int, data: bytes | memoryview, at_ns: int) -> None:
-        """Keep what was answered to the read of a block."""
-        for field in self._fields[block]:
-            self.values[field.column] = field.place.number(data) * field.scale + field.offset
-        self.fresh[block] = True
-        self.at_ns[block] = at_ns
-
-    def settle(self, now_ns: int) -> None:
-        """Fill the states from the replies of this cycle. As in kernel.c."""
-        sources = self.sources
-        for number, (_, _, row, here, columns) in enumerate(self._devices):
-            valid = bool(self.fresh[here].all())
-            if valid and not np.isfinite(self.values[columns]).all():
+    def judge(self, now_ns: int) -> None:
+        """Doubt each device that sent something that is no finite number in this cycle."""
+        for number, (_, _, here, columns) in enumerate(self._devices):
+            if self.fresh[here].all() and not np.isfinite(self.values[columns]).all():
                 self._report(number, now_ns)
-                valid = False
-            if valid:
-                sources.values[columns] = self.values[columns]
-                self.shown_ns[number] = self.at_ns[here].min()
-            shown_ns = self.shown_ns[number]
-            sources.valid[row] = valid
-            sources.age_ns[row] = -1 if shown_ns < 0 else now_ns - shown_ns
+                self.doubted[number] = True
 
     def _report(self, number: int, now_ns: int) -> None:
         if now_ns - self._reported_ns[number] >= REPORT_AGAIN_NS:
             self._reported_ns[number] = now_ns
-            name, label, _, here, _ = self._devices[number]
+            name, label, here, _ = self._devices[number]
             wrong = [
                 field.state
                 for fields in self._fields[here]

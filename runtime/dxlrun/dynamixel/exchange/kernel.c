@@ -5,8 +5,7 @@
  * turns goals into sync writes. Whatever is not exactly as planned ends it with UNEXPECTED; what has arrived
  * until then is left in the line's buffer, and the packet-by-packet parser in Python goes on from there.
  *
- * All lengths come from the plan, none from the wire. Arithmetic is IEEE double in the order in which
- * `samples.py` does it, so that both give the same bits; build with -ffp-contract=off.
+ * All lengths come from the plan, none from the wire. Build with -ffp-contract=off: the same bits everywhere.
  */
 
 #define _GNU_SOURCE
@@ -133,7 +132,7 @@ typedef struct Kernel {
     const Servo *servos;
     double *values;
     const double *scale, *reference;
-    uint8_t *fresh;
+    uint8_t *fresh, *doubted;
     int64_t *at_ns, *shown_ns;
     double *position, *velocity, *effort;
     uint8_t *valid;
@@ -142,7 +141,7 @@ typedef struct Kernel {
     const Block *blocks;
     const DeviceField *fields;
     double *device_values;
-    uint8_t *block_fresh;
+    uint8_t *block_fresh, *device_doubted;
     int64_t *block_at_ns, *device_shown_ns;
     double *source_values;
     uint8_t *source_valid;
@@ -444,25 +443,25 @@ static const Piece *piece_of(const Line *l, int32_t at)
     return p;
 }
 
-static void take_block(Kernel *k, const Line *l, const Part *part, int64_t at_ns)
+static void take_block(Kernel *k, int32_t i, const uint8_t *data, int64_t at_ns)
 {
-    int32_t i = l->first_block + part->servo - l->servo_count;
     const DeviceField *f = k->fields + k->blocks[i].first_field;
     for (int32_t n = k->blocks[i].field_count; n > 0; n--, f++)
-        k->device_values[f->column] = tick(&f->field, l->buffer + part->data_at) * f->scale + f->offset;
+        k->device_values[f->column] = tick(&f->field, data) * f->scale + f->offset;
     k->block_fresh[i] = 1;
     k->block_at_ns[i] = at_ns;
 }
 
-static void take_state(Kernel *k, const Line *l, const Part *part, int64_t at_ns)
+/* Takes what a member of a line, by its index, answered to the read of its state. */
+static void take_state(Kernel *k, const Line *l, int32_t member, const uint8_t *data, int64_t at_ns)
 {
-    if (part->servo >= l->servo_count) {
-        take_block(k, l, part, at_ns);
+    if (member >= l->servo_count) {
+        take_block(k, l->first_block + member - l->servo_count, data, at_ns);
         return;
     }
-    int32_t i = l->first_servo + part->servo, n = k->servo_count;
+    int32_t i = l->first_servo + member, n = k->servo_count;
     for (int32_t f = 0; f < 3; f++)
-        k->values[f * n + i] = tick(&k->servos[i].fields[f], l->buffer + part->data_at) * k->scale[f * n + i];
+        k->values[f * n + i] = tick(&k->servos[i].fields[f], data) * k->scale[f * n + i];
     k->values[i] -= k->reference[i];
     k->fresh[i] = 1;
     k->at_ns[i] = at_ns;
@@ -524,8 +523,10 @@ static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
         put_record(k, l, STATUS, p->id, piece_of(l, p->start)->at_ns, piece_of(l, p->end - 1)->at_ns,
                    l->buffer + p->start, p->end - p->start);
     }
-    for (int32_t i = 0; i < r->part_count; i++)
-        take_state(k, l, &r->parts[i], r->fast ? at : piece_of(l, r->parts[i].end - 1)->at_ns);
+    for (int32_t i = 0; i < r->part_count; i++) {
+        const Part *p = &r->parts[i];
+        take_state(k, l, p->servo, l->buffer + p->data_at, r->fast ? at : piece_of(l, p->end - 1)->at_ns);
+    }
     if (k->polling.enabled)
         dxl_polling_came(&k->polling, l->due_ns, at);
     note_lateness(l, at - l->due_ns - l->latency_ns);
@@ -611,12 +612,13 @@ static int is_finite(const Kernel *k, const Device *d)
     return 1;
 }
 
-/* Fills the states of the devices; see DeviceSamples.settle. */
-static void settle_devices(Kernel *k, int64_t now)
+/* Fills the states of the devices: a row is valid when all its blocks came, with numbers that are finite. */
+static void show_devices(Kernel *k, int64_t now)
 {
     for (int32_t i = 0; i < k->device_count; i++) {
         const Device *d = &k->devices[i];
-        int whole = is_whole(k, d);
+        int whole = is_whole(k, d) && !k->device_doubted[i];
+        k->device_doubted[i] = 0;
         for (int32_t b = d->first_block; whole && b < d->first_block + d->block_count; b++) {
             const DeviceField *f = k->fields + k->blocks[b].first_field;
             for (int32_t n = k->blocks[b].field_count; n > 0; n--, f++)
@@ -629,9 +631,29 @@ static void settle_devices(Kernel *k, int64_t now)
     }
 }
 
-/* Fills the states of the robot; LOOK, with nothing changed, where a position is further than is plausible, or a
- * device sent no number. */
-static int settle(Kernel *k, int64_t now)
+/* Fills the states of the robot from what came in this cycle and is not doubted. */
+void dxl_show(Kernel *k, int64_t now)
+{
+    int32_t n = k->servo_count;
+    show_devices(k, now);
+    for (int32_t i = 0; i < n; i++) {
+        int64_t row = k->servos[i].row;
+        int valid = k->fresh[i] && !k->doubted[i];
+        k->doubted[i] = 0;
+        if (valid) {
+            k->position[row] = k->values[i];
+            k->velocity[row] = k->values[n + i];
+            k->effort[row] = k->values[2 * n + i];
+        }
+        k->valid[row] = (uint8_t)valid;
+        k->age_ns[row] = k->at_ns[i] < 0 ? -1 : now - k->at_ns[i];
+        k->shown_ns[i] = k->at_ns[i];
+    }
+}
+
+/* Ends a cycle, and fills the states; LOOK, with nothing changed, where a position is further than is plausible,
+ * or a device sent no number. */
+int32_t dxl_settle(Kernel *k, int64_t now)
 {
     int32_t n = k->servo_count;
     k->reserved = 0;
@@ -646,19 +668,14 @@ static int settle(Kernel *k, int64_t now)
     for (int32_t i = 0; i < k->device_count; i++)
         if (is_whole(k, &k->devices[i]) && !is_finite(k, &k->devices[i]))
             return LOOK;
-    settle_devices(k, now);
-    for (int32_t i = 0; i < n; i++) {
-        int64_t row = k->servos[i].row;
-        if (k->fresh[i]) {
-            k->position[row] = k->values[i];
-            k->velocity[row] = k->values[n + i];
-            k->effort[row] = k->values[2 * n + i];
-        }
-        k->valid[row] = k->fresh[i];
-        k->age_ns[row] = k->at_ns[i] < 0 ? -1 : now - k->at_ns[i];
-        k->shown_ns[i] = k->at_ns[i];
-    }
+    dxl_show(k, now);
     return OK;
+}
+
+/* Takes what the parser found of a member of a line. */
+void dxl_take(Kernel *k, int32_t line, int32_t member, const uint8_t *data, int64_t at_ns)
+{
+    take_state(k, &k->lines[line], member, data, at_ns);
 }
 
 /* Notes that the servos are asked now; false where a line had no instruction for longer than its servos wait. */
@@ -730,7 +747,7 @@ static int32_t read_all(Kernel *k)
         if (answer != OK)
             return answer;
     }
-    return settle(k, now_ns(k));
+    return dxl_settle(k, now_ns(k));
 }
 
 /* Reads every servo once. WAITING: `beat_ns` has passed since the call; FULL: commit the log; call again. SILENCE:

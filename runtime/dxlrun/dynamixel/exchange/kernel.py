@@ -119,6 +119,12 @@ def load(path: Path | None = None) -> ctypes.CDLL:
         raise StartUpError(f"the compiled kernel is of another source than kernel.c beside it: {MISSING}")
     library.dxl_read.argtypes = library.dxl_write.argtypes = library.dxl_abandon.argtypes = (c_void_p,)
     library.dxl_abandon.restype = None
+    library.dxl_take.argtypes, library.dxl_take.restype = (
+        (c_void_p, c_int32, c_int32, c_void_p, c_int64),
+        None,
+    )
+    library.dxl_settle.argtypes = library.dxl_show.argtypes = (c_void_p, c_int64)
+    library.dxl_show.restype = None
     return library
 
 
@@ -263,6 +269,9 @@ class Kernel:
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
         self.read: Callable[[], int] = partial(self._library.dxl_read, self._pointer)
         """Reads every servo once, in C; returns 0, or what `finish_read` takes."""
+        samples.take = partial(self._library.dxl_take, self._pointer)
+        samples.settle_all = partial(self._library.dxl_settle, self._pointer)
+        samples.show = partial(self._library.dxl_show, self._pointer)
         self.write: Callable[[], int] = partial(self._library.dxl_write, self._pointer)
         """Sends the goals that are due, in C; returns 0, or what `finish_write` takes."""
 
@@ -299,7 +308,7 @@ class Kernel:
             one.fields = (_Field * 3)(*map(_field, (layout.position, layout.velocity, layout.effort)))
             one.row, one.quick = servo.row, quick
         kernel.servos = self._lay(laid)
-        for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns"):
+        for name in ("values", "scale", "reference", "fresh", "doubted", "at_ns", "shown_ns"):
             setattr(kernel, name, _data(getattr(samples, name)))
         for name in ("position", "velocity", "effort", "valid", "age_ns"):
             setattr(kernel, name, _data(getattr(states, name)))
@@ -323,6 +332,7 @@ class Kernel:
         kernel.fields = self._lay(_array(_DeviceField, fields))
         kernel.device_values, kernel.block_fresh = _data(samples.values), _data(samples.fresh)
         kernel.block_at_ns, kernel.device_shown_ns = _data(samples.at_ns), _data(samples.shown_ns)
+        kernel.device_doubted = _data(samples.doubted)
         kernel.source_values, kernel.source_valid = _data(sources.values), _data(sources.valid)
         kernel.source_age_ns = _data(sources.age_ns)
 

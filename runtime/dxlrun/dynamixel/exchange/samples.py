@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,16 @@ class Samples:
         """Time at which the newest plausible reply arrived; -1 while none ever did."""
         self.shown_ns = self.at_ns.copy()
         """The same as of the end of the cycle before: the time of the sample that the states show."""
+        self.doubted = np.zeros(len(servos), dtype=np.bool_)
+        """True where the reply of this cycle is not believed."""
         self.jumps = Jumps(plans, events)
+        self.take: Callable[[int, int, bytes, int], object]
+        """Takes what a member of a bus answered, both by their index, and when it came; of the kernel."""
+        self.settle_all: Callable[[int], int]
+        """Fills the states at a time from the replies of this cycle; or returns another number than 0, having
+        filled none, where something is to be judged."""
+        self.show: Callable[[int], object]
+        """Fills the states at a time from those replies that are not doubted."""
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
         self.modes = b""  # The robot's modes, as of the last `follow_modes`
@@ -65,8 +74,8 @@ class Samples:
         """Where the replies of devices go."""
         first_servo = first_block = 0
         buses = []
-        for plan in plans:
-            buses.append(BusSamples(plan, self, first_servo, first_block))
+        for number, plan in enumerate(plans):
+            buses.append(BusSamples(number, plan, self, first_servo, first_block))
             first_servo += len(plan.servos)
             first_block += len(plan.members) - len(plan.servos)
         self.buses = tuple(buses)  # Where the replies of each bus go
@@ -83,36 +92,31 @@ class Samples:
         The row of a servo without a reply, or with an implausible one, keeps its values, is invalid, and its
         age grows.
         """
-        states, rows, at_ns = self._states, self.rows, self.at_ns
-        valid = self.fresh.copy()
-        steps = self.values[0] - states.position[rows]
-        for index in self.jumps.suspects(steps, valid):
-            elapsed_ns = int(at_ns[index] - self.shown_ns[index])
+        if self.settle_all(now_ns):
+            self.judge(now_ns)
+
+    def judge(self, now_ns: int) -> None:
+        """Fill the states from those replies of this cycle that can be true."""
+        steps = self.values[0] - self._states.position[self.rows]
+        for index in self.jumps.suspects(steps, self.fresh):
+            elapsed_ns = int(self.at_ns[index] - self.shown_ns[index])
             if not self.jumps.can_be(index, float(steps[index]), elapsed_ns, now_ns):
-                valid[index] = False
-                at_ns[index] = self.shown_ns[index]
-        shown = rows[valid]
-        states.motion[:, shown] = self.values[:, valid]
-        states.valid[rows] = valid
-        states.age_ns[rows] = np.where(at_ns < 0, -1, now_ns - at_ns)
-        self.shown_ns[:] = at_ns
-        self.devices.settle(now_ns)
+                self.doubted[index] = True
+                self.at_ns[index] = self.shown_ns[index]
+        self.devices.judge(now_ns)
+        self.show(now_ns)
 
 
 class BusSamples:
     """The part of one bus: its servos are columns of the arrays of `Samples`; its devices' blocks follow."""
 
-    def __init__(self, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
+    def __init__(self, number: int, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
         blocks = slice(first_block, first_block + len(plan.members) - len(plan.servos))
         self._samples = samples
-        self._first = first
-        self._fields = [
-            (servo.state.position, servo.state.velocity, servo.state.effort) for servo in plan.servos
-        ]
+        self._number = number
         self.fresh = samples.fresh[here]
         """True where an intact reply arrived in this cycle; shape (servos of the bus,)."""
-        self._first_block = first_block
         self.blocks_fresh = samples.devices.fresh[blocks]
         """The same of the devices' blocks; shape (blocks of the bus,)."""
         self.blocks_at_ns = samples.devices.at_ns[blocks]
@@ -132,16 +136,7 @@ class BusSamples:
 
     def take(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
         """Keep what a member of the plan, by its index, answered to the read of its state."""
-        if servo >= len(self.fresh):
-            self._samples.devices.take(self._first_block + servo - len(self.fresh), data, at_ns)
-            return
-        samples, column = self._samples, self._first + servo
-        values, scale = samples.values, samples.scale
-        for number, field in enumerate(self._fields[servo]):
-            values[number, column] = field.tick(data) * scale[number, column]
-        values[0, column] -= samples.reference[column]
-        self.fresh[servo] = True
-        self.at_ns[servo] = at_ns
+        self._samples.take(self._number, servo, bytes(data), at_ns)
 
 
 class Jumps:
