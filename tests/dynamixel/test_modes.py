@@ -599,3 +599,16 @@ def test_an_led_that_stays_dark_shows_no_reboot():
     change(rig, Mode.VELOCITY)
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
     assert rig.torque() == [True, True]
+
+
+def test_a_mode_is_entered_though_no_cycle_leaves_time_for_it():
+    rig = start_rig(make_pair())
+    rig.cycles(10)
+    rig.set_modes(V, Mode.UNKNOWN)
+    for _ in range(400):
+        rig.hardware.idle(rig.clock.now_ns())
+        rig.hardware.read()
+        rig.hardware.write()
+        rig.wait(1_000_000)
+    assert rig.states.mode.tolist() == [V, P]
+    assert "waits for idle time" in rig.events.texts(EventCode.OVERRUN)[0]

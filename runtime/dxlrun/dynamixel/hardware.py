@@ -260,15 +260,19 @@ class DynamixelHardware:
 
     def _rest(self) -> None:
         """Look at nothing any more where all is as planned, until that changes."""
-        self._look = not (all(servos.at_rest for servos in self._servos) and self._plan_reads())
         self._due_ns = min((servos.due_ns for servos in self._servos), default=NEVER)
         self._waiting = [
             (bus.words, work.least_ns)
             for bus, work in zip(self._buses, self._idle, strict=True)
             if work.tasks
         ]
-        if not self._look:
-            self._by_kernel = True
+        self._by_kernel = (
+            all(servos.at_rest for servos in self._servos)
+            and all(least_ns for _, least_ns in self._waiting)
+            and self._states.mode.tobytes() == self._samples.modes
+            and self._plan_reads()
+        ) or None
+        self._look = self._by_kernel is None
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in idle time; UNKNOWN leaves one as it is."""
