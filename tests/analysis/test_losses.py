@@ -89,8 +89,9 @@ def own(write: Make, wire: Make, packets: list[tuple[PacketKind, int, bytes]]) -
 ASK, STATUS, NOISE = PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.NOISE
 
 
-def test_servos_behind_a_silent_one_wait_in_vain(write: Make, wire: Make) -> None:
-    packets = [(ASK, 254, SYNC_READ), (STATUS, 3, status(3))]  # 7 is silent, and 4 waits for it
+@pytest.mark.parametrize("behind", [[], [(STATUS, 4, status(4))]], ids=["none", "it comes all the same"])
+def test_servos_behind_a_silent_one_wait_in_vain(behind: list[Any], write: Make, wire: Make) -> None:
+    packets = [(ASK, 254, SYNC_READ), (STATUS, 3, status(3)), *behind]  # 7 is silent, and 4 waits for it
     assert own(write, wire, packets) == {3: (1, 0), 7: (1, 1)}  # nothing is known of 4
 
 

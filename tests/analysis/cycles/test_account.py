@@ -124,3 +124,9 @@ def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
     assert cause == ("missing reply", 0, IDS[answered] if answered else -1)
     heard = PLANNED[answered - 1] if answered else len(ASK) * 10
     assert us == 9_000 - 10 - heard
+
+
+def test_the_requests_of_another_bus_end_no_exchange() -> None:
+    silent = [asked(10), asked(20, 1), *replies(20, PLANNED, 1)]
+    found = split(9_000, silent, BUS, structs.replace(BUS, name="other"))
+    assert found == {("missing reply", 0, -1): 9_000 - 10 - len(ASK) * 10}

@@ -239,6 +239,7 @@ def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> N
         packets.append(Wire(PacketKind.INSTRUCTION, 5, 1000 + number * 20_000, ask))
         if number != 7:
             packets.append(Wire(PacketKind.STATUS, 5, 1400 + number * 20_000 + 10 * number, answer))
+    packets.append(Wire(PacketKind.INSTRUCTION, 5, 1000 + 20 * 20_000, ask))  # open where the log ends
     log = read_log(write([Cycle(number) for number in range(20)], packets))
     collector = ReplyCollector()
     analyze(log, exchanges=collector.take)
