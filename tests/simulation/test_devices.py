@@ -235,5 +235,5 @@ def test_the_voltage_of_the_line_is_shown(line):
 
 def test_a_device_has_only_the_rates_of_its_table():
     config = BusConfig("main", 1_234_567, (), 2.0, devices=(DeviceConfig(200, "OpenCR"),))
-    with pytest.raises(ValueError, match="a OpenCR has no baud rate of 1234567 bit/s"):
+    with pytest.raises(ValueError, match="OpenCR: no baud rate near 1234567 bit/s"):
         SimulatedBus(config, Ledger(), 0)

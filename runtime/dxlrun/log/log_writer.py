@@ -63,7 +63,8 @@ class LogWriter:
         """Written at the end, beside the header's: what became known in the run."""
         self._layout = header.layout
         self._file = LogFile(path)
-        self._messages = self._lost = self._unwritten = self._last_ns = 0
+        self._messages = self._lost = self._unwritten = 0
+        self.first_ns = self.last_ns = 0  # Of the messages so far
         self._whole_bytes = self._whole_messages = 0
         self._summary: LogSummary | None = None
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
@@ -178,7 +179,8 @@ class LogWriter:
         self._writer.add_message(channel, wall_ns, data, wall_ns, sequence & 0xFFFFFFFF)
         self._messages += 1
         self._chunk_bytes += len(data)
-        self._last_ns = max(self._last_ns, t_ns)
+        self.first_ns = self.first_ns or t_ns
+        self.last_ns = max(self.last_ns, t_ns)
 
     def _end_chunk(self) -> None:
         """Write the chunk, with the packets that belong to its cycles: what is behind it may be lost."""
@@ -341,7 +343,7 @@ class LogWriter:
         them = "it" if lost == 1 else "them"
         text = f"{what} overwritten or damaged before the recorder read {them}"
         data = msgspec.json.encode(LostRecords(source, lost))
-        event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
+        event = Event(self.last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
         self._guarded(self._write_event, event)
 
     def flush(self, *, sync: bool = False) -> None:

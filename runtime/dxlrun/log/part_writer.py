@@ -6,10 +6,8 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 from msgspec.structs import replace
 
-from dxlrun.channels.events import decode_event
 from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LogHeader, LogSummary
@@ -52,10 +50,6 @@ class PartWriter:
         self._summary: LogSummary | None = None
         self._topics: dict[bytes, None] = {}
         """Announced topics, which each part announces again."""
-        self._dtype = header.layout.dtype
-        self._now_ns = 0
-        self._began_ns: int | None = None
-        """Time of the part's first record."""
         self._path = path / part_name(0)
         self._log = self._open(0, "start")
 
@@ -96,8 +90,8 @@ class PartWriter:
             self._error = f"{part_name(index)} cannot be written: {error.strerror or error}"
             return
         self._closed.append(summary)
-        self._kept.append((ended, self._now_ns))
-        self._log, self._began_ns = log, None
+        self._kept.append((ended, self._log.last_ns))
+        self._log = log
 
     def _end(self, *, last: bool) -> LogSummary:
         end = {PART_END_NAME: {"last": "yes" if last else "no"}}
@@ -106,39 +100,31 @@ class PartWriter:
 
     def take(self, kind: int, payload: Payload) -> None:
         """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
-        if kind == RecordKind.CYCLE:
-            self._now_ns = max(self._now_ns, int(np.frombuffer(payload, self._dtype, 1)[0]["woken_ns"]))
-        elif kind == RecordKind.EVENT:
-            self._now_ns = max(self._now_ns, decode_event(payload).t_ns)
-        elif kind == RecordKind.TOPIC:
+        if kind == RecordKind.TOPIC:
             self._topics[bytes(payload)] = None
-        if self._begins():
+        if self._error is None:
             self._log.take(kind, payload)
+        else:
+            self._unwritten += 1
 
     def machine(self, t_ns: int, data: bytes) -> None:
         """Write a message about the machine."""
-        if self._begins():
+        if self._error is None:
             self._log.machine(t_ns, data)
-
-    def _begins(self) -> bool:
-        """Note when the part began; False, and the record counts as unwritten, when the log has ended."""
-        if self._error is not None:
+        else:
             self._unwritten += 1
-            return False
-        if self._began_ns is None and self._now_ns:
-            self._began_ns = self._now_ns
-        return True
 
     def settle(self) -> None:
         """End the part if it is full or old, and delete the oldest; call it behind a whole cycle."""
         size, age_ns, keep_ns = self._plan.split_bytes, self._plan.split_ns, self._plan.keep_ns
+        now_ns = self._log.last_ns
         if size is not None and self._log.size >= size:
             self._next("size")
-        elif age_ns is not None and self._began_ns is not None and self._now_ns - self._began_ns >= age_ns:
+        elif age_ns is not None and now_ns - self._log.first_ns >= age_ns:
             self._next("time")
         if keep_ns is None or self.error is not None:  # a log that has ended loses nothing more
             return
-        while self._kept and self._kept[0][1] < self._now_ns - keep_ns:
+        while self._kept and self._kept[0][1] < now_ns - keep_ns:
             with suppress(OSError):  # then it stays
                 self._kept.popleft()[0].unlink()
 

@@ -21,7 +21,7 @@ from dxlrun.plan.simulation_plan import DeviceConfig
 from dxlrun.simulation.device.measured import Measured, shown
 from dxlrun.simulation.servo.access import device_rules
 from dxlrun.simulation.servo.memory import IDENTITY, Memory
-from dxlrun.simulation.servo.node import Answer, SimulatedNode
+from dxlrun.simulation.servo.node import Answer, SimulatedNode, baud_value
 from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket
 
 CHAIN_WAIT_NS = 50_000_000
@@ -64,7 +64,7 @@ class SimulatedDevice(SimulatedNode):
         if "return_delay_time" in memory:
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
         if "baud_rate" in memory:
-            memory["baud_rate"] = _baud_value(table, baud_rate)
+            memory["baud_rate"] = baud_value(registers, baud_rate)
         memory.watch(IDENTITY, self._identify)
 
     def _identify(self) -> None:
@@ -235,13 +235,6 @@ def _registers(table: DeviceTable) -> ControlTable:
         max_speed=0.0,
         stall_torque=0.0,
     )
-
-
-def _baud_value(table: DeviceTable, baud_rate: int) -> int:
-    for value, rate in table.baud_rates.items():
-        if rate == baud_rate:
-            return value
-    raise ValueError(f"a {table.model} has no baud rate of {baud_rate} bit/s")
 
 
 def make_device(

@@ -30,7 +30,7 @@ _LIMITS_OF_PROFILES = {"profile_velocity": "velocity_limit", "profile_accelerati
 """On P and PRO(A) these "cannot exceed" their limits (e-Manual, Profile Velocity (560)); of Y it is inferred
 [i], on X they may."""
 
-_GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
+GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
 _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
 _MULTI_TURN_GOAL = 28_672
@@ -151,7 +151,7 @@ def torque_rules(memory: Memory, item: ControlItem) -> Iterator[Rule]:
         yield ErrorNumber.DATA_RANGE, _between(-reach, reach)
     else:
         yield from device_rules(memory, item)
-    if name in _GOALS and watchdog_expired(memory):
+    if name in GOALS and watchdog_expired(memory):
         yield ErrorNumber.DATA_RANGE, _nothing
     bounded = table.items["torque_enable"].address == TORQUE_ENABLE_OF_P
     limits = _LIMITS_OF_GOALS | (_LIMITS_OF_PROFILES if bounded else {})

@@ -11,7 +11,7 @@ from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.joint_shaft import JointShaft
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.mode_shaft import ModeShaft
-from dxlrun.simulation.servo.node import baud_item
+from dxlrun.simulation.servo.node import baud_item, baud_value
 from dxlrun.simulation.servo.protocol1_servo import Protocol1Servo
 from dxlrun.simulation.servo.protocol2_servo import Protocol2Servo
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
@@ -47,7 +47,7 @@ def make_servo(
     )
     servo.write_time_ns = config.times.write_time_ns
     memory["id"] = config.servo_id
-    memory[baud_item(memory)] = _baud_value(table, baud_rate)
+    memory[baud_item(memory)] = baud_value(table, baud_rate)
     memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
     servo.power_up()
     shaft.response_delay_ns = config.times.response_delay_ns
@@ -59,13 +59,3 @@ def _table(config: ServoConfig, protocol: float) -> ControlTable:
     if config.firmware is None:
         return table
     return next(iter(models_by_number(table.model_number, protocol, config.firmware)), table)
-
-
-def _baud_value(table: ControlTable, baud_rate: int) -> int:
-    for value, rate in table.baud_rates.items():
-        if rate == baud_rate:
-            return value
-    value = round(2_000_000 / baud_rate) - 1  # e-Manual, Baud Rate (4): 2,000,000 / (value + 1)
-    if table.protocol != 1.0 or not 0 <= value <= 254:
-        raise ValueError(f"the servo has no baud rate near {baud_rate} bit/s")
-    return value

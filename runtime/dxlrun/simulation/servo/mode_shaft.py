@@ -10,15 +10,18 @@ from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import FREE, LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.servo.access import watchdog_expired
+from dxlrun.simulation.servo.access import OperatingMode, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.shaft import Shaft, Trajectory, critical_d
 
 REVERSE, TIME_BASED = 0x01, 0x04
 """Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
 
-CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_BASED, PWM = 0, 1, 3, 4, 5, 16
-"""Operating Mode (11)"""
+_OF_POSITION = (
+    OperatingMode.POSITION,
+    OperatingMode.EXTENDED_POSITION,
+    OperatingMode.CURRENT_BASED_POSITION,
+)
 
 _RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
 _ARRIVED, _ON_THE_WAY = 0x01, 0x02
@@ -101,8 +104,6 @@ class ModeShaft(Shaft):
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
         memory.watch(("drive_mode", "homing_offset"), self._orient)
-        self._goal_speed_ticks, self._ramp_ticks = 0, 0
-        memory.watch((self._speed_item, self._ramp_item), self._note_profile)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
@@ -162,7 +163,7 @@ class ModeShaft(Shaft):
 
     @property
     def _controls_position(self) -> bool:
-        return self.memory["operating_mode"] in {POSITION, EXTENDED, CURRENT_BASED}
+        return self.memory["operating_mode"] in _OF_POSITION
 
     @property
     def _noticed_speed(self) -> float:
@@ -175,18 +176,20 @@ class ModeShaft(Shaft):
             return LIMP
         duty = self._part("goal_pwm", "pwm_limit")
         limit = memory.get("pwm_limit", round(1 / self._pwm_unit)) * self._pwm_unit
-        if mode == PWM:
+        if mode == OperatingMode.PWM:
             return ServoCommand(bias=duty, limit=limit)
         limit = min(limit, abs(duty)) if "goal_pwm" in memory else limit
         torque = self._goal_torque()
-        if mode == CURRENT:
+        if mode == OperatingMode.CURRENT:
             return ServoCommand(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
-        if mode == VELOCITY:
+        if mode == OperatingMode.VELOCITY:
             return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
         if not self._controls_position:
             return LIMP  # a value that the model's manual does not name
         most = (
-            abs(torque) if mode == CURRENT_BASED and "goal_current" in memory else self._most_torque(torque)
+            abs(torque)
+            if mode == OperatingMode.CURRENT_BASED_POSITION and "goal_current" in memory
+            else self._most_torque(torque)
         )
         return _position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
 
@@ -203,7 +206,7 @@ class ModeShaft(Shaft):
     def _turn(self, limit: float) -> ServoCommand:
         memory = self.memory
         speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
-        ramp = self._ramp_ticks * self._acceleration_unit or FREE
+        ramp = self._profile(self._ramp_item) * self._acceleration_unit or FREE
         return _velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
 
     def _part(self, name: str, otherwise: str) -> float:
@@ -228,7 +231,7 @@ class ModeShaft(Shaft):
 
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
-        velocity, ramp = self._goal_speed_ticks, self._ramp_ticks
+        velocity, ramp = self._profile(self._speed_item), self._profile(self._ramp_item)
         aimed = (memory["goal_position"], velocity, ramp)
         if aimed == self._aimed and not afresh:
             return None
@@ -254,10 +257,6 @@ class ModeShaft(Shaft):
         acceleration = speed / ramp if ramp else FREE
         self._profile_kind = _kind(ramp, distance, speed, acceleration)
         return goal, speed, acceleration
-
-    def _note_profile(self) -> None:
-        self._goal_speed_ticks = self._profile(self._speed_item)
-        self._ramp_ticks = self._profile(self._ramp_item)
 
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0

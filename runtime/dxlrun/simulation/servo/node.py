@@ -12,6 +12,7 @@ from typing import ClassVar, TypeVar
 
 import msgspec
 
+from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.simulation.servo.access import Access, Rules
 from dxlrun.simulation.servo.memory import Memory, Run
 from dxlrun.simulation.wire import protocol1, protocol2
@@ -301,6 +302,17 @@ class SimulatedNode(ABC):
 
 
 Node = TypeVar("Node", bound=SimulatedNode)
+
+
+def baud_value(table: ControlTable, baud_rate: int) -> int:
+    """Return the value of that item for a rate, bit/s. Raises ValueError for one that the model lacks."""
+    for value, rate in table.baud_rates.items():
+        if rate == baud_rate:
+            return value
+    value = round(2_000_000 / baud_rate) - 1  # e-Manual, Baud Rate (4): 2,000,000 / (value + 1)
+    if table.protocol != 1.0 or not 0 <= value <= 254:
+        raise ValueError(f"{table.model}: no baud rate near {baud_rate} bit/s")
+    return value
 
 
 def baud_item(memory: Memory) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from enum import IntFlag, unique
 
 from dxlrun.dynamixel.control_table import ControlItem
-from dxlrun.simulation.servo.access import OperatingMode, torque_rules, watchdog_expired
+from dxlrun.simulation.servo.access import GOALS, OperatingMode, torque_rules, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory, Run
 from dxlrun.simulation.servo.shaft import Shaft
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
@@ -21,8 +21,6 @@ from dxlrun.simulation.wire.protocol2 import ALERT, ErrorNumber
 WATCHDOG_UNIT_NS = 20_000_000
 TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuration (60)
 TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal switches the torque on
-
-_GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
 
 
 @unique
@@ -333,7 +331,7 @@ class Protocol2Servo(SimulatedServo):
         if "protocol_type" in names and registers["protocol_type"] not in _SPEAKS:
             self.note(f"servo {self.servo_id} left Protocol 2.0: protocol type {registers['protocol_type']}")
         by_goal = registers.get("drive_mode") & TORQUE_ON_BY_GOAL
-        if by_goal and not _GOALS.isdisjoint(names) and "torque_enable" not in names and not self._shut_down:
+        if by_goal and not GOALS.isdisjoint(names) and "torque_enable" not in names and not self._shut_down:
             registers["torque_enable"] = 1
         if self._has_error_code:
             self._show_controller_state()
