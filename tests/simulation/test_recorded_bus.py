@@ -25,7 +25,7 @@ from dxlrun.run.simulation_front import Served
 from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.messages import SimulationMessage
+from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 from exchange.simulated import SimulatedServos
 
 ROBOT = """\
@@ -251,8 +251,8 @@ def heard(log: Log) -> dict[bytes, list[bytes]]:
 def test_the_command_serves_the_buses_of_the_log(run, monkeypatch, capsys):
     served: list[SimulationConfig] = []
 
-    def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
-        served.append(config)
+    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+        served.append(job.config)
         return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim_command, "_serve", serve)

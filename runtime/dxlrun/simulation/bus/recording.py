@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
@@ -35,11 +34,11 @@ class Recording:
         for piece in open_log(path).slices():
             if bus not in piece.buses:
                 raise LogError(f"{path}: the log has no bus {bus}")
-            packets = piece.packets
-            pieces.append(_owned(packets.take(packets.bus == piece.buses.index(bus))))
-        first_ns, last_ns, asked, length = (np.concatenate([one[row] for one in pieces]) for row in range(4))
-        data = b"".join(one[4] for one in pieces)
-        start = np.cumsum(length) - length
+            pieces.append(piece.packets.take(piece.packets.bus == piece.buses.index(bus)).compact())
+        packets = PacketColumns.joined(pieces)
+        packets = packets.take(np.argsort(packets.first_ns, kind="stable")).compact()
+        first_ns, last_ns, start, length = packets.first_ns, packets.last_ns, packets.start, packets.length
+        data, asked = packets.data.tobytes(), packets.kind == PacketKind.INSTRUCTION
         rows = np.flatnonzero(asked)
         if not len(rows):
             raise LogError(f"{path}: no instruction was sent on bus {bus}, so there is nothing to answer")
@@ -86,17 +85,3 @@ class Recording:
                 strict=True,
             )
         )
-
-
-_Piece = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64], bytes]
-
-
-def _owned(packets: PacketColumns) -> _Piece:
-    """Return first and last time, whether it is an instruction, length and bytes, in order of time."""
-    order = np.argsort(packets.first_ns, kind="stable")
-    packets = packets.take(order)
-    data = packets.data.tobytes()
-    ends = zip(packets.start.tolist(), packets.length.tolist(), strict=True)
-    joined = b"".join(data[start : start + length] for start, length in ends)
-    asked = packets.kind == PacketKind.INSTRUCTION
-    return packets.first_ns, packets.last_ns, asked, packets.length.astype(np.int64), joined
