@@ -27,7 +27,7 @@ from dxlrun.log.reader import Log
 from dxlrun_analysis.causes.account import Account, CauseName
 from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineLoad, MachineSample
 from dxlrun_analysis.causes.timeline import timeline
-from dxlrun_analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
+from dxlrun_analysis.cycles.latency import ROUGH_NS, begins, first_deadline_ns
 from dxlrun_analysis.cycles.worst import Cause, CauseShare, WorstCycle
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Pairing
@@ -36,8 +36,6 @@ KEPT = 200
 """So many of the worst cycles are split ..."""
 WORST = 10
 """... and so many of them shown with their packets."""
-AT_ONCE = 4096
-"""Cycles that are looked at together, at least: slices of a log may be small."""
 _MACHINE = (CauseName("late wake-up"), CauseName("own work"))
 """What may be the machine's, in the order in which that has it."""
 _TIMES = ("scheduled", "woken", "read", "updated", "written")
@@ -81,11 +79,12 @@ class CycleCauses:
     def __init__(self) -> None:
         self._late = self._long = 0
         self._sequential = False
-        self._cycles: list[Cycles] = []
-        """Whose packets may not be complete yet."""
+        self._newest: Cycles | None = None
+        """The next one declares what was skipped behind it."""
         self._before: Cycles | None = None
-        """The cycle before them."""
+        """The cycle before that."""
         self._packets: list[PacketColumns] = []
+        """Those since its read."""
         self._buses: tuple[LoggedBus, ...] = ()
         self._controllers: tuple[str, ...] = ()
         self._machine = MachineHistory()
@@ -96,22 +95,22 @@ class CycleCauses:
     def take(self, log: Log) -> None:
         """Take the next slice. Raises LogError when a packet in it cannot be read."""
         plan = plan_of(log)
-        if not self._cycles:
+        if self._newest is None:
             self._buses = tuple(plan.by_name.get(name, LoggedBus(name)) for name in log.buses)
             self._controllers = tuple(controller.name for controller in log.controllers)
             self._sequential = plan.loop.schedule == "sequential"
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
-        self._cycles.append(cycles_of(log))
         if len(log.packets):
             self._packets.append(log.packets)
         self._samples += self._machine.new(log, self._begin_ns)
-        if sum(map(len, self._cycles)) >= AT_ONCE:
-            self._advance(final=False)
+        cycles = cycles_of(log)
+        self._advance(cycles if self._newest is None else np.concatenate([self._newest, cycles]))
 
     def finish(self) -> Causes:
         """Return the causes of the whole run."""
-        self._advance(final=True)
+        if self._newest is not None:
+            self._advance(self._newest, final=True)
         pairing = Pairing(self._buses)
         accounts = [
             Account(one.cycle, one.before, one.packets, pairing, self._controllers) for one in self._kept
@@ -134,15 +133,13 @@ class CycleCauses:
             self._machine.load,
         )
 
-    def _advance(self, *, final: bool) -> None:
-        """Look at the waiting cycles that have all their packets, and forget them and their packets."""
-        if not self._cycles:
-            return
-        waiting = np.concatenate(self._cycles)
-        count = len(waiting) if final else self._certain(waiting)
+    def _advance(self, cycles: Cycles, *, final: bool = False) -> None:
+        """Look at the cycles that have one behind them: a slice of a log has all their packets."""
+        count = len(cycles) if final else max(len(cycles) - 1, 0)
+        self._newest = cycles[count:].copy()
         if not count:
             return
-        ready, behind = waiting[:count].copy(), waiting[1 : count + 1]
+        ready, behind = cycles[:count].copy(), cycles[1 : count + 1]
         # what was skipped behind a cycle is declared by the next one
         followed = len(behind)
         ready["skipped"] = np.append(behind["skipped"], [0] * (count - followed))
@@ -150,22 +147,12 @@ class CycleCauses:
         between = behind["scheduled"] - counted_from
         between //= np.maximum(behind["cycle"] - ready["cycle"][:followed], 1)
         ready["period"][:followed] = np.where(between > 0, between, ready["period"][:followed])
-        self._cycles = [waiting[count:]]
         rows = ready if self._before is None else np.concatenate([self._before, ready])
         self._look(rows, new=len(rows) - count)
         self._before = rows[-1:].copy()
         from_ns = int(rows["read"][-1])
         kept = [part.take(part.last_ns >= from_ns) for part in self._packets]
         self._packets = [part.compact() for part in kept if len(part)]
-
-    def _certain(self, rows: Cycles) -> int:
-        """Return how many of the waiting cycles have all their packets, and a cycle behind them."""
-        if len(rows) < 2:
-            return 0
-        written = rows["written"]
-        newest_ns = int(self._packets[-1].last_ns.max()) if self._packets else 0
-        over = int(np.searchsorted(written, written[-1] - DISORDER_NS))
-        return min(len(rows) - 1, max(int(np.searchsorted(written, newest_ns)), over))
 
     def _look(self, rows: Cycles, new: int) -> None:
         """Count late and long cycles from row `new` on, and keep the worst."""

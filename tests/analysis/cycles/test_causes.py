@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.kit.made_logs import Cycle, Wire
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
-from dxlrun_analysis.causes import causes
 from dxlrun_analysis.causes.causes import Causes, CycleCauses
 from dxlrun_analysis.counts import has_them_alone
 
@@ -123,19 +124,12 @@ def causes_of(log: Log, pieces: int = 1) -> Causes:
 
 
 def sliced(log: Log, pieces: int) -> Iterator[Log]:
-    """Yield a log in pieces, the packets as far behind their cycles as rings may bring them."""
-    if pieces == 1:
-        yield log
-        return
-    size, packets = -(-len(log.cycles) // pieces), log.packets
-    share = -(-len(packets) // pieces)
-    for index in range(pieces + 1):
-        part = replace(
-            log,
-            cycles=log.cycles[index * size : (index + 1) * size],
-            packets=packets[max(0, (index - 1) * share) : max(0, index * share)],
-        )
-        yield part
+    """Yield a log in pieces, each with the packets up to the first cycle of the next."""
+    parts = np.array_split(np.arange(len(log.cycles)), pieces)
+    begins = [0, *(int(log.cycles["woken_ns"][part[0]]) for part in parts[1:]), 1 << 62]
+    for part, (begin, end) in zip(parts, itertools.pairwise(begins), strict=True):
+        mine = (log.packets.first_ns >= begin) & (log.packets.first_ns < end)
+        yield replace(log, cycles=log.cycles[part], packets=log.packets.take(mine))
 
 
 def shares(found: Causes) -> dict[tuple[str, str], float]:
@@ -172,10 +166,7 @@ LONG: dict[str, tuple[dict[str, Any], tuple[str, str], float]] = {
 
 @pytest.mark.parametrize("pieces", [1, 4])
 @pytest.mark.parametrize("what", list(LONG))
-def test_a_long_cycle_names_its_cause(
-    run: Run, what: str, pieces: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(causes, "AT_ONCE", 1)
+def test_a_long_cycle_names_its_cause(run: Run, what: str, pieces: int) -> None:
     changed, cause, us = LONG[what]
     found = causes_of(run.log(**changed), pieces)
     assert found.long == 1
