@@ -5,24 +5,31 @@ loop as a run assembles it, with the exchange kernel and the rings of a log; the
 and not part of it. A cycle begins when the one before is in the ring. The most frequent cycle is printed;
 functions of numpy and of the standard library are not counted.
 
-    python tests/bench/cycle_trace.py [ROBOT.yaml]
+With --command the torso (robots/bioloid_torso.yaml) gets positions and speeds of its head through the mailbox
+in every fifth cycle, and the most frequent one that takes them is printed.
+
+    python tests/bench/cycle_trace.py [ROBOT.yaml | --command]
 """
 
 from __future__ import annotations
 
 import os
+import struct
 import sys
 import tempfile
 import tty
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
 
 import dxlrun
 import dxlrun_controllers
-from dxlrun.channels.commands import NoCommands
+from dxlrun.channels import mailbox
+from dxlrun.channels.commands import Command, CommandRing, Inbox, NoInbox
+from dxlrun.channels.events import EventRing
+from dxlrun.channels.mailbox import Mailbox, MailboxWriter
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RingWriter, create
 from dxlrun.clock import MonotonicClock
@@ -35,7 +42,11 @@ from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.testing import plan_of
 from exchange.simulated import SimulatedServos
 
-ROBOT = Path(__file__).parents[2] / "robots" / "open_manipulator_x.yaml"
+ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOT = ROBOTS / "open_manipulator_x.yaml"
+COMMANDED = ROBOTS / "bioloid_torso.yaml"
+COMMAND_CYCLES = 5
+"""After so many cycles another command is sent."""
 ROOTS = tuple(str(Path(module.__file__ or "").parent) for module in (dxlrun, dxlrun_controllers))
 WARM_UP = 30
 """Cycles before the trace begins."""
@@ -44,19 +55,13 @@ SECONDS = 1.5
 Calls = Counter[CodeType]
 
 
-class Events:
-    """Takes events and forgets them."""
-
-    def emit(self, *event: object) -> None:
-        """Forget it."""
-
-
 class Trace:
     """Counts the functions of each cycle."""
 
-    def __init__(self) -> None:
+    def __init__(self, box: MailboxWriter | None = None) -> None:
         self.cycles: list[Calls] = []
         self._calls: Calls = Counter()
+        self._box = box
 
     def next(self, count: int, skipped: int) -> None:
         """End the trace of a cycle that is in the rings, and begin the next."""
@@ -64,6 +69,9 @@ class Trace:
         if count > WARM_UP:
             self.cycles.append(self._calls)
             self._calls = Counter()
+            if self._box is not None and count % COMMAND_CYCLES == 0:
+                data = struct.pack("<4d", 0.3 + count * 1e-3, -0.5, 1.0, 1.0)
+                self._box.post(Command(count, "head", "posvel", data, "bench"))
             sys.setprofile(self._note)
 
     def _note(self, frame: FrameType, event: str, _: object) -> None:
@@ -90,11 +98,31 @@ def simulated(plan: Plan) -> Iterator[list[SerialPort]]:
 
 def steady_cycle(robot: Path = ROBOT) -> Calls:
     """Return the functions of the most frequent cycle and how often it calls each."""
-    plan = plan_of(robot, duration_s=SECONDS)
-    trace = Trace()
-    rings = [create(name, 1 << 22, LONGEST_BATCH) for name in ("cycles", "packets")]
-    cycles, packets = map(RingWriter, rings)
-    sinks = Sinks(cycles, PacketBatch(packets), Events(), NoCommands(), trace.next)
+    return _most_frequent(_cycles(robot, Trace(), NoInbox()))
+
+
+def command_cycle() -> Calls:
+    """Return those of the most frequent cycle that takes a command."""
+    box, answers = mailbox.create(8), create("answers", 1 << 18, mailbox.LONGEST_ANSWER)
+    cycles = _cycles(COMMANDED, Trace(MailboxWriter(box)), Mailbox(box, RingWriter(answers)))
+    os.close(box)
+    os.close(answers)
+    return _most_frequent(
+        [calls for calls in cycles if any(code.co_qualname == "Steering.take" for code in calls)]
+    )
+
+
+def _most_frequent(cycles: Sequence[Calls]) -> Calls:
+    kinds = Counter(frozenset(calls.items()) for calls in cycles)
+    return Counter(dict(kinds.most_common(1)[0][0]))
+
+
+def _cycles(robot: Path, trace: Trace, inbox: Inbox) -> list[Calls]:
+    plan = plan_of(robot, duration_s=SECONDS if robot == ROBOT else 5 * SECONDS)
+    rings = [create(name, 1 << 22, LONGEST_BATCH) for name in ("cycles", "packets", "events")]
+    cycles, packets, happened = map(RingWriter, rings)
+    events = EventRing(happened, MonotonicClock())
+    sinks = Sinks(cycles, PacketBatch(packets), events, CommandRing(happened), trace.next)
     with simulated(plan) as ports:
         assembled = assemble(
             plan,
@@ -104,6 +132,7 @@ def steady_cycle(robot: Path = ROBOT) -> Calls:
             sinks=sinks,
             beat=int,
             stop=StopFlag(),
+            inbox=inbox,
         )
         assembled.hardware.start()
         try:
@@ -113,8 +142,7 @@ def steady_cycle(robot: Path = ROBOT) -> Calls:
             assembled.hardware.stop()
     for ring in rings:
         os.close(ring)
-    kinds = Counter(frozenset(calls.items()) for calls in trace.cycles)
-    return Counter(dict(kinds.most_common(1)[0][0]))
+    return trace.cycles
 
 
 def by_file(calls: Calls) -> dict[str, list[str]]:
@@ -129,7 +157,8 @@ def by_file(calls: Calls) -> dict[str, list[str]]:
 
 def main() -> None:
     """Print the functions by file."""
-    calls = steady_cycle(*map(Path, sys.argv[1:2]))
+    words = sys.argv[1:2]
+    calls = command_cycle() if words == ["--command"] else steady_cycle(*map(Path, words))
     files = by_file(calls)
     for name, functions in files.items():
         sys.stdout.write(f"{len(functions):3}  {name}: {', '.join(sorted(functions))}\n")

@@ -8,7 +8,7 @@ from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update
 
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import Conflict, conflicts
-from dxlrun.control.controllers.managed import Event, State
+from dxlrun.control.controllers.managed import TRANSITIONS, Event, State
 from dxlrun.errors import ControllerFault, PlugInError
 
 NAN = np.nan
@@ -245,10 +245,32 @@ def test_joints_of_a_faulty_controller_stop_where_the_gate_last_let_them():
     assert np.isnan(last(robot, "position")).all()
 
 
-def test_an_event_that_a_state_does_not_have_is_a_mistake_and_changes_nothing(robot):
-    robot.script("asleep", active=False).build()
-    managed = robot.manager._named["asleep"]
-    for event in (Event.COMMAND, Event.EXPIRE, Event.LEAVE):
-        with pytest.raises(KeyError):
+@pytest.mark.parametrize("state", State)
+def test_every_event_leads_from_every_state_to_another_or_is_a_fault(robot, state):
+    robot.script("one").build()
+    managed = robot.manager._named["one"]
+    for event in Event:
+        managed.state, after = state, TRANSITIONS[state].get(event)
+        if after is not None:
             managed.on(event)
-    assert (managed.state, robot.record.active) == (State.INACTIVE, 0)
+            assert managed.state is after
+            assert robot.record.active == (after in (State.ACTIVE, State.HELD))
+            continue
+        assert event in (Event.ENTER, Event.COMMAND), "what is called without a fallback fits every state"
+        with pytest.raises(ControllerFault, match=f"one is {state.value}, where {event.value} cannot happen"):
+            managed.on(event)
+        assert managed.state is state
+
+
+def test_a_command_for_a_controller_that_is_not_active_ends_no_loop_but_is_its_fault(robot):
+    """No way leads there; a mistake of this program is reported, and the run goes on."""
+    robot.script("one").script("asleep", active=False).build()
+    manager, asleep = robot.manager, robot.manager._named["asleep"]
+    assert (
+        robot.run(3, {1: lambda: manager._attempt(asleep, 0, asleep.command, "go", np.zeros(1), 0)}).cycles
+        == 3
+    )
+    fault = ("asleep", "controller asleep is inactive, where a command cannot happen")
+    assert robot.events.of(EventCode.CONTROLLER_FAULT) == [fault]
+    assert robot.active(2) == ["one"]
+    assert robot.result.reason == "stopped"

@@ -177,9 +177,8 @@ def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
     return record
 
 
-def decode_command(payload: Payload) -> Command:
-    """Return the command of a record; raises ValueError when it is none."""
-    return msgspec.msgpack.decode(payload, type=Command)
+decode_command = msgspec.msgpack.Decoder(Command).decode
+"""Return the command of a record; raises ValueError when it is none."""
 
 
 def decode_taken_command(payload: Payload) -> TakenCommand:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
-import numpy as np
 
 from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
@@ -148,9 +147,26 @@ class Steering:
         if self.halt.waiting:
             self.halt.watch()
         for place, command in enumerate(commands, 1):
-            self._log(command)
-            for_loop = command.controller == LOOP
-            answer = self._for_loop(command, time_ns) if for_loop else self._hand(command, time_ns)
+            self.taken.take(
+                TakenCommand(
+                    t_ns=record.woken_ns,
+                    cycle=record.cycle,
+                    planned=-1,
+                    controller=command.controller,
+                    kind=command.kind,
+                    origin=command.origin,
+                    data=command.data,
+                    lease_ns=command.lease_ns,
+                    request=command.request,
+                )
+            )
+            answer: Answer | None
+            if for_loop := command.controller == LOOP:
+                answer = self._for_loop(command, time_ns)
+            else:
+                found = manager.hand(command, time_ns)
+                goals = (found,) if isinstance(found, int) and found else ()
+                answer = found if isinstance(found, Refusal) else Done(record.cycle, goals=goals)
             self._report(command, answer, place)
             if for_loop and self.paused:
                 self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
@@ -164,7 +180,7 @@ class Steering:
                 commanding = manager.switching.commanding(record.layout.joints)
                 manager.switching.switch((), commanding, time_ns)
             self._log_stale("loop", f"no client ended the pause; {ends or what}")
-        for name in manager.stale(record.woken_ns):
+        for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 manager.hold(name)
             self._log_stale(name, f"the stream of commands ended; {ends or 'its joints are held'}")
@@ -250,18 +266,6 @@ class Steering:
 
     # Commands
 
-    def _hand(self, command: Command, time_ns: int) -> Answer:
-        if len(command.data) % 8:
-            problem = f"{len(command.data)} bytes are no array of numbers"
-            return Refusal(Code.INVALID, {"problem": problem})
-        data = np.frombuffer(command.data, dtype="<f8")
-        until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
-        name, kind, origin = command.controller, command.kind, command.origin
-        found = self.manager.hand(name, kind, data, origin, time_ns, until_ns)
-        if isinstance(found, Refusal):
-            return found
-        return Done(self.record.cycle, goals=(found,) if found else ())
-
     def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
         """Execute a command for the loop itself; None: it is answered later."""
         kind, data, numbers = command.kind, command.data, b""
@@ -337,19 +341,3 @@ class Steering:
 
     def _log_stale(self, source: str, text: str) -> None:
         self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, source, text)
-
-    def _log(self, command: Command) -> None:
-        record = self.record
-        self.taken.take(
-            TakenCommand(
-                t_ns=record.woken_ns,
-                cycle=record.cycle,
-                planned=-1,
-                controller=command.controller,
-                kind=command.kind,
-                origin=command.origin,
-                data=command.data,
-                lease_ns=command.lease_ns,
-                request=command.request,
-            )
-        )

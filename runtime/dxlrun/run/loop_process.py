@@ -21,7 +21,7 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process, slot
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
+from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import Mailbox
@@ -169,7 +169,9 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     )
     heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)  # what is taken over may have torque
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
-    _prepare(plan, job, heartbeat, sinks, ports, pacing)
+    _prepare(plan, job, heartbeat, sinks.events, pacing)
+    if ports.polling:
+        ports.polling.margin_ns = pacing.measured_ns
     try:
         result = robot.run(heartbeat.enter)
     except AskedToStop as asked:
@@ -188,16 +190,12 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     )
 
 
-def _prepare(  # noqa: PLR0917  what a loop's process has
-    plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, ports: SerialPorts, pacing: Pacing
-) -> None:
+def _prepare(plan: Plan, job: LoopJob, heartbeat: Heartbeat, events: EventSink, pacing: Pacing) -> None:
     """Ask the operating system for real time, measure how late sleeps wake, and report both."""
     grants = realtime.apply(beside_simulation(plan))
     heartbeat.beat()
     grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
-    if ports.polling:
-        ports.polling.margin_ns = pacing.measured_ns
-    realtime.log_grants(grants, "loop", sinks.events)
+    realtime.log_grants(grants, "loop", events)
     os.pwrite(job.memory.grants, msgspec.json.encode(grants), 0)
     heartbeat.beat()
 

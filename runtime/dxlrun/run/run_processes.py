@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 from msgspec.json import Decoder
@@ -132,9 +132,8 @@ def start_sensor(
     bodies = sensed_bodies(plan) if sensor.links else None
     job = SensorJob(sensor, memory.sensors[index], os.getpid(), restarted, bodies, memory.shafts)
     inherited = [job.slot, *([job.shafts] if bodies is not None else [])]
-    return _executed(
-        f"sensor {sensor.name}", "dxlrun.run.sensor_process", job, inherited, memory, Decoder(SensorMessage)
-    )
+    program = Program(f"sensor {sensor.name}", "dxlrun.run.sensor_process")
+    return _executed(program, job, inherited, memory, Decoder(SensorMessage))
 
 
 def start_recorder(
@@ -143,7 +142,11 @@ def start_recorder(
     """Start the recorder and wait until the log is open."""
     job = RecorderJob(str(log), header, memory.recorded, recording)
     child: Child[RecorderMessage] = _executed(
-        "recorder", "dxlrun.log.recorder", job, memory.recorded.values(), memory, Decoder(RecorderMessage)
+        Program("recorder", "dxlrun.log.recorder"),
+        job,
+        memory.recorded.values(),
+        memory,
+        Decoder(RecorderMessage),
     )
     try:
         child.ready()
@@ -168,9 +171,8 @@ def start_gateway(log: Path | None, memory: RunMemory, epoch_offset_ns: int = 0)
         memory.messages,
     )
     job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None, epoch_offset_ns)
-    return _executed(
-        "gateway", "dxlrun.remote", job, [memory.plan, *astuple(shared)], memory, Decoder(GatewayMessage)
-    )
+    inherited = [memory.plan, *astuple(shared)]
+    return _executed(Program("gateway", "dxlrun.remote"), job, inherited, memory, Decoder(GatewayMessage))
 
 
 def guardian_job(
@@ -200,18 +202,27 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     """
     memory = job.memory
     inherited = [memory.guardian, memory.stderr, *memory.of_loop, *others]
-    return _executed("guardian", "dxlrun.run.guardian", job, inherited, memory, Decoder(GuardianMessage))
+    program = Program("guardian", "dxlrun.run.guardian")
+    return _executed(program, job, inherited, memory, Decoder(GuardianMessage))
 
 
-def _executed(  # noqa: PLR0917  how it is called, what is executed, and on what
-    name: str,
-    module: str,
+class Program(NamedTuple):
+    """What is executed as a process of a run."""
+
+    name: str
+    """As sentences have it."""
+    module: str
+
+
+def _executed(
+    program: Program,
     job: object,
     inherited: Iterable[int],
     memory: RunMemory,
     messages: Decoder[Message],
 ) -> Child[Message]:
-    """Execute a module on a job, which it reads from a descriptor."""
+    """Execute a program on a job, which it reads from a descriptor."""
+    name, module = program
     descriptor = process.memory_file(f"dxlrun-{name}", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
     try:

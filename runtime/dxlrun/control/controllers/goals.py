@@ -92,13 +92,14 @@ class PlayedMotion(msgspec.Struct):
 
 
 class Result(NamedTuple):
-    """What `Goal.end` was given with `reached`, and until when that may become certain."""
+    """What `Goal.end` was given, and until when `reached` may become certain."""
 
     text: str
     joint: str
     error: float
-    joints: tuple[str, ...]
-    certain_by_ns: int
+    joints: Sequence[str] | None
+    """By which the goal is judged; None: those that its controller commands."""
+    certain_by_ns: int = 0
 
 
 class RunningGoal:
@@ -143,7 +144,7 @@ class RunningGoal:
         Reached and missed are judged by the joints' states, see `controller.Goal.end`.
         """
         if self.outcome is None:
-            self._goals.judge(self, Outcome(outcome), text, joint, float(error), joints)
+            self._goals.judge(self, Outcome(outcome), Result(text, joint, float(error), joints))
 
 
 class Goals:
@@ -199,19 +200,12 @@ class Goals:
             return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
         return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
 
-    def judge(  # noqa: PLR0917  as `Goal.end`
-        self,
-        goal: RunningGoal,
-        outcome: Outcome,
-        text: str,
-        joint: str,
-        error: float,
-        joints: Sequence[str] | None,
-    ) -> None:
+    def judge(self, goal: RunningGoal, outcome: Outcome, result: Result) -> None:
         """End a goal, but let `reached` wait until its joints are certain.
 
         One that is reached or missed is aborted instead when a joint goes nowhere, and that joint named.
         """
+        text, joint, error, joints, _ = result
         names = self._commanded(goal.controller) if joints is None else joints
         if outcome in _JUDGED and names:
             states, rows = self._record.states, [self._rows[name] for name in names]
@@ -244,8 +238,7 @@ class Goals:
         """Judge again the goals whose results wait for their joints' replies and torque."""
         for goal in tuple(self.running.values()):
             if goal.result is not None:
-                text, joint, error, joints, _ = goal.result
-                self.judge(goal, Outcome.REACHED, text, joint, error, joints)
+                self.judge(goal, Outcome.REACHED, goal.result)
 
     def _report(
         self, goal: RunningGoal, code: EventCode, severity: Severity, status: str, sentence: str

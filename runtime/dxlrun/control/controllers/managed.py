@@ -60,9 +60,9 @@ class State(Enum):
 class Event(Enum):
     """What happens to a controller."""
 
-    AWAIT = "await"  # It is to be active; joints must change their modes first
-    ENTER = "enter"  # It took its joints over
-    COMMAND = "command"  # It was given a command, or one above it commands it now
+    AWAIT = "a wait for modes"  # It is to be active; joints must change their modes first
+    ENTER = "an entry"  # It took its joints over
+    COMMAND = "a command"  # It was given a command, or one above it commands it now
     EXPIRE = "expire"  # Its stream of commands ran out
     LEAVE = "leave"  # It is deactivated, or need not wait any more
     FAULT = "fault"  # It broke its contract
@@ -75,14 +75,21 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
         State.INACTIVE: {
             Event.AWAIT: State.ENTERING,
             Event.ENTER: State.ACTIVE,
-            Event.FAULT: State.INACTIVE,
+            Event.EXPIRE: State.INACTIVE,
+            **_OUT,
         },
-        State.ENTERING: {Event.ENTER: State.ACTIVE, **_OUT},
-        State.ACTIVE: _TAKES_PART,
-        State.HELD: _TAKES_PART,
+        State.ENTERING: {
+            Event.AWAIT: State.ENTERING,
+            Event.ENTER: State.ACTIVE,
+            Event.EXPIRE: State.ENTERING,
+            **_OUT,
+        },
+        State.ACTIVE: {Event.AWAIT: State.ACTIVE, **_TAKES_PART},
+        State.HELD: {Event.AWAIT: State.HELD, **_TAKES_PART},
     }
 )
-"""Every legal transition; another event in a state is a mistake of this program."""
+"""Every legal transition. Another one is a mistake of this program, which ends the controller: only what is
+called where a ControllerFault ends it, `activate` and commands, has events that a state lacks."""
 
 
 def rate_fits(rate: float | None, period_ns: int) -> bool:
@@ -140,6 +147,8 @@ class Managed:
         """True while one of the joints that it claims is lost."""
         self.runs = False
         """True when it is updated in the cycles in which it is due."""
+        self.uppers: tuple[Managed, ...] = ()
+        """Those that command its references while they are active."""
         self.due_cycle = 0
         """The first cycle in which it is updated again; a skipped one is made up for next."""
         self.until_ns = 0
@@ -221,9 +230,12 @@ class Managed:
         plugins.after_each(f"of controller {name}")
 
     def on(self, event: Event) -> None:
-        """Change the state by an event; raises KeyError for one that the state does not have."""
-        before = self.active
-        self.state = TRANSITIONS[self.state][event]
+        """Change the state by an event. Raises ControllerFault for one that the state does not have."""
+        before, after = self.active, TRANSITIONS[self.state].get(event)
+        if after is None:
+            text = f"is {self.state.value}, where {event.value} cannot happen"
+            raise ControllerFault(f"controller {self.plan.name} {text}")
+        self.state = after
         self.failed |= event is Event.FAULT
         if before and self.state is not State.ACTIVE:  # else the arrays that it claims may be another's
             self._outputs.withdraw()
@@ -265,11 +277,10 @@ class Managed:
 
     # In a cycle
 
-    def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
-        """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
-        ControllerFault."""
+    def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Hand over a prepared command, which never runs out. Raises ControllerFault."""
         self.on(Event.COMMAND)
-        self.until_ns = until_ns
+        self.until_ns = 0
         self._inputs.gather()
         self._call(ControllerMethod.ON_COMMAND, kind, self.controller.on_command, kind, data, time_ns)
 

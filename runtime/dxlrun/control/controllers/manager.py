@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
-from dxlrun.channels.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.channels.commands import Command, CommandSink, NoCommands, TakenCommand
 from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.kept import KeptStates
@@ -149,37 +149,42 @@ class Manager:
 
     # Commands
 
-    def hand(  # noqa: PLR0917  a command's parts, as they come
-        self,
-        controller: str,
-        kind: str,
-        data: NDArray[np.float64],
-        origin: str,
-        time_ns: int,
-        until_ns: int = 0,
-    ) -> int | Refusal:
-        """Hand a prepared command to a controller; return the number of the goal that it is, else 0.
+    def hand(self, command: Command, time_ns: int) -> int | Refusal:
+        """Hand a prepared command to its controller; return the number of the goal that it is, else 0.
 
-        `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
-        Of a stream, only the first one has an event.
+        With a lease it runs out unless another one follows (see `stale`). Of a stream, only the first one has
+        an event.
         """
-        managed = self._commandable(controller)
+        if len(command.data) % 8:
+            problem = f"{len(command.data)} bytes are no array of numbers"
+            return Refusal(Code.INVALID, {"problem": problem})
+        managed = self._commandable(command.controller)
         if isinstance(managed, Refusal):
             return managed
+        kind, data = command.kind, np.frombuffer(command.data, dtype="<f8")
         if kind in managed.controller.Goals:
-            if until_ns:
-                return Refusal(Code.GOAL_STREAMED, {"controller": controller, "kind": kind})
-            return self._begin_goal(managed, kind, data, origin, time_ns)
-        if (motion := self._motions.get(controller)) is not None:
+            if command.lease_ns:
+                return Refusal(Code.GOAL_STREAMED, {"controller": managed.plan.name, "kind": kind})
+            return self._begin_goal(managed, kind, data, command.origin, time_ns)
+        if (motion := self._motions.get(managed.plan.name)) is not None:
             motion.goal.end(Outcome.PREEMPTED, "another command took its place")
-        streaming = until_ns and managed.until_ns
-        if refusal := self._attempt(managed, time_ns, managed.command, kind, data, time_ns, until_ns):
-            return refusal
-        if until_ns:
+        streaming = command.lease_ns and managed.until_ns
+        try:
+            managed.command(kind, data, time_ns)
+        except ControllerFault as fault:
+            return self._end(managed, fault, time_ns)
+        if command.lease_ns:
+            managed.until_ns = self._record.woken_ns + command.lease_ns
             self.streams[managed.place] = managed
         if not streaming:
-            self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
+            self._events.emit(
+                EventCode.COMMAND, Severity.INFO, managed.plan.name, f"{kind} from {command.origin}"
+            )
         return 0
+
+    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> Refusal:
+        self.switching.end(managed, fault, time_ns)
+        return fault_of(managed, str(fault))
 
     def _attempt(
         self,
@@ -193,23 +198,24 @@ class Manager:
         try:
             call(*arguments, **named)
         except ControllerFault as fault:
-            self.switching.end(managed, fault, time_ns)
-            return fault_of(managed, str(fault))
+            return self._end(managed, fault, time_ns)
         return None
 
     def _known(self, controller: str) -> Managed | Refusal:
-        unknown = Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
-        return self._named.get(controller, unknown)
+        managed = self._named.get(controller)
+        return managed or Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
 
     def _commandable(self, controller: str) -> Managed | Refusal:
-        managed = self._known(controller)
-        if isinstance(managed, Refusal):
-            return managed
+        managed = self._named.get(controller)
+        if managed is None:
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
         if not managed.active:
             code = Code.NOT_ACTIVE_YET if managed.state is State.ENTERING else Code.NOT_ACTIVE
             return Refusal(code, {"controller": controller})
-        if upper := commander(controller, [one.plan for one in self._named.values() if one.active]):
-            return _commanded_by(controller, upper, f"command {upper}, or deactivate it")
+        for upper in managed.uppers:
+            if upper.active:
+                hint = f"command {upper.plan.name}, or deactivate it"
+                return _commanded_by(controller, upper.plan.name, hint)
         return managed
 
     def _hand_over(self, time_ns: int) -> None:
@@ -220,8 +226,7 @@ class Manager:
             name, kind, origin = command.controller, command.kind, command.origin
             self._taken.take(TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b""))
             self._next += 1
-            data = np.frombuffer(command.data, dtype="<f8")
-            answer = self.hand(name, kind, data, origin, time_ns)
+            answer = self.hand(Command(place, name, kind, command.data, origin), time_ns)
             if isinstance(answer, Refusal):
                 text = f"{kind} from {origin} refused: {answer.text}"
                 self.switching.report_refusal(name, text, CommandOutcome(kind, origin, answer))
@@ -253,8 +258,7 @@ class Manager:
 
     def hold(self, controller: str) -> None:
         """Withdraw what a controller commands until it gets another command; it stays active."""
-        managed = self._named.get(controller)
-        if managed is not None and managed.active:
+        if (managed := self._named.get(controller)) is not None:
             managed.hold()
 
     def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
@@ -373,7 +377,7 @@ class Manager:
     def load(self, plan: ControllerPlan) -> int | Refusal:
         """Configure one more controller, inactive; return its place. Only while the loop is paused."""
         place = self._free_place()
-        if refusal := self._refuse_load(plan, place):
+        if refusal := next(self._refusals(plan, place), None):
             return refusal
         plan = replace(plan, active=False, every=rate_divider(plan.rate, self._period_ns))
         begin_ns = self._clock.now_ns()
@@ -388,32 +392,31 @@ class Manager:
         self._log_loaded(managed, "loaded", begin_ns)
         return place
 
-    def _refuse_load(  # noqa: PLR0911  one return a reason
-        self, plan: ControllerPlan, place: int
-    ) -> Refusal | None:
+    def _refusals(self, plan: ControllerPlan, place: int) -> Iterator[Refusal]:
+        """Yield why a controller cannot be loaded into a place; the first reason counts."""
         known, layout = self.switching.standing.known, self._record.layout
         if plan.name in known:
-            return Refusal(Code.NAME_TAKEN, {"controller": plan.name})
+            yield Refusal(Code.NAME_TAKEN, {"controller": plan.name})
         if not rate_fits(plan.rate, self._period_ns):
-            return _refuse_rates({plan.name: plan}, self._period_ns)
+            yield from _refused_rates({plan.name: plan}, self._period_ns)
         if place >= MOST_CONTROLLERS:
-            return Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
+            yield Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
         if unknown := tuple(joint for joint in plan.joints if joint not in layout.joints):
-            return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
+            yield Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         if (parted := parted_couplings(plan, self._plan.joints)) is not None:
             joint, others = parted[0], " and ".join(parted[1])
             problem = f"it commands another mode of {joint} without {others}, which the same servos move"
-            return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
+            yield Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
         if unknown := tuple(lower for lower in plan.into if lower not in known):
-            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
+            yield Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
         provided = {f"{plan.name}/{state}" for state in plan.provides}
         if not (set(plan.references) <= set(layout.references) and provided <= set(layout.source_states)):
-            return Refusal(Code.NO_NEW_REFERENCES, {"controller": plan.name})
+            yield Refusal(Code.NO_NEW_REFERENCES, {"controller": plan.name})
         try:
             update_order([*known.values(), plan])
         except ValueError as error:
-            return Refusal(Code.INVALID, {"problem": str(error)})
-        return _refuse_rates({**known, plan.name: plan}, self._period_ns)
+            yield Refusal(Code.INVALID, {"problem": str(error)})
+        yield from _refused_rates({**known, plan.name: plan}, self._period_ns)
 
     def _free_place(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
@@ -443,7 +446,7 @@ class Manager:
 
     def change_period(self, period_ns: int) -> Refusal | None:
         """Let every controller keep its own rate in another period of the loop."""
-        if refusal := _refuse_rates(self.switching.standing.known, period_ns):
+        if refusal := next(_refused_rates(self.switching.standing.known, period_ns), None):
             return refusal
         self._period_ns = period_ns
         for managed in self._named.values():
@@ -468,6 +471,8 @@ class Manager:
     def _sort(self) -> None:
         self.providers = tuple(one.provided for one in self._managed if one.provided is not None)
         loaded = [one for one in self._managed if self._named.get(one.plan.name) is one]
+        for one in loaded:
+            one.uppers = tuple(upper for upper in self._named.values() if one.plan.name in upper.plan.into)
         self._order = tuple(self._named[name] for name in update_order([one.plan for one in loaded]))
 
     def _log_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
@@ -501,17 +506,16 @@ def _commanded_by(controller: str, upper: str, hint: str) -> Refusal:
     return Refusal(Code.COMMANDED, {"controller": controller, "upper": upper, "hint": hint})
 
 
-def _refuse_rates(plans: Plans, period_ns: int) -> Refusal | None:
-    """Refuse a period in which a controller cannot keep its rate, or is not updated whenever one above it
-    is."""
+def _refused_rates(plans: Plans, period_ns: int) -> Iterator[Refusal]:
+    """Yield why a period does not do: a controller cannot keep its rate in it, or is not updated whenever one
+    above it is."""
     rate = 1e9 / period_ns
     for plan in plans.values():
         if not rate_fits(plan.rate, period_ns):
             fields: dict[str, Field] = {"controller": plan.name, "controller_rate": plan.rate or 0.0}
-            return Refusal(Code.RATE_NOT_DIVIDED, fields | {"rate": rate})
+            yield Refusal(Code.RATE_NOT_DIVIDED, fields | {"rate": rate})
     for upper in plans.values():
         for lower in (plans[name] for name in upper.into):
             if rate_divider(upper.rate, period_ns) % rate_divider(lower.rate, period_ns):
                 fields = {"controller": lower.name, "upper": upper.name, "rate": rate}
-                return Refusal(Code.RATE_BELOW_UPPER, fields)
-    return None
+                yield Refusal(Code.RATE_BELOW_UPPER, fields)

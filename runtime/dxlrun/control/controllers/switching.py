@@ -286,8 +286,7 @@ class Switching:
         self.modes_requested = False
         self._end_switch(group.number, refusal)
         for managed in group.entering:
-            if managed.state is State.ENTERING:
-                managed.on(Event.LEAVE)
+            managed.on(Event.LEAVE)  # it may have left already
             name = managed.plan.name
             self._report_left_out(name, f"{name} is not activated: {problem}", refusal)
         self.fault = self.fault or group.why or None
@@ -343,8 +342,7 @@ class Switching:
             lowers = [one for lower in into if (one := self.named.get(lower)) and one.active]
             active = {one.plan.name for one in lowers}
             if missing := [lower for lower in into if lower not in active]:
-                if managed.state is State.ENTERING:
-                    managed.on(Event.LEAVE)
+                managed.on(Event.LEAVE)
                 problem = f"{missing[0]}, whose references it commands, is not active"
                 self._report_left_out(name, f"{name} is not activated: {problem}", fault_of(managed, problem))
                 continue
