@@ -1,7 +1,7 @@
-"""Build backend and hook: hatchling, and the exchange's kernel compiled into the wheel.
+"""Build backend and hook: hatchling, and what is in C compiled into the wheel: exchange and gate.
 
 Where no C compiler works, `pip install .` fetches `ziglang` for the build alone, which has one. The object
-carries a checksum of its source, so that an old one is never used. Only Linux has the kernel: elsewhere robot
+carries a checksum of its source, so that an old one is never used. Only Linux has them: elsewhere robot
 files are checked.
 """
 
@@ -32,14 +32,15 @@ __all__ = [
     "get_requires_for_build_sdist",
     "get_requires_for_build_wheel",
 ]
-FOLDER = Path("runtime/dxlrun/dynamixel/exchange")
+SOURCES = (Path("dxlrun/dynamixel/exchange/kernel.c"), Path("dxlrun/control/gate.c"))
+"""Each is compiled into an object of its own, which lies beside it: libkernel.so."""
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: states and goals have the same bits on every processor."""
 
 
-def compile_kernel(root: Path, compiler: list[str], target: Path) -> str:
-    """Compile the kernel; return why that did not work, or nothing."""
-    source = root / FOLDER / "kernel.c"
+def compile_kernel(root: Path, compiler: list[str], target: Path, name: Path = SOURCES[0]) -> str:
+    """Compile the kernel, or another source; return why that did not work, or nothing."""
+    source = root / "runtime" / name
     crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
     with tempfile.TemporaryDirectory() as cache:
         caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
@@ -84,21 +85,21 @@ class KernelHook(BuildHookInterface[Any]):
         if self.target_name != "wheel" or not sys.platform.startswith("linux"):
             return
         root = Path(self.root)
-        if version == "editable":
-            target = root / FOLDER / "libkernel.so"
-            target.unlink(missing_ok=True)
-        else:  # elsewhere: other builds may go on in this tree
-            self.made = tempfile.mkdtemp()
-            target = Path(self.made, "libkernel.so")
         compiler = system_compiler(root)
         if not compiler and find_spec("ziglang"):
             compiler = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
-        if why := compile_kernel(root, compiler or ["cc"], target):
-            raise RuntimeError(
-                f"the exchange's kernel was not compiled; install a C compiler (sudo apt install gcc):\n{why}"
-            )
-        if self.made:
-            build_data["force_include"][str(target)] = "dxlrun/dynamixel/exchange/libkernel.so"
+        if version != "editable":  # elsewhere: other builds may go on in this tree
+            self.made = tempfile.mkdtemp()
+        for source in SOURCES:
+            made = source.with_name(f"lib{source.stem}.so")
+            target = Path(self.made, made.name) if self.made else root / "runtime" / made
+            target.unlink(missing_ok=True)
+            if why := compile_kernel(root, compiler or ["cc"], target, source):
+                raise RuntimeError(
+                    f"{source.name} was not compiled; install a C compiler (sudo apt install gcc):\n{why}"
+                )
+            if self.made:
+                build_data["force_include"][str(target)] = str(made)
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"py3-none-{platform}"
         build_data["pure_python"] = False

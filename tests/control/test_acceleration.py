@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.control.gate_law import BRAKING_S
 from tests.kit.loops import GateRig
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.control.gate import BRAKING_S
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.control.gate_law import BRAKING_S, LAG_S
 from tests.kit.loops import PERIOD_NS, GateRig
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.control.gate import BRAKING_S, LAG_S
 from dxlrun.description.modes import COMMAND_INTERFACES, Mode
 from dxlrun.plan.policy_plan import SLOW_SPEED
 

@@ -167,57 +167,6 @@ def test_what_the_manager_found_not_finite_stays_flagged():
     assert rig.record.clamped.tolist() == [0, Clamp.NOT_FINITE]
 
 
-one_of_few = st.sampled_from([0.0, 0.05, 0.1, 0.3, 0.9, 1.0, 1.5, -2.0, np.nan, np.inf])
-
-
-def led_by_the_rules(velocity, last, command, speed, most):
-    """Return goal, speed and flags of one joint, step by step, as the gate's docstring has it."""
-    goal, last_speed = last
-    top_speed, flags = 6.0, NONE
-    ceiling = velocity if velocity is not None and velocity < top_speed else np.nan
-    last_speed = np.fmin(last_speed, ceiling)
-    if np.isnan(command):
-        return goal, last_speed, flags
-    if np.isinf(command):
-        return goal, last_speed, Clamp.NOT_FINITE
-    low, high = min(-1.0, goal), max(1.0, goal)
-    flags |= Clamp.LOWER if command < low else Clamp.UPPER if command > high else NONE
-    inside = min(max(command, low), high)
-    step = (np.inf if velocity is None else velocity) * DT
-    if not goal - step <= inside <= goal + step:
-        if velocity < top_speed:  # a goal as fast as the servo is not held back
-            flags |= Clamp.STEP
-        inside = min(max(inside, goal - step), goal + step)
-    speed = abs(speed)
-    if np.isinf(speed):
-        return inside, ceiling, flags | Clamp.NOT_FINITE
-    if speed > most:
-        flags |= Clamp.VELOCITY
-    return inside, np.fmin(speed if np.isnan(speed) else min(speed, most), ceiling), flags
-
-
-@settings(max_examples=300, deadline=None)
-@given(
-    velocity=st.none() | st.floats(1, 30),
-    start=st.floats(-2, 2),
-    commands=st.lists(st.lists(st.tuples(one_of_few, one_of_few), min_size=2, max_size=2), max_size=12),
-)
-def test_goals_speeds_and_flags_are_those_of_the_rules_applied_joint_by_joint(velocity, start, commands):
-    rig = GateRig(velocity=velocity, joints=2, start=start, top_speed=6.0)
-    most, goals = rig.gate._most[1, 0], rig.goals
-    for both in commands:
-        last = zip(goals.position.tolist(), goals.velocity.tolist(), strict=True)
-        expected = [
-            led_by_the_rules(velocity, *one, most) for one in zip(last, *zip(*both, strict=True), strict=True)
-        ]
-        rig.record.clamped[:] = 0
-        led(rig, *zip(*both, strict=True))
-        found = zip(goals.position, goals.velocity, rig.record.clamped, strict=True)
-        for (goal, speed, flags), (where, toward, done) in zip(found, expected, strict=True):
-            slow = toward if -1.0 <= where <= 1.0 else np.fmin(toward, BACK_SPEED)  # outside of the limits
-            np.testing.assert_equal((goal, speed, Clamp(int(flags))), (where, slow, done))
-
-
 LIGHT = SourcePlan(
     "light",
     "device",

@@ -356,12 +356,13 @@ def answer(terminal, size, replies):
 
 @pytest.fixture
 def build(tmp_path, monkeypatch):
-    """The build, in a folder that has the kernel's source."""
+    """The build, in a folder that has the sources."""
     spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    (tmp_path / module.FOLDER).mkdir(parents=True)
-    shutil.copy(kernel.SOURCE, tmp_path / module.FOLDER)
+    for source in module.SOURCES:
+        (tmp_path / "runtime" / source).parent.mkdir(parents=True)
+        shutil.copy(ROOT / "runtime" / source, tmp_path / "runtime" / source)
     monkeypatch.chdir(tmp_path)
     return module
 
@@ -389,3 +390,13 @@ def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, m
     hook = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel")
     with pytest.raises(RuntimeError, match=r"install a C compiler \(sudo apt install gcc\)"):
         hook.initialize("standard", {})
+
+
+def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
+    hook, data = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel"), {"force_include": {}}
+    hook.initialize("standard", data)
+    names = ["dxlrun/dynamixel/exchange/libkernel.so", "dxlrun/control/libgate.so"]
+    assert list(data["force_include"].values()) == names
+    assert all(Path(made).stat().st_size for made in data["force_include"])
+    hook.finalize("standard", data, "")
+    assert not any(Path(made).exists() for made in data["force_include"])

@@ -12,7 +12,7 @@ import numpy as np
 
 from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import LOOP, Command, QueueInbox
-from dxlrun.channels.cycle import Clamp, CycleRecord
+from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.clock import VirtualClock
 from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
@@ -466,12 +466,18 @@ class GateRig:
 
     def apply(self, dt_ns: int = 0, **commands: Any) -> Sent:
         """Command these values for a cycle; what is not named is not commanded."""
-        self.record.commands.clear()
+        wanted = Commands.empty(len(self.plan.joints))
         for name, value in commands.items():
-            getattr(self.record.commands, name)[:] = value
+            getattr(wanted, name)[:] = value
         before, dt_ns = float(self.goals.position[0]), dt_ns or self.dt_ns
-        self.gate.enter_modes()
-        self.gate.apply(self.record.commands, self.goals, dt_ns)
+        self.cycle(dt_ns, wanted.values)
         sent = [float(one) for one in self.goals.values[:, 0]]
         moved = (sent[0] - before) / (dt_ns * 1e-9)
         return Sent(*sent, moved, Clamp(int(self.record.clamped[0])))
+
+    def cycle(self, dt_ns: int, commands: Floats) -> None:
+        """Command these values, shape (4, joints), for a cycle."""
+        self.record.commands.values[:] = commands
+        if self.states.mode.tobytes() != self.gate.modes:
+            self.gate.enter_modes()
+        self.gate.apply(dt_ns)

@@ -240,7 +240,8 @@ class Loop:
         if self.sensors is not None:
             self.sensors.read()
         read_ns = now_ns()
-        self.gate.enter_modes()
+        if record.states.mode.tobytes() != self.gate.modes:
+            self.gate.enter_modes()
         valid = record.states.valid
         all_valid = valid.tobytes() == self._all_valid
         if self._motion:
@@ -250,7 +251,7 @@ class Loop:
             if not (all_valid and self._lost.none) and self._lost.look(record.states):
                 self._miss()
             self._update(cycle, time_ns)
-        self.gate.apply(record.commands, record.goals, dt_ns)
+        self.gate.apply(dt_ns)
         updated_ns = now_ns()
         self.hardware.write()
         record.set_times(read_ns, updated_ns, now_ns())

@@ -16,6 +16,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypeVar
 from zlib import crc32
 
 import msgspec
@@ -106,17 +107,28 @@ def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
     )
 
 
-def load(path: Path | None = None) -> ctypes.CDLL:
-    """Return the compiled kernel.
+Library = TypeVar("Library", bound=ctypes.CDLL)
+
+
+def compiled(source: Path, kind: type[Library], path: Path | None = None) -> Library:
+    """Return what the build compiled of a C source, which lies beside it.
 
     Raises StartUpError where it was not built, or of another source.
     """
     try:
-        library = ctypes.CDLL(str(path or LIBRARY))
+        library = kind(str(path or source.with_name(f"lib{source.stem}.so")))
     except OSError:
         raise StartUpError(MISSING) from None
-    if library.dxl_source() & 0xFFFFFFFF != crc32(SOURCE.read_bytes()):
-        raise StartUpError(f"the compiled kernel is of another source than kernel.c beside it: {MISSING}")
+    if library.dxl_source() & 0xFFFFFFFF != crc32(source.read_bytes()):
+        raise StartUpError(
+            f"the compiled kernel is of another source than {source.name} beside it: {MISSING}"
+        )
+    return library
+
+
+def load(path: Path | None = None) -> ctypes.CDLL:
+    """Return the compiled kernel. Raises StartUpError as `compiled`."""
+    library = compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
     library.dxl_read.argtypes = library.dxl_write.argtypes = library.dxl_abandon.argtypes = (c_void_p,)
     library.dxl_abandon.restype = None
     library.dxl_take.argtypes, library.dxl_take.restype = (
