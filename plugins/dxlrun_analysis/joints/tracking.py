@@ -30,8 +30,8 @@ _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 """Settled: so near to where it stays, as a part of the way or in ticks, whichever is more."""
 _MOVED_TICKS = 4
 """Shorter ways give no lag: positions are read in ticks."""
-_BLOCK = 8192
-"""Cycles that are worked on at once."""
+_BLOCK = 1 << 16
+"""Cycles that are worked on at once, times joints; of eight for a robot of fewer."""
 _LONGEST_REST_S = 20.0
 """What rests longer is counted as two rests."""
 
@@ -291,7 +291,7 @@ class Tracking:
             self.movement = Movement(joints, int(log.cycles["read_ns"][0]))
         self._parts.append(log.cycles)
         self._count += len(log.cycles)
-        if self._count >= _BLOCK:
+        if self._count * max(8, len(self._rows)) >= _BLOCK:
             self._work()
 
     def finish(self, log: Log) -> tuple[JointTracking, ...]:

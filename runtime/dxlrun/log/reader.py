@@ -123,7 +123,9 @@ class LogReader:
         with _readable(self.path):
             for messages in gathered(walk.messages(), SLICE_BYTES):
                 self.share = walk.share
-                yield slicer.take(messages)
+                part = slicer.take(messages)
+                del messages  # what looks at the part does not need their memory
+                yield part
             yield slicer.rest()
         if packets or self._about is None:
             self._about = slicer.about()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO
@@ -99,24 +99,27 @@ def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
         parts.append(messages)
         size += len(messages.data)
         if size >= least:
+            size = 0
             yield _joined(parts)
-            parts, size = [], 0
     if parts:
         yield _joined(parts)
 
 
-def _joined(parts: Sequence[Messages]) -> Messages:
+def _joined(parts: list[Messages]) -> Messages:
+    """Return messages as one, and forget the parts: they need not be in memory twice."""
     if len(parts) == 1:
-        return parts[0]
+        return parts.pop()
     sizes = [len(part.data) for part in parts]
     before = np.cumsum([0, *sizes[:-1]])
-    return Messages(
+    whole = Messages(
         data=np.concatenate([part.data for part in parts]),
         channel=np.concatenate([part.channel for part in parts]),
         t_ns=np.concatenate([part.t_ns for part in parts]),
         start=np.concatenate([part.start + at for part, at in zip(parts, before, strict=True)]),
         size=np.concatenate([part.size for part in parts]),
     )
+    parts.clear()
+    return whole
 
 
 @dataclass(slots=True)
