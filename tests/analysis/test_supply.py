@@ -95,6 +95,12 @@ def test_a_supply_that_falls_with_the_load_of_one_servo_is_its_own() -> None:
     assert "stay at 12.0 V" in sentence
 
 
+def test_one_that_is_low_for_most_of_the_run_does_not_measure_less() -> None:
+    ((code, subject, sentence),) = findings(volts(2, np.where(TIME > 3.0, 2.0, 0.0)))
+    assert (code, subject) == ("own_supply", "j2")
+    assert "to 10.0 V" in sentence
+
+
 def test_one_that_falls_at_another_time_is_told_without_the_load() -> None:
     ((code, subject, sentence),) = findings(volts(2, np.where((TIME > 9) & (TIME < 14), 1.5, 0.0)))
     assert (code, subject) == ("own_supply", "j2")
@@ -112,12 +118,13 @@ def test_what_a_servo_reported_is_told_once() -> None:
     [
         volts(),
         volts(2, 0.6),  # it measures less, always
+        volts(2, np.where(np.sin(TIME) > 0, 0.6, 0.8)),  # and wavers
         volts(2, 0.3 * LOADS[:, 2]),
         volts(None, np.linspace(0, 0.2, len(TIME))),
         volts(2, np.where((TIME > 9) & (TIME < 9.5), 1.5, 0.0)),  # read once
         volts(2, 2.5 * LOADS[:, 2]) + volts(3, 2.5 * LOADS[:, 2]) - 12.0,  # of some it is not known why
     ],
-    ids=["none", "measures less", "little", "battery", "once", "two"],
+    ids=["none", "measures less", "wavers", "little", "battery", "once", "two"],
 )
 def test_voltages_that_differ_accuse_nothing(innocent: Floats) -> None:
     assert findings(innocent) == []

@@ -256,7 +256,9 @@ class Trends:
             warnings.simplefilter("ignore", RuntimeWarning)  # before the first voltage there is none
             usual = np.nanmedian(others, axis=1)
             below = usual - volts
-            below -= max(0.0, np.nanquantile(below, 0.25))  # it may always measure a little less
+            least_below, usually = np.nanquantile(below, (0.05, 0.25))
+            # it may always measure a little less, and waver about that
+            below -= max(0.0, min(usually, least_below + _LEAST_V))
             lowest = np.fmin.reduce(others, axis=1)
         least = np.maximum(_SAG * usual, _LEAST_V)
         dips = (below > least) & (usual - lowest < least)

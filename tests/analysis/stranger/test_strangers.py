@@ -18,7 +18,6 @@ from tests.conftest import SEED as COMMIT
 
 _SWINGS = "it swings too little for the rule of what swings by itself"
 UNNAMED = {
-    ("corroded_crimp", "mx_two"): "its voltage is 2 V lower nearly from the start, as if it measured less",
     ("own_gain_too_high", "x_fast"): _SWINGS,
     ("own_gain_too_high", "x_three"): _SWINGS,
 }
