@@ -46,13 +46,38 @@ def test_a_joint_is_blocked_from_when_its_goal_left_it() -> None:
     assert "from 5.0 s of the run on" in only(Joint(way=late, position=np.zeros(600), load=0.9)).sentence
 
 
-@pytest.mark.parametrize(("swing", "shakes"), [(0.04, True), (0.015, False)])
-def test_a_joint_that_turns_again_and_again_shakes(swing: float, shakes: bool) -> None:
-    shaking = np.where(FAULT, swing * np.cos(2 * math.pi * 10.0 * TIME), 0.0)
+@pytest.mark.parametrize(
+    ("swing", "hertz", "code"),
+    [
+        (0.04, 10.0, "joint_shakes"),
+        (0.04, 4.0, "hunting_joint"),
+        (0.018, 5.0, "hunting_joint"),
+        (0.005, 5.0, ""),
+    ],
+)
+def test_a_joint_that_turns_again_and_again_shakes(swing: float, hertz: float, code: str) -> None:
+    shaking = np.where(FAULT, swing * np.cos(2 * math.pi * hertz * TIME), 0.0)
     found = findings(Joint(position=SWING + shaking), Joint(), Joint())
-    assert [(one.code, one.subject) for one in found] == [("joint_shakes", "j0")] * shakes
-    assert all("times a second around its goal" in one.sentence for one in found)
+    assert [(one.code, one.subject) for one in found] == [(code, "j0")] * bool(code)
+    assert all("around its goal" in one.sentence and "times a second" in one.sentence for one in found)
     assert findings(Joint(way=shaking, position=behind(shaking, 1)), Joint(), Joint()) == []  # as it is told
+    both = [Joint(position=SWING + shaking), Joint(position=SWING + shaking)]
+    assert bool(findings(*both, Joint())) == (code == "joint_shakes")
+
+
+@pytest.mark.parametrize(("hertz", "shakes"), [(5.0, True), (3.0, False)])
+def test_a_joint_that_a_controller_moves_with_an_effort_shakes_around_its_reference(
+    hertz: float, shakes: bool
+) -> None:
+    shaking = np.where(FAULT, 0.06 * np.cos(2 * math.pi * hertz * TIME), 0.0)
+    joint = Joint(np.full(600, np.nan), SWING + shaking, effort=SWING, sought=SWING)
+    found = findings(joint, Joint(), Joint())
+    assert [(one.code, one.subject) for one in found] == [("joint_shakes", "j0")] * shakes
+    assert all(
+        "around its goal, to which a controller moves it with an effort" in one.sentence for one in found
+    )
+    swung = Joint(np.full(600, np.nan), SWING + shaking, effort=SWING, sought=SWING + shaking)
+    assert findings(swung, Joint(), Joint()) == []
 
 
 def test_a_joint_that_is_sent_in_steps_does_not_shake() -> None:

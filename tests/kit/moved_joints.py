@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,15 +41,23 @@ class Joint:
     velocity: float = 1.0
     """NaN: not read"""
     planned: dict[str, Any] = field(default_factory=dict)
+    effort: Floats | float = math.nan
+    """What a controller moves it with"""
+    sought: Floats | float = math.nan
+    """Where that controller is to move it"""
 
 
 def findings(*joints: Joint, name: str = "j") -> list[Finding]:
     """Judge joints; all others beside them follow well."""
     kind = [("read_ns", np.int64), *((field, np.float64, len(joints)) for field in FIELDS)]
-    kind += [("age_ns", np.int64, len(joints)), ("torque", np.uint8, len(joints))]
+    kind += [
+        ("age_ns", np.int64, len(joints)),
+        ("torque", np.uint8, len(joints)),
+        ("reference", np.float64, len(joints)),
+    ]
     cycles = np.zeros(len(TIME), [*kind, ("valid", np.bool_, len(joints))])
     cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
-    cycles["valid"], cycles["goal_effort"] = True, np.nan
+    cycles["valid"] = True
     planned = []
     for row, joint in enumerate(joints):
         tick = joint.planned.get("tick", TICK)
@@ -56,9 +65,11 @@ def findings(*joints: Joint, name: str = "j") -> list[Finding]:
         cycles["velocity"][:, row] = joint.velocity * np.gradient(joint.position, DT)
         cycles["effort"][:, row], cycles["torque"][:, row] = joint.load, joint.torque
         cycles["goal_position"][:, row] = joint.way
+        cycles["goal_effort"][:, row], cycles["reference"][:, row] = joint.effort, joint.sought
         facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
         planned.append(PlannedJoint(f"{name}{row}", **facts))
-    movement = Movement(planned, int(cycles["read_ns"][0]))
+    references = [f"pid/{joint.name}/position" for joint in planned]
+    movement = Movement(planned, int(cycles["read_ns"][0]), references)
     ways = np.array([joint.way for joint in joints]).T
     for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
         known = min(begin, 2)

@@ -12,7 +12,8 @@ has torque and controls a position, in bins of 0.1 s or more:
 - *error grew*: three times the worst of any time before, and that of the other joints, and 4.6 deg, at goals
   at which it was before, and not much faster. Not at fault is a joint whose load grew as much as its error:
   it carries more. Where most joints get worse together, it is none of them.
-- *shakes*: its error swings by 2 deg or more, a dozen times a second more than its trajectory does.
+- *shakes*: its error swings by 2 deg or more, a dozen times a second more than its trajectory does; eight
+  times where a controller moves it with an effort, from the position that this one is to hold.
 - *goal swings*: a dozen times a second, which the joint cannot follow.
 
 A joint that never followed well, or that is nowhere it was before, is compared with nothing.
@@ -60,6 +61,8 @@ _CATCH_UP_S = 2.0
 """After it had no torque, or was not read."""
 _SHAKES_HZ = 12.0
 """Swings a second, two of them to and fro."""
+_SHAKES_BY_EFFORT_HZ = 8.0
+"""The same where a controller moves it with an effort: it is slower than a servo's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +197,8 @@ def _at_limit(values: Floats, most: float, step: float) -> bool:
 
 def _shakes(one: Windows) -> Failing | None:
     """Return the time in which a joint shakes around its trajectory, or is sent to and fro."""
-    shakes = one.mean[SWINGS] >= _SHAKES_HZ
+    by_effort = np.isnan(one.mean[AWAY])
+    shakes = one.mean[SWINGS] >= np.where(by_effort, _SHAKES_BY_EFFORT_HZ, _SHAKES_HZ)
     seconds = float(shakes.sum()) * one.length_s
     if seconds >= BAD_S:
         return Failing("joint_shakes", shakes, seconds, ~shakes)

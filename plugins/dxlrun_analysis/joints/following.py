@@ -44,6 +44,11 @@ _AT_ONCE = round(0.08 / STEP_S)
 _BENDS_RAD_S = 0.6
 """A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
 _NEAR_RAD = 0.006
+_SWING_RAD, _SWING_TICKS = 0.01, 4
+"""0.6 deg, or as many ticks"""
+_SWING_S = 0.2
+_UNEVEN = 0.4
+"""What swings by itself does so evenly."""
 
 Flags = NDArray[np.bool_]
 
@@ -127,7 +132,7 @@ class Followed(NamedTuple):
         found = []
         edges = np.flatnonzero(np.diff(np.isfinite(self.goal), prepend=False, append=False))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            at = [begin + index for index in _turning(self.goal[begin:end])]
+            at = [begin + index for index in _turning(self.goal[begin:end], STROKE_RAD)]
             for three in zip(at, at[1:], at[2:], strict=False):
                 turn = self._turn(*three)
                 if turn is not None:
@@ -200,6 +205,24 @@ class Followed(NamedTuple):
         moved = float(speed @ speed)
         taken = float(speed @ (load - load.mean())) / moved if moved else 0.0
         return self.load - taken * self.speed
+
+    def swings(self) -> Floats:
+        """Return when it turned in its longest series of even swings, s; of none where its goal swings."""
+        least = max(_SWING_RAD, _SWING_TICKS * self.joint.tick / self.joint.share)
+        turns = self._turns_of(self.off, least)
+        parts = np.split(turns, np.flatnonzero(np.diff(turns) > _SWING_S) + 1)
+        series = max((part for part in parts if _even(part)), key=len, default=turns[:0])
+        told = self._turns_of(self.goal, least / 4)
+        if len(series) and ((told >= series[0]) & (told <= series[-1])).sum() > len(series) / 3:
+            return series[:0]
+        return series
+
+    def _turns_of(self, values: Floats, least: float) -> Floats:
+        """Return when values turn by so much, s, where it is known how it follows."""
+        edges = np.flatnonzero(np.diff(np.isfinite(self.off), prepend=False, append=False))
+        pairs = zip(edges[::2], edges[1::2], strict=True)
+        turns = [begin + at for begin, end in pairs for at in _turning(values[begin:end], least)[1:-1]]
+        return self.at_s[turns]
 
     def jerks(self) -> Floats:
         """Return by how much it is off otherwise 80 ms later.
@@ -290,8 +313,8 @@ def _lasting(when: Flags, samples: int) -> Flags:
     return np.convolve(when.astype(float), np.ones(samples))[: len(when)] > 0
 
 
-def _turning(values: Floats) -> list[int]:
-    """Return where finite values turn by 6 deg or more, from the first turn or end to the last."""
+def _turning(values: Floats, least: float) -> list[int]:
+    """Return where finite values turn by so much or more, from the first turn or end to the last."""
     step = np.sign(np.diff(values))
     moved = np.flatnonzero(step)
     turns = moved[1:][step[moved[1:]] != step[moved[:-1]]]
@@ -301,10 +324,15 @@ def _turning(values: Floats) -> list[int]:
         gone = float(values[at] - values[furthest])
         if gone * direction > 0:
             furthest = at
-        elif abs(gone) >= STROKE_RAD:
+        elif abs(gone) >= least:
             found.append(furthest)
             direction, furthest = math.copysign(1.0, gone), at
     return [*found, furthest] if direction else []
+
+
+def _even(at_s: Floats) -> bool:
+    gaps = np.diff(at_s)
+    return len(gaps) > 0 and bool(gaps.std() < _UNEVEN * gaps.mean())
 
 
 def _nearest(value: float, before: Sequence[float]) -> float:

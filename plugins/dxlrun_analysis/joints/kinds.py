@@ -129,8 +129,10 @@ def _commanded(one: Windows, failing: Failing, others: float) -> str:
 
 def _shakes(one: Windows, failing: Failing, others: float) -> str:
     hertz = one.typical(SWINGS, failing.when) / 2
-    text = f"shakes {hertz:.0f} times a second around its goal, {_away(one, failing)} on average"
-    return text + _exerted(one, failing)
+    text = f"shakes {hertz:.0f} times a second around its goal"
+    if math.isnan(one.typical(AWAY, failing.when)):
+        return f"{text}, to which a controller moves it with an effort"
+    return f"{text}, {_away(one, failing)} on average{_exerted(one, failing)}"
 
 
 def _still(one: Windows, failing: Failing, others: float, how: str = "") -> str:
@@ -185,7 +187,9 @@ KINDS = {
         of_replies=True,
     ),
     "joint_shakes": Kind(
-        "Look for play in gears and horn; lower its gains, or its load's inertia.", _shakes, of_replies=True
+        "Look for play in gears and horn; lower the gains of servo and controller, or its load's inertia.",
+        _shakes,
+        of_replies=True,
     ),
     "goal_swings": Kind(
         "See which clients and controllers command it (`/commands` in the log), and let only one.",
@@ -241,6 +245,11 @@ KINDS = {
     "off_its_way": Kind(
         "Look at what it carries and touches, and at its gains.",
         may_be=": its load changed, or how it holds it",
+        rank=Rank.REMARK,
+    ),
+    "hunting_joint": Kind(
+        "Lower its gains, or those of its controller; look for play in gears and horn.",
+        may_be=": it swings by itself",
         rank=Rank.REMARK,
     ),
     "jerked_joint": Kind(

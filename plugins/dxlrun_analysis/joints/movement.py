@@ -70,8 +70,14 @@ class _Jumps:
 class Movement:
     """Collects how the joints moved, in memory that does not grow with the log."""
 
-    def __init__(self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0) -> None:
+    def __init__(
+        self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0, references: Sequence[str] = ()
+    ) -> None:
         self._joints = joints
+        found = {name.partition("/")[2]: column for column, name in enumerate(references)}
+        columns = [found.get(f"{joint.name}/position", -1) for joint in joints]
+        self._references = {row: column for row, column in enumerate(columns) if column >= 0}
+        """Of the joints that a controller moves to a position by itself, with an effort"""
         self._fastest = np.zeros(len(joints))
         self._jumps = [_Jumps() for _ in joints]
         self.bins = Bins(8, len(joints), begin_ns)
@@ -104,6 +110,9 @@ class Movement:
         hurries = (velocity * error < 0) & (np.abs(velocity) >= _FULL_SPEED * fastest)
         hurries &= moved >= _FULL_SPEED / 2 * np.abs(velocity)
         unknown = np.isnan(error)
+        sought = self._sought(cycles)
+        off = np.where(unknown, cycles["position"] - sought, error)
+        swings = self._swings(cycles, off) - self._told(cycles, np.where(unknown, sought, way))
         values = [
             error,
             np.where(unknown, np.nan, way),
@@ -111,13 +120,21 @@ class Movement:
             np.where(unknown, np.nan, speed),
             np.where(unknown, np.nan, np.abs(cycles["effort"])),
             np.where(hurries, 0.0, np.abs(error)),
-            np.where(unknown, np.nan, self._swings(cycles, error) - self._told(cycles, way)),
+            np.where(np.isnan(off), np.nan, swings),
             np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
         ]
         self.bins.take(cycles["read_ns"], np.array(values))
         self._trail.take(
             cycles["read_ns"], way, np.where(driven, cycles["position"], np.nan), cycles["effort"]
         )
+
+    def _sought(self, cycles: NDArray[np.void]) -> Floats:
+        """Return the positions that controllers of efforts are to hold, shape (cycles, joints)."""
+        sought = np.full(cycles["position"].shape, np.nan)
+        by_effort = (cycles["torque"] == Torque.ON) & cycles["valid"] & np.isfinite(cycles["goal_effort"])
+        for row, column in self._references.items():
+            sought[:, row] = np.where(by_effort[:, row], cycles["reference"][:, column], np.nan)
+        return sought
 
     def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
         """Return where a swing ends, as swings a second, shape (cycles, joints)."""

@@ -288,7 +288,7 @@ class Tracking:
         if not self._rows:
             joints = planned_joints(log)
             self._rows = [_Row(row, joint) for row, joint in enumerate(joints)]
-            self.movement = Movement(joints, int(log.cycles["read_ns"][0]))
+            self.movement = Movement(joints, int(log.cycles["read_ns"][0]), log.header.references)
         self._parts.append(log.cycles)
         self._count += len(log.cycles)
         if self._count * max(8, len(self._rows)) >= _BLOCK:

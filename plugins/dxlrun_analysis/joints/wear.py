@@ -8,6 +8,7 @@
   places; on one side the more the further it goes, it is held back there by a spring; where it takes next to
   none any more, it carries nothing.
 - *jerked*: it is thrown off its way again and again, within 80 ms, while its goals are even.
+- *hunts*: it swings evenly around its goal, by 0.6 deg, three times a second or more, where that does not.
 
 All of it three times as much as in any other joint that moved: where others show it too, it is the motion,
 the ground or the supply. A joint that other rules name is left to them.
@@ -53,6 +54,8 @@ _JERK_RAD = 0.021
 """1.2 deg"""
 _JERKS = 4
 _APART_S = 0.15
+_SWINGS = 10
+"""In a row, to and fro being two"""
 
 
 class Worn(NamedTuple):
@@ -71,6 +74,7 @@ def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
     turns = [one.turns() for one in sound]
     visits = [list(one.visits(_OFF_RAD / 2, _LOAD / 2)) for one in sound]
     jerks = [one.jerks() for one in sound]
+    swings = [one.swings() for one in sound]
     for at, one in enumerate(sound):
         others = [other for other in range(len(sound)) if other != at]
         found = (
@@ -78,6 +82,7 @@ def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
             or _takes_more(one, turns[at], [turns[other] for other in others])
             or _pulled(one, visits[at], [visit for other in others for visit in visits[other]], turns[at])
             or _jerked(one, jerks[at], [jerks[other] for other in others])
+            or _hunts(one, swings[at], [swings[other] for other in others])
         )
         if found is not None:
             yield found
@@ -190,6 +195,15 @@ def _jerked(one: Followed, jerks: Floats, others: list[Floats]) -> Worn | None:
     most = _deg(float(np.nanmax(jerks)))
     text = f"is thrown off its way {count} times while its goals are even, by up to {most} within 80 ms"
     return Worn("jerked_joint", one.row, float(times[0]), text + _beside(theirs, others))
+
+
+def _hunts(one: Followed, at_s: Floats, others: list[Floats]) -> Worn | None:
+    theirs = max((len(each) for each in others), default=0)
+    if len(at_s) < max(_SWINGS, _OTHERS * theirs):
+        return None
+    hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
+    text = f"swings to and fro around its goal {hertz:.0f} times a second, {len(at_s) // 2} times in a row"
+    return Worn("hunting_joint", one.row, float(at_s[0]), text)
 
 
 def _beside(theirs: float, others: Sequence[object]) -> str:

@@ -16,11 +16,7 @@ from tests.analysis.stranger.campaign import CASES, PAIRS
 from tests.analysis.stranger.expectation import Case, judged
 from tests.conftest import SEED as COMMIT
 
-_SWINGS = "it swings too little for the rule of what swings by itself"
-UNNAMED = {
-    ("own_gain_too_high", "x_fast"): _SWINGS,
-    ("own_gain_too_high", "x_three"): _SWINGS,
-}
+UNNAMED: dict[tuple[str, str], str] = {}
 """Pairs that are known not to be named, and why."""
 COUNT = int(os.environ.get("DXLRUN_STRANGERS", "4"))
 SEED = os.environ.get("DXLRUN_STRANGERS_SEED", COMMIT)
