@@ -5,6 +5,7 @@ import gc
 import json
 import os
 import random
+import select
 import socket
 import struct
 import subprocess
@@ -15,8 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.remote import server
+from dxlrun.channels.heartbeat import Phase
+from dxlrun.remote import gateway, server
 from dxlrun.remote.client import RemoteRobot
+from dxlrun.remote.live.topics import framed
+from dxlrun.remote.replies import RunEnded
 from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS, serve
 from dxlrun.remote.sockets import MOST_BYTES, SocketLink
 
@@ -168,6 +172,70 @@ def test_a_silent_connection_is_closed(door, monkeypatch):
 
     assert door.open(act) == [b"", b"", b""]
     assert door.desk.taken == []
+
+
+STREAM = b"GET /stream?topic=/joint_states HTTP/1.0\r\n\r\n"
+
+
+def test_a_stream_stays_open_while_it_is_read_or_quiet_and_a_sleeping_listener_is_closed(door, monkeypatch):
+    """What that one does not take stays in the ring: the gateway keeps no more for it than for others."""
+    monkeypatch.setattr(server, "SILENCE_S", 0.1)
+    monkeypatch.setattr(gateway, "BEAT_S", 0.02)
+    kept = []
+
+    async def act():
+        quiet, quiet_end = await door.connect(b"GET /stream?topic=/events HTTP/1.0\r\n\r\n")
+        reading, reading_end = await door.connect(STREAM)
+        sleeping = socket.socket(socket.AF_UNIX)
+        sleeping.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(sleeping, door.path)
+        sleeping.send(STREAM)
+        until = asyncio.get_running_loop().time() + 60
+        while not (connections := [one for one in gc.get_objects() if type(one) is server.Connection]):
+            await asyncio.sleep(0.001)
+        read = 0
+        while asyncio.get_running_loop().time() < until:
+            for _ in range(50):
+                door.desk.finish_cycle()
+            read += len(await reading.read(1 << 20))
+            sizes = [one.transport.get_write_buffer_size() for one in connections if one.transport]
+            kept.append(max(sizes, default=0))
+            if hung_up(sleeping):
+                break
+        else:
+            raise AssertionError("the sleeping listener was never closed")
+        door.desk.heartbeat.enter(Phase.DONE)
+        ends = [await asyncio.wait_for(one.read(), 60) for one in (reading, quiet)]
+        for end in (reading_end, quiet_end, sleeping):
+            end.close()
+        return read, ends
+
+    read, ends = door.open(act)
+    assert read > 100_000
+    assert max(kept) < 1 << 18
+    assert all(end.endswith(framed(RunEnded())) for end in ends)
+    assert bytes(4) in ends[1]
+
+
+def hung_up(end: socket.socket) -> bool:
+    """Whether the other side has closed a connection of which nothing is read."""
+    look = select.poll()
+    look.register(end, select.POLLRDHUP)
+    return bool(look.poll(0))
+
+
+def test_a_listener_that_is_killed_leaves_nothing_behind(door):
+    async def act():
+        for _ in range(3 * MOST_OF_PROCESS):
+            reader, writer = await door.connect(STREAM)
+            await reader.readuntil(b"\r\n\r\n")
+            writer.transport.abort()
+            door.desk.finish_cycle()
+        while [one for one in asyncio.all_tasks() if "RequestResponseCycle" in str(one.get_coro())]:
+            await asyncio.sleep(0.001)
+        assert await door.stopped()
+
+    door.open(act)
 
 
 RUBBISH = [
