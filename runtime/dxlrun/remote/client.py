@@ -10,7 +10,6 @@ One connection, one request at a time, of one thread.
 
 from __future__ import annotations
 
-import http.client
 import json
 import math
 import os
@@ -484,7 +483,7 @@ class RemoteRobot:
         """Return an answer of the link; raises DxlrunError when there is none."""
         try:
             return ask()
-        except (http.client.HTTPException, OSError, ValueError) as error:
+        except (OSError, ValueError) as error:
             why = str(error) or type(error).__name__
             raise DxlrunError(f"{self.name} no longer answers: {why}") from error
 

@@ -8,8 +8,8 @@ each other's runs: set it alike.
 from __future__ import annotations
 
 import fcntl
-import http.client
 import os
+import re
 import select
 import socket
 import stat
@@ -23,6 +23,9 @@ from typing import Protocol
 from dxlrun.errors import DxlrunError
 
 SUFFIX = ".sock"
+_HEAD = re.compile(rb"HTTP/1\.\d (\d{3}).*?\r\n\r\n", re.DOTALL)
+_LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)")
+_CHUNK = 65536
 MOST_BYTES = 1 << 20
 """The longest body of a request; longer ones are refused before they are read."""
 TIMEOUT_S = 10.0
@@ -160,85 +163,44 @@ class RobotLink(Protocol):
         ...
 
 
-class _Connection(http.client.HTTPConnection):
-    """HTTP over a Unix socket."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=TIMEOUT_S)
-        self._path = path
-
-    def connect(self) -> None:
-        """Connect to the socket's path; where its queue of connections is full, wait in the Linux kernel's.
-
-        Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
-        EAGAIN), so a process that floods the queue only delays this one.
-        """
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
-        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
-        try:
-            self.sock.connect(str(self._path))
-        except BlockingIOError:
-            raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
-        self.sock.settimeout(self.timeout)
-
-    @property
-    def hung_up(self) -> bool:
-        """True when the other end has closed it; it sends nothing unasked, so any byte means that too."""
-        if self.sock is None:
-            return False
-        look = select.poll()
-        look.register(self.sock, select.POLLIN)
-        return bool(look.poll(0))
-
-
 class SocketLink:
-    """One connection for requests, one at a time, and one more for each stream.
-
-    Everything raises OSError or http.client.HTTPException when the gateway does not answer.
-    """
+    """HTTP on the socket of a run: one connection for requests, one at a time, and one more for each stream."""
 
     def __init__(self, path: Path, client: str) -> None:
         self._path = path
-        self._connection = _Connection(path)
+        self._end: socket.socket | None = None
         self._used = time.monotonic()
-        shown = "".join(letter for letter in client if letter.isprintable())
-        self._headers = {
-            "X-Dxlrun-Client": shown.encode().decode("latin-1"),  # UTF-8 in what HTTP takes for Latin-1
-            "Content-Type": "application/json",
-        }
+        self.client = "".join(letter for letter in client if letter.isprintable())
+        """The name of the client for the log."""
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
         """Ask once; return status and answer. Nothing is sent twice: the first may have been received."""
-        idle = time.monotonic() - self._used > _IDLE_S
-        if idle or self._connection.hung_up:
+        content = body or b""
+        head = (
+            f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+            f"Content-Length: {len(content)}\r\nX-Dxlrun-Client: {self.client}\r\n\r\n"
+        )
+        end = self._end
+        if end is None or time.monotonic() - self._used > _IDLE_S or _hung_up(end):
             self.close()
+            end = self._end = _connected(self._path)
         try:
-            self._connection.request(method, path, body, self._headers)
-            response = self._connection.getresponse()
-            answer = response.read()
+            end.sendall(head.encode() + content)
+            status, answer, closes = _answer(end)
         except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
             self.close()
             raise
+        if closes:
+            self.close()
         self._used = time.monotonic()
-        return response.status, answer
+        return status, answer
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
         """Return status, first bytes and the connection of an answer that ends with the connection."""
-        connection = _Connection(self._path)
-        connection.connect()
-        end: socket.socket = connection.sock
+        end = _connected(self._path)
         try:
             end.sendall(f"GET {path} HTTP/1.0\r\n\r\n".encode())
-            answer = b""
-            while b"\r\n\r\n" not in answer:
-                if not (more := end.recv(4096)):
-                    raise ConnectionResetError("the connection was closed")
-                answer += more
-            head, _, first = answer.partition(b"\r\n\r\n")
-            status = int(head.split(None, 2)[1])
-            while status >= 400 and (more := end.recv(4096)):
-                first += more
+            status, first, _ = _answer(end)
         except BaseException:
             end.close()
             raise
@@ -246,7 +208,9 @@ class SocketLink:
 
     def close(self) -> None:
         """Close the connection; the robot keeps running."""
-        self._connection.close()
+        if self._end is not None:
+            self._end.close()
+            self._end = None
 
     @property
     def alive(self) -> bool:
@@ -264,3 +228,52 @@ class SocketLink:
                 return False
             time.sleep(0.02)
         return True
+
+
+def _connected(path: Path) -> socket.socket:
+    """Connect to a socket; where its queue of connections is full, wait in the Linux kernel's.
+
+    Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7), EAGAIN),
+    so a process that floods the queue only delays this one.
+    """
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
+    end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
+    try:
+        end.connect(str(path))
+    except BlockingIOError:
+        end.close()
+        raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
+    except BaseException:
+        end.close()
+        raise
+    end.settimeout(TIMEOUT_S)
+    return end
+
+
+def _hung_up(end: socket.socket) -> bool:
+    """Return whether the other end has closed it; it sends nothing unasked, so any byte means that too."""
+    look = select.poll()
+    look.register(end, select.POLLIN)
+    return bool(look.poll(0))
+
+
+def _answer(end: socket.socket) -> tuple[int, bytes, bool]:
+    """Return status and body of an answer, of one without a length its beginning, and whether it is the last.
+
+    Raises OSError when the connection is closed before, ValueError for what is no answer.
+    """
+    data = b""
+    while not (found := _HEAD.match(data)):
+        if not (more := end.recv(_CHUNK)):
+            raise ConnectionResetError("the connection was closed without an answer")
+        data += more
+        if not data.startswith(b"HTTP/1."[: len(data)]):
+            raise ValueError(f"{data[:40]!r} is no answer of HTTP")
+    head, content = found[0].lower(), bytearray(data[found.end() :])
+    length = _LENGTH.search(head)
+    while length and len(content) < int(length[1]):
+        if not (more := end.recv(_CHUNK)):
+            raise ConnectionResetError("the connection was closed in an answer")
+        content += more
+    return int(found[1]), bytes(content), b"\r\nconnection: close" in head
