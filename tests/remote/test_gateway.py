@@ -315,7 +315,7 @@ def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(des
             await desk.request("POST", SET_POINT, {"positions": [0]}, client=(f"process {process}", 0))
 
     asyncio.run(flood())
-    assert len(desk.gateway._set_points._left) == gateway.MOST_PEERS
+    assert len(desk.gateway._allowances[gateway.MOST_SET_POINTS]._left) == gateway.MOST_PEERS
     assert len(desk.take()) == 1
 
 

@@ -14,9 +14,9 @@ from dxlrun.remote.joints import (
     effort_units,
     position_unit,
     prepared_reading,
-    prepared_reboot,
     prepared_register,
     read_register,
+    require_reboots,
 )
 from dxlrun.remote.preparation import RefusedRequest, in_si, plain_quantities
 from dxlrun_lab.guided.choice import require_own_servos
@@ -80,7 +80,7 @@ def test_servos_of_several_models_have_no_register_together(plan: Plan) -> None:
 
 
 def test_all_servos_of_a_joint_must_know_a_reboot(plan: Plan) -> None:
-    assert prepared_reboot(plan, (), ["hip", "roll"], False).joints == ("hip", "roll")
+    require_reboots(plan, ("hip", "roll"))
 
 
 def test_experiments_on_single_servos_refuse_what_is_none(plan: Plan) -> None:

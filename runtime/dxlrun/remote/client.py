@@ -71,20 +71,6 @@ Reply = TypeVar("Reply")
 
 
 @dataclass(frozen=True, slots=True)
-class Halted:
-    """A robot that stands still."""
-
-    cycle: int
-    """The loop's cycle that found it."""
-    seconds: float
-    """Since the loop took the command."""
-    joint: str
-    """The fastest one then."""
-    velocity: float
-    """Its speed, rad/s"""
-
-
-@dataclass(frozen=True, slots=True)
 class RemoteGoal:
     """A goal of a running robot, by its number."""
 
@@ -387,15 +373,13 @@ class RemoteRobot:
         """Let the loop run at another rate, Hz."""
         return self._execute("/rate", {"rate": rate})
 
-    def halt(self) -> Halted:
+    def halt(self) -> Executed:
         """Deactivate all controllers that command joints; returns when every joint stands still and holds.
 
-        Raises Refused with the code `still_moving` when one does not after five seconds.
+        `halted` of the answer has how long that took, and the fastest joint. Raises Refused with the code
+        `still_moving` when one does not after five seconds.
         """
-        done = self._execute("/halt")
-        if done.halted is None:
-            raise DxlrunError(f"{self.name} answers in a way that this version does not know")
-        return Halted(done.cycle, done.halted.seconds, done.halted.joint, done.halted.velocity)
+        return self._execute("/halt")
 
     def pause(self) -> Executed:
         """Hold the joints, and stop the controllers' time."""

@@ -1,25 +1,6 @@
 """Gateway: what can be asked of a running robot, over HTTP on a Unix socket; JSON in, JSON out.
 
-    GET  /robot                                 the run, its controllers and the commands that they take
-    GET  /states                                the newest cycle
-    GET  /events?after=N                        what happened since event N
-    GET  /topics, GET /stream?topic=NAME&topic=NAME      all of them; messages as they come, see replies.Frame
-    POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
-    POST /controllers/NAME/commands/position?in=2 {JOINT: ...}   some joints by name; in: s, of a trajectory
-    POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
-    GET  /goals, GET /goals/N?wait=2            those that run and the last that ended; wait for an end, s
-    POST /goals/N/cancel, /controllers/NAME/cancel       a goal, by its number or its controller
-    GET, POST /controllers/NAME/parameters {values}      all of them; change live ones in one cycle
-    POST /play {text, file, speed}              a motion file, begun softly, all its controllers in one cycle
-    POST /switch {activate, deactivate}         controllers, in one cycle or not at all
-    GET  /joints/NAME                           its newest state
-    GET  /joints/NAME/registers/ITEM            an item of its servo, read in idle time
-    POST /joints/NAME/registers/ITEM {value}    a RAM item of it; answered when it is there, with the old one
-    POST /torque {joints, on, release}          of joints, of a controller's joints, of all
-    POST /reboot {joints, release}              their servos (Protocol 2.0)
-    POST /rate {rate}, /halt, /pause, /resume, /stop
-    POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
-
+REQUESTS has all of it, docs/steering.md what each means. The answer is
 `{"done": true, "cycle": N}`, of a goal with its number in `"goals"`, of a set-point instead `"clamped"`, the
 number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
 "fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the
@@ -33,11 +14,11 @@ import math
 import time
 import traceback
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -62,12 +43,12 @@ from dxlrun.remote.goals import LOST
 from dxlrun.remote.joints import (
     effort_units,
     joint_row,
+    named_joints,
     position_unit,
     prepared_reading,
-    prepared_reboot,
     prepared_register,
-    prepared_torque,
     read_register,
+    require_reboots,
     states_of,
 )
 from dxlrun.remote.link import Link, Loaded
@@ -159,7 +140,6 @@ _STATUS = {
 _CONFLICT = 409
 """Status of all other refusals: what the loop or a controller cannot do now."""
 
-Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 T = TypeVar("T")
 
 
@@ -173,21 +153,6 @@ class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Body of a change of live parameters: values as in the robot file, by dotted name."""
 
     values: dict[str, Written]
-
-
-class TorqueBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a request for torque; `joints` may name controllers, or be `["all"]`."""
-
-    joints: tuple[str, ...]
-    on: bool
-    release: bool = False
-
-
-class RebootBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a request for reboots."""
-
-    joints: tuple[str, ...]
-    release: bool = False
 
 
 class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -213,9 +178,8 @@ class GatewayApp:
         self._link = link
         self._preparation = preparation
         self._log = log
-        self._operations = Allowance(MOST_OPERATIONS, now)
-        self._set_points = Allowance(MOST_SET_POINTS, now)
-        self._looks = Allowance(MOST_LOOKS, now)
+        rates = (MOST_OPERATIONS, MOST_SET_POINTS, MOST_LOOKS)
+        self._allowances = {rate: Allowance(rate, now) for rate in rates}
         self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
@@ -224,73 +188,57 @@ class GatewayApp:
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
-
-        def route(path: str, handler: Handler, method: str, allowance: Allowance | None) -> Route:
-            return Route(path, _answered(handler, allowance), methods=[method])
-
-        looks, operations = self._looks, self._operations
-        routes = [
-            route("/robot", self.robot, "GET", looks),
-            route("/states", self.states, "GET", looks),
-            route("/frames", self.frames, "GET", looks),
-            route("/events", self.events, "GET", looks),
-            route("/topics", self.topics, "GET", looks),
-            route("/stream", self.stream, "GET", looks),
-            route("/goals", self.goals, "GET", looks),
-            route("/goals/{number}", self.goal, "GET", looks),
-            route("/goals/{number}/cancel", self.cancel, "POST", operations),
-            route("/controllers/{name}/cancel", self.cancel, "POST", operations),
-            Route(
-                "/controllers/{name}/parameters",
-                _answered(self.parameters, operations),
-                methods=["GET", "POST"],
-            ),
-            route("/controllers/{name}/commands/{kind}", self.command, "POST", operations),
-            route("/controllers/{name}/set-points/{kind}", self.set_point, "POST", self._set_points),
-            route("/controllers/{name}", self.unload, "DELETE", operations),
-            route("/controllers", self.load, "POST", operations),
-            route("/play", self.play, "POST", operations),
-            route("/switch", self.switch, "POST", operations),
-            # a path, since servos that share joints have names such as hip/1
-            route("/joints/{name:path}/registers/{item}", self.register, "POST", operations),
-            route("/joints/{name:path}/registers/{item}", self.read_register, "GET", operations),
-            route("/joints/{name:path}", self.joint, "GET", looks),
-            route("/torque", self.torque, "POST", operations),
-            route("/reboot", self.reboot, "POST", operations),
-            route("/rate", self.rate, "POST", operations),
-            route("/halt", self.halt, "POST", None),  # always taken, as far as there is room
-            route("/pause", self.pause, "POST", operations),
-            route("/resume", self.resume, "POST", operations),
-            route("/stop", self.stop, "POST", None),  # always taken
-        ]
+        routes = [Route(one.path, self._answered(one), methods=[one.method]) for one in REQUESTS]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _unknown_page})
         app.router.redirect_slashes = False
         return app
 
+    def _answered(self, asked: Asked) -> Callable[[Request], Awaitable[Response]]:
+        """Return what answers a request: its body is read, and what a client may ask a second is kept."""
+        allowance = self._allowances[asked.rate] if asked.rate else None
+        handler = partial(asked.handler, self)
+
+        async def answer(request: Request) -> Response:
+            try:
+                if allowance is not None:
+                    allowance.spend(peer(request))
+                given = () if asked.body is None else (await typed(request, asked.body),)
+                return _response(await handler(request, *given))
+            except RefusedRequest as error:
+                return _refused(error.refusal)
+            except ClientDisconnect:
+                return Response(status_code=400)  # no client reads it
+            except RecursionError:  # only a body can be so deep
+                return _refused(Refusal(Code.INVALID, {"problem": "the body is nested too deeply"}))
+            except Exception as error:  # the last resort: one request fails, and the gateway serves the next
+                traceback.print_exc()
+                return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
+            finally:
+                if allowance is not None:
+                    allowance.charge(peer(request), getattr(request.state, "received", 0))
+
+        return answer
+
     # Looking
 
-    async def robot(self, request: Request) -> Response:
+    async def robot(self, request: Request) -> object:
         """Return the run, its controllers and the commands that they take."""
         link = self._link
-        return _json(
-            {
-                "robot": link.plan.robot,
-                "rate": link.rate,
-                "paused": link.paused,
-                "cycles": link.heartbeat.cycles,
-                "skipped": link.heartbeat.skipped,
-                "joints": [joint.name for joint in link.plan.loop.joints],
-                "groups": link.plan.groups,
-                "units": {
-                    joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints
-                },
-                "effort_units": effort_units(link.plan),
-                "controllers": [self._shown(one) for one in link.controllers.values()],
-                "sources": link.plan.loop.sources,
-                "file": str(Path(link.plan.source_file).absolute()),
-                "log": self._log,
-            }
-        )
+        return {
+            "robot": link.plan.robot,
+            "rate": link.rate,
+            "paused": link.paused,
+            "cycles": link.heartbeat.cycles,
+            "skipped": link.heartbeat.skipped,
+            "joints": [joint.name for joint in link.plan.loop.joints],
+            "groups": link.plan.groups,
+            "units": {joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints},
+            "effort_units": effort_units(link.plan),
+            "controllers": [self._shown(one) for one in link.controllers.values()],
+            "sources": link.plan.loop.sources,
+            "file": str(Path(link.plan.source_file).absolute()),
+            "log": self._log,
+        }
 
     def _shown(self, loaded: Loaded) -> dict[str, object]:
         plan = loaded.plan
@@ -310,7 +258,7 @@ class GatewayApp:
             "goals": self._preparation.goals(plan),
         }
 
-    async def states(self, request: Request) -> Response:
+    async def states(self, request: Request) -> object:
         """Return the newest cycle; numbers that are not known are null."""
         return Response(encoded(self._states()), media_type="application/json")
 
@@ -325,12 +273,12 @@ class GatewayApp:
             raise refused(Code.NO_CYCLE, {})
         return record
 
-    async def frames(self, request: Request) -> Response:
+    async def frames(self, request: Request) -> object:
         """Return the URDF and what moves it: a client computes where frames lie by itself."""
         plan = self._link.plan
-        return _json({"urdf": plan.urdf, "frames": plan.frames})
+        return {"urdf": plan.urdf, "frames": plan.frames}
 
-    async def events(self, request: Request) -> Response:
+    async def events(self, request: Request) -> object:
         """Return the events after number `after` that are kept; `last` is the newest's number."""
         after = number(request, "after", 0.0)
         newest = self._link.events[-1][0] if self._link.events else 0
@@ -346,13 +294,13 @@ class GatewayApp:
             for n, event in self._link.events
             if n > after
         ]
-        return _json({"events": rows, "last": newest})
+        return {"events": rows, "last": newest}
 
-    async def topics(self, request: Request) -> Response:
+    async def topics(self, request: Request) -> object:
         """Return all topics, with their types and rates."""
-        return _json(Topics((*self._link.topic_states(),)))
+        return Topics((*self._link.topic_states(),))
 
-    async def stream(self, request: Request) -> Response:
+    async def stream(self, request: Request) -> object:
         """Stream the messages of topics as frames, see `Frame`, until the run ends."""
         topics, rate = request.query_params.getlist("topic"), number(request, "rate", MOST_LOOKS)
         if not topics or rate <= 0:
@@ -381,12 +329,12 @@ class GatewayApp:
             await asyncio.sleep(0 if stream.behind else look_s)
         yield framed(RunEnded())
 
-    async def goals(self, request: Request) -> Response:
+    async def goals(self, request: Request) -> object:
         """Return the goals that run, and the last that ended."""
         book = self._link.goals
-        return _json(Goals((*book.running.values(),), (*book.ended.values(),)))
+        return Goals((*book.running.values(),), (*book.ended.values(),))
 
-    async def goal(self, request: Request) -> Response:
+    async def goal(self, request: Request) -> object:
         """Return one goal; with `wait`, s, when it has ended or after that time."""
         wanted, chosen, goals = waiting(request), _goal_number(request), self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
@@ -395,11 +343,11 @@ class GatewayApp:
             if goals.status(chosen).ended is None:
                 raise refused(Code.RUN_ENDING, {})
         await goals.wait(chosen, wanted)
-        return _json(goals.status(chosen))
+        return goals.status(chosen)
 
     # Steering
 
-    async def cancel(self, request: Request) -> Response:
+    async def cancel(self, request: Request) -> object:
         """Cancel a goal by its number, or the one that a controller has; answer with its number."""
         if "number" in request.path_params:
             wanted = Cancel(goal=_goal_number(request))
@@ -413,7 +361,7 @@ class GatewayApp:
         except RefusedRequest as error:
             self._note_ended(goals, error.refusal)
             raise
-        return _done(Executed(done.cycle, (*goals,)))
+        return Executed(done.cycle, (*goals,))
 
     def _note_ended(self, goals: Sequence[int], refusal: Refusal) -> None:
         """Note what a refused cancel shows of goals whose reports were lost on their way here."""
@@ -424,9 +372,8 @@ class GatewayApp:
             for goal in goals:
                 self._link.goals.end(goal, str(known), LOST, record.woken_ns * 1e-9)
 
-    async def play(self, request: Request) -> Response:
+    async def play(self, request: Request, given: NewMotion) -> object:
         """Play a motion file: all its controllers begin in one cycle; answer with their goals."""
-        given = await typed(request, NewMotion, '{"text": "name: wave ...", "speed": 0.5}')
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
             raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
         self._newest()
@@ -445,7 +392,7 @@ class GatewayApp:
         done = await self._link.command(
             LOOP, "play", played.data, f"{origin(request)}: {file}", request=played.request
         )
-        return _done(Executed(done.cycle, done.goals, seconds=played.seconds))
+        return Executed(done.cycle, done.goals, seconds=played.seconds)
 
     def _played(self, given: NewMotion, file: str) -> bytes:
         """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
@@ -467,30 +414,32 @@ class GatewayApp:
             answer = Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"})
         return msgspec.msgpack.encode(answer)
 
-    async def parameters(self, request: Request) -> Response:
-        """Return a controller's parameters, or change live ones, all of them in one cycle."""
-        if request.method == "GET":
-            now = self._preparation.parameters(self._known(request).plan)
-            return _json(Parameters((*parameters_of(now),)))
-        given = await typed(request, NewValues, '{"values": {"speed": "20 deg/s"}}')
+    async def parameters(self, request: Request) -> object:
+        """Return a controller's parameters."""
+        now = self._preparation.parameters(self._known(request).plan)
+        return Parameters((*parameters_of(now),))
+
+    async def change(self, request: Request, given: NewValues) -> object:
+        """Change live parameters of a controller, all of them in one cycle."""
         async with self._changing:  # what is checked against the values of now must meet them in the loop
             loaded = self._known(request)
             now = self._preparation.parameters(loaded.plan)
             change = changed(loaded.plan, now, given.values, bounded)
             noted = partial(self._note_parameters, loaded, change)
             done = await self._link.for_loop("parameters", change.request, origin(request), noted)
-        return _done(Changed(done.cycle, change.shown))
+        return Changed(done.cycle, change.shown)
 
     def _note_parameters(self, loaded: Loaded, change: Change, _: Done) -> None:
         loaded.plan = change.plan
 
-    async def command(self, request: Request) -> Response:
+    async def command(self, request: Request) -> object:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         kind, content = request.path_params["kind"], await body(request)
         device = self._devices.get(request.path_params["name"])
         if device is not None and kind == DEVICE_COMMANDS:
-            plans = [one.plan for one in self._link.controllers.values()]
-            name, content = device_command(device, content, plans, self._active, self._preparation.takes)
+            name, content = device_command(
+                device, content, self._plans(), self._active, self._preparation.takes
+            )
             loaded = self._link.controllers[name]
         else:
             loaded = self._known(request)
@@ -512,9 +461,9 @@ class GatewayApp:
         done = await self._link.command(
             loaded.plan.name, kind, prepared.data, origin(request), request=prepared.request
         )
-        return _done(Executed(done.cycle, done.goals))
+        return Executed(done.cycle, done.goals)
 
-    async def set_point(self, request: Request) -> Response:
+    async def set_point(self, request: Request) -> object:
         """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
 
         The last gate clamps values beyond their joints' limits; the answer counts them.
@@ -534,11 +483,10 @@ class GatewayApp:
             raise refused(Code.NOT_ACTIVE, {"controller": name})
         lease_ns = round(lease * 1e9)
         self._link.set_point(loaded, kind, prepared.data, origin(request), lease_ns, prepared.request)
-        return _done(Clamped(len(prepared.beyond), prepared.joints_beyond), 202)
+        return Clamped(len(prepared.beyond), prepared.joints_beyond)
 
-    async def switch(self, request: Request) -> Response:
+    async def switch(self, request: Request, switch: Switch) -> object:
         """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
-        switch = await typed(request, Switch, '{"activate": ["head"], "deactivate": []}')
         known = tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
@@ -548,7 +496,7 @@ class GatewayApp:
         below = self._below(switch.activate)
         done = await self._link.for_loop("switch", switch, origin(request))
         await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
-        return _done(Executed(done.cycle, below=(*below,)))
+        return Executed(done.cycle, below=(*below,))
 
     def _below(self, names: Sequence[str]) -> list[str]:
         """Return the inactive controllers that those named command, which are activated with them."""
@@ -565,53 +513,48 @@ class GatewayApp:
                     found.append(lower)
         return found
 
-    async def register(self, request: Request) -> Response:
+    async def register(self, request: Request, given: Value) -> object:
         """Have a RAM item of a joint's servo written, and answer when it was read back."""
-        given = await typed(request, Value, '{"value": 800}')
         joint, item = request.path_params["name"], request.path_params["item"]
         register = prepared_register(self._link.plan, joint, item, given.value)
         done = await self._link.for_loop("register", register, origin(request))
-        return _done(Executed(done.cycle, old=done.value, value=register.value))
+        return Executed(done.cycle, old=done.value, value=register.value)
 
-    async def read_register(self, request: Request) -> Response:
+    async def read_register(self, request: Request) -> object:
         """Have an item of a joint's servo read, and return what it has."""
         plan, joint, item = self._link.plan, request.path_params["name"], request.path_params["item"]
         reading = prepared_reading(plan, joint, item)
         done = await self._link.for_loop("get", reading, origin(request))
-        return _json({"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)})
+        return {"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)}
 
-    async def joint(self, request: Request) -> Response:
+    async def joint(self, request: Request) -> object:
         """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
         plan, joint, states = self._link.plan, request.path_params["name"], self._states()
         if (source := states.source(joint)) is not None:
-            return _json({"source": joint, "cycle": states.cycle, **source})
+            return {"source": joint, "cycle": states.cycle, **source}
         joint_row(plan, joint, (*states.sources, *states.source_states))
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
-        return _json({"joint": joint, "cycle": states.cycle, **states.joint(joint), **units})
+        return {"joint": joint, "cycle": states.cycle, **states.joint(joint), **units}
 
-    async def torque(self, request: Request) -> Response:
+    async def torque(self, request: Request, given: TorqueRequest) -> object:
         """Switch the torque of joints on or off, and answer when it was read back."""
-        given = await typed(request, TorqueBody, '{"joints": ["elbow"], "on": false}')
-        plans = [one.plan for one in self._link.controllers.values()]
-        wanted = prepared_torque(self._link.plan, plans, given.joints, given.on, given.release)
-        return await self._joints_done("torque", wanted, request)
+        joints = named_joints(self._link.plan, self._plans(), given.joints)
+        return await self._joints_done("torque", replace(given, joints=joints), request)
 
-    async def reboot(self, request: Request) -> Response:
+    async def reboot(self, request: Request, given: RebootRequest) -> object:
         """Reboot the servos of joints, and answer when they are in order again."""
-        given = await typed(request, RebootBody, '{"joints": ["elbow"]}')
-        plans = [one.plan for one in self._link.controllers.values()]
-        wanted = prepared_reboot(self._link.plan, plans, given.joints, given.release)
-        return await self._joints_done("reboot", wanted, request)
+        joints = named_joints(self._link.plan, self._plans(), given.joints)
+        require_reboots(self._link.plan, joints)
+        return await self._joints_done("reboot", replace(given, joints=joints), request)
 
     async def _joints_done(
         self, kind: str, wanted: TorqueRequest | RebootRequest, request: Request
-    ) -> Response:
+    ) -> Executed[int]:
         done = await self._link.for_loop(kind, wanted, origin(request))
         await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
         self._released |= dict.fromkeys(done.deactivated)
         offered = self._offered() if isinstance(wanted, TorqueRequest) and wanted.on else ()
-        reply = Executed[int](done.cycle, joints=wanted.joints, deactivated=done.deactivated, offered=offered)
-        return _done(reply)
+        return Executed(done.cycle, joints=wanted.joints, deactivated=done.deactivated, offered=offered)
 
     def _offered(self) -> tuple[str, ...]:
         """Return the released controllers that could be activated again: their joints have torque."""
@@ -624,62 +567,46 @@ class GatewayApp:
         limp = {joint for joint, row in rows.items() if record.states.torque[row] in LIMP}
         return tuple(name for name in self._released if limp.isdisjoint(known[name].plan.joints))
 
-    async def rate(self, request: Request) -> Response:
+    async def rate(self, request: Request, given: Rate) -> object:
         """Run the loop at another rate."""
-        rate = await typed(request, Rate, '{"rate": 100}')
-        return await self._for_loop("rate", rate, request, rate=rate.rate)
+        return await self._for_loop("rate", given, request, partial(self._link.note_rate, given.rate))
 
-    async def halt(self, request: Request) -> Response:
+    async def halt(self, request: Request) -> object:
         """Let every joint come to a stop and hold; answered when they stand still."""
-        done = await self._link.for_loop("halt", None, origin(request))
-        return _done(Executed(done.cycle, halted=done.halted))
+        return await self._for_loop("halt", None, request)
 
-    async def pause(self, request: Request) -> Response:
+    async def pause(self, request: Request) -> object:
         """Hold the joints at their goals, and stop the controllers' time."""
-        return await self._for_loop("pause", None, request, paused=True)
+        return await self._for_loop("pause", None, request, partial(self._link.note_paused, True))
 
-    async def resume(self, request: Request) -> Response:
+    async def resume(self, request: Request) -> object:
         """Let the controllers' time run again."""
-        return await self._for_loop("resume", None, request, paused=False)
+        return await self._for_loop("resume", None, request, partial(self._link.note_paused, False))
 
-    async def stop(self, request: Request) -> Response:
+    async def stop(self, request: Request) -> object:
         """End the run in order."""
         return await self._for_loop("stop", None, request)
 
     async def _for_loop(
-        self,
-        kind: str,
-        data: object,
-        request: Request,
-        *,
-        rate: float | None = None,
-        paused: bool | None = None,
-    ) -> Response:
-        """Have the loop do something; note the rate, or the pause, when it is done."""
+        self, kind: str, data: object, request: Request, noted: Callable[[Done], object] | None = None
+    ) -> Executed[int]:
+        """Have the loop do something; `noted` is called when it is done."""
+        done = await self._link.for_loop(kind, data, origin(request), noted)
+        return Executed(done.cycle, halted=done.halted)
 
-        def noted(_: Done) -> None:
-            self._link.rate = self._link.rate if rate is None else rate
-            self._link.paused = self._link.paused if paused is None else paused
-
-        return _done(Executed((await self._link.for_loop(kind, data, origin(request), noted)).cycle))
-
-    async def load(self, request: Request) -> Response:
+    async def load(self, request: Request, entry: dict[str, object]) -> object:
         """Load a controller into a paused loop."""
-        entry = await typed(request, dict[str, object], '{"name": "arm", "type": "..."}')
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
         plan = self._preparation.controller(entry, others, self._link.rate)
-        noted = partial(self._link.loaded, plan)
-        return _done(Executed((await self._link.for_loop("load", plan, origin(request), noted)).cycle))
+        return await self._for_loop("load", plan, request, partial(self._link.loaded, plan))
 
-    async def unload(self, request: Request) -> Response:
+    async def unload(self, request: Request) -> object:
         """Take a controller out of a paused loop."""
         name = self._known(request).plan.name
+        return await self._for_loop("unload", Unload(name), request, partial(self._link.unloaded, name))
 
-        def noted(_: Done) -> None:
-            self._link.controllers.pop(name, None)
-
-        done = await self._link.for_loop("unload", Unload(name), origin(request), noted)
-        return _done(Executed(done.cycle))
+    def _plans(self) -> list[ControllerPlan]:
+        return [one.plan for one in self._link.controllers.values()]
 
     def _active(self, plan: ControllerPlan) -> bool:
         return self._link.active(self._link.controllers[plan.name])
@@ -692,36 +619,75 @@ class GatewayApp:
         return loaded
 
 
-def _answered(handler: Handler, allowance: Allowance | None) -> Handler:
-    """Return a handler whose refusals become answers, for as many requests as a client may make."""
+class Asked(NamedTuple):
+    """A request that clients may make."""
 
-    async def answer(request: Request) -> Response:
-        try:
-            if allowance is not None:
-                allowance.spend(peer(request))
-            return await handler(request)
-        except RefusedRequest as error:
-            return _refused(error.refusal)
-        except ClientDisconnect:
-            return Response(status_code=400)  # no client reads it
-        except RecursionError:  # only a body can be so deep
-            return _refused(Refusal(Code.INVALID, {"problem": "the body is nested too deeply"}))
-        except Exception as error:  # the last resort: one request fails, and the gateway serves the next
-            traceback.print_exc()
-            return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
-        finally:
-            if allowance is not None:
-                allowance.charge(peer(request), getattr(request.state, "received", 0))
+    method: str
+    path: str
+    handler: Callable[..., Awaitable[object]]
+    """Gets the request, and its body where that has a type; returns the answer."""
+    rate: float
+    """How many a second of one process, together with all others of this number; 0: it is always taken."""
+    body: type | None = None
 
-    return answer
+
+REQUESTS = (
+    Asked("GET", "/robot", GatewayApp.robot, MOST_LOOKS),
+    Asked("GET", "/states", GatewayApp.states, MOST_LOOKS),
+    Asked("GET", "/frames", GatewayApp.frames, MOST_LOOKS),
+    Asked("GET", "/events", GatewayApp.events, MOST_LOOKS),
+    Asked("GET", "/topics", GatewayApp.topics, MOST_LOOKS),
+    Asked("GET", "/stream", GatewayApp.stream, MOST_LOOKS),
+    Asked("GET", "/goals", GatewayApp.goals, MOST_LOOKS),
+    Asked("GET", "/goals/{number}", GatewayApp.goal, MOST_LOOKS),
+    Asked("POST", "/goals/{number}/cancel", GatewayApp.cancel, MOST_OPERATIONS),
+    Asked("POST", "/controllers/{name}/cancel", GatewayApp.cancel, MOST_OPERATIONS),
+    Asked("GET", "/controllers/{name}/parameters", GatewayApp.parameters, MOST_OPERATIONS),
+    Asked("POST", "/controllers/{name}/parameters", GatewayApp.change, MOST_OPERATIONS, NewValues),
+    Asked("POST", "/controllers/{name}/commands/{kind}", GatewayApp.command, MOST_OPERATIONS),
+    Asked("POST", "/controllers/{name}/set-points/{kind}", GatewayApp.set_point, MOST_SET_POINTS),
+    Asked("POST", "/controllers", GatewayApp.load, MOST_OPERATIONS, dict[str, object]),
+    Asked("DELETE", "/controllers/{name}", GatewayApp.unload, MOST_OPERATIONS),
+    Asked("POST", "/play", GatewayApp.play, MOST_OPERATIONS, NewMotion),
+    Asked("POST", "/switch", GatewayApp.switch, MOST_OPERATIONS, Switch),
+    # a path, since servos that share joints have names such as hip/1
+    Asked("POST", "/joints/{name:path}/registers/{item}", GatewayApp.register, MOST_OPERATIONS, Value),
+    Asked("GET", "/joints/{name:path}/registers/{item}", GatewayApp.read_register, MOST_OPERATIONS),
+    Asked("GET", "/joints/{name:path}", GatewayApp.joint, MOST_LOOKS),
+    Asked("POST", "/torque", GatewayApp.torque, MOST_OPERATIONS, TorqueRequest),
+    Asked("POST", "/reboot", GatewayApp.reboot, MOST_OPERATIONS, RebootRequest),
+    Asked("POST", "/rate", GatewayApp.rate, MOST_OPERATIONS, Rate),
+    Asked("POST", "/halt", GatewayApp.halt, 0),
+    Asked("POST", "/pause", GatewayApp.pause, MOST_OPERATIONS),
+    Asked("POST", "/resume", GatewayApp.resume, MOST_OPERATIONS),
+    Asked("POST", "/stop", GatewayApp.stop, 0),
+)
+"""All of them. Halt and stop are always taken, as far as there is room."""
+_EXAMPLES: Mapping[type, str] = {
+    NewValues: '{"values": {"speed": "20 deg/s"}}',
+    dict[str, object]: '{"name": "arm", "type": "..."}',
+    NewMotion: '{"text": "name: wave ...", "speed": 0.5}',
+    Switch: '{"activate": ["head"], "deactivate": []}',
+    Value: '{"value": 800}',
+    TorqueRequest: '{"joints": ["elbow"], "on": false}',
+    RebootRequest: '{"joints": ["elbow"]}',
+    Rate: '{"rate": 100}',
+}
+"""Of each body, for what is refused."""
+
+
+def _response(reply: object) -> Response:
+    """Return the response for what a handler returned."""
+    if isinstance(reply, Response):
+        return reply
+    if isinstance(reply, Executed | Changed | Clamped):
+        status = 202 if isinstance(reply, Clamped) else 200
+        return _json({"done": True, **msgspec.to_builtins(reply)}, status)
+    return _json(reply)
 
 
 def _json(content: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
-
-
-def _done(reply: Executed[int] | Changed | Clamped, status: int = 200) -> Response:
-    return _json({"done": True, **msgspec.to_builtins(reply)}, status)
 
 
 def _mistaken(error: InputError) -> dict[str, Field]:
@@ -815,12 +781,12 @@ async def body(request: Request) -> bytes:
     return bytes(content)
 
 
-async def typed(request: Request, kind: type[T], example: str) -> T:
+async def typed(request: Request, kind: type[T]) -> T:
     """Return a body that is JSON of a type; raises RefusedRequest."""
     try:
         return msgspec.json.decode(await body(request), type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{error}; write for example {example}") from error
+        raise invalid(f"{error}; write for example {_EXAMPLES[kind]}") from error
 
 
 def number(request: Request, name: str, default: float) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.compile.joints.registers import UnfitRegister, steered_value
-from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
+from dxlrun.control.joint_requests import Register, RegisterReading
 from dxlrun.description.joints.groups import ALL
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table
@@ -29,39 +30,29 @@ _MOST_NAMES = 5
 
 def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -> RobotStates:
     """Return the states of a cycle; `controllers` with their places in its record."""
-    layout, states, goals, sources = record.layout, record.states, record.goals, record.sources
+    layout, states = record.layout, record.states
+    row = np.frombuffer(record.raw, layout.dtype)[0]
+    known = row.dtype.names or ()
+    arrays = {name: row[name] for name in RobotStates.__struct_fields__ if name in known}
     efforts = effort_units(plan)
     timed = {name: place for name, place in controllers.items() if place < len(record.controller_ns)}
+    special: dict[str, Any] = {
+        "cycle": record.cycle,
+        "mode": tuple(Mode(mode).name.lower() for mode in states.mode.tolist()),
+        "torque": tuple(Torque(torque).name.lower() for torque in states.torque.tolist()),
+        "controller_ns": record.controller_ns[[*timed.values()]],
+    }
     return RobotStates(
-        cycle=record.cycle,
+        **arrays | special,
         time_ns=record.woken_ns,
         late_ns=record.woken_ns - record.scheduled_ns,
         joints=layout.joints,
         units=tuple("m" if joint.linear else "rad" for joint in plan.loop.joints),
         effort_units=tuple(efforts.get(name, "") for name in layout.joints),
-        position=states.position,
-        velocity=states.velocity,
-        effort=states.effort,
-        valid=states.valid,
-        age_ns=states.age_ns,
-        goal_position=goals.position,
-        goal_velocity=goals.velocity,
-        goal_effort=goals.effort,
-        goal_pwm=goals.pwm,
-        temperature=states.temperature,
-        voltage=states.voltage,
-        hardware_error=states.hardware_error.astype(np.int64),
-        mode=tuple(Mode(mode).name.lower() for mode in states.mode.tolist()),
-        torque=tuple(Torque(torque).name.lower() for torque in states.torque.tolist()),
         references=layout.references,
-        reference=record.reference,
         source_states=layout.source_states,
-        source_state=sources.values,
         sources=layout.sources,
-        source_valid=sources.valid,
-        source_age_ns=sources.age_ns,
         controllers=tuple(timed),
-        update_ns=record.controller_ns[[*timed.values()]],
     )
 
 
@@ -112,18 +103,8 @@ def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Seque
     )
 
 
-def prepared_torque(
-    plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str], on: bool, release: bool
-) -> TorqueRequest:
-    """Return the data of the loop's command for torque; raises RefusedRequest."""
-    return TorqueRequest(named_joints(plan, controllers, names), on, release)
-
-
-def prepared_reboot(
-    plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str], release: bool
-) -> RebootRequest:
-    """Return the data of the loop's command for reboots; raises RefusedRequest where a servo knows none."""
-    joints = named_joints(plan, controllers, names)
+def require_reboots(plan: Plan, joints: tuple[str, ...]) -> None:
+    """Raise RefusedRequest where a servo of these joints knows no reboot."""
     servos = plan.servos_by_joint
     cannot = [
         label
@@ -136,7 +117,6 @@ def prepared_reboot(
         verb = "knows" if len(cannot) == 1 else "know"
         what = f"{', '.join(cannot)} {verb} no reboot instruction: switch the torque off and on, or the power"
         raise refused(Code.NOT_REBOOTED, {"joint": joints, "problem": what})
-    return RebootRequest(joints, release)
 
 
 # Registers

@@ -223,6 +223,18 @@ class Link:
         if done.place is not None:
             self.controllers[plan.name] = Loaded(plan, done.place)
 
+    def unloaded(self, name: str, _: Done) -> None:
+        """Note that a controller is gone."""
+        self.controllers.pop(name, None)
+
+    def note_rate(self, rate: float, _: Done) -> None:
+        """Note that the loop runs at another rate, Hz."""
+        self.rate = rate
+
+    def note_paused(self, paused: bool, _: Done) -> None:
+        """Note that the loop is paused, or goes on."""
+        self.paused = paused
+
     async def watch(self) -> None:
         """Collect answers and events for ever."""
         while True:

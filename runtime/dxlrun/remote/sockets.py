@@ -164,7 +164,7 @@ class RobotLink(Protocol):
 
 
 class SocketLink:
-    """HTTP on the socket of a run: one connection for requests, one at a time, and one more for each stream."""
+    """HTTP on the socket of a run: one connection for requests, one at a time, and one for each stream."""
 
     def __init__(self, path: Path, client: str) -> None:
         self._path = path

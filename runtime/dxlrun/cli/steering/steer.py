@@ -6,7 +6,7 @@ Each is one request to the gateway of the run: executed after the read of a cycl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -136,15 +136,10 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
     """Let every joint of a running robot come to a stop within its limits and hold; the run goes on."""
     with robot_of(chosen, "halt") as robot:
         done = robot.halt()
-        if chosen.as_json:
-            show_json_line({"robot": robot.name, "done": True, **asdict(done)})
-            return 0
-        fastest = f"{done.joint}: {done.velocity:.2g} rad/s"
-        show(
-            f"{robot.name} stands still after {done.seconds:.2f} s ({fastest}); "
-            "`dxlrun switch --activate NAME` lets it go on"
-        )
-        return 0
+        text = f"{robot.name} stands still"
+        if (found := done.halted) is not None:
+            text += f" after {found.seconds:.2f} s ({found.joint}: {found.velocity:.2g} rad/s)"
+        return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it go on")
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
@@ -231,6 +226,8 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
         cycle: dict[str, object] = {} if done is None else {"cycle": done.cycle}
         if done is not None and done.value is not None:
             cycle |= {"value": done.value} if done.old is None else {"old": done.old, "value": done.value}
+        if done is not None and done.halted is not None:
+            cycle |= {name: getattr(done.halted, name) for name in ("seconds", "joint", "velocity")}
         for name in ("below", "deactivated", "offered"):
             if done is not None and (names := getattr(done, name)):
                 cycle |= {name: list(names)}

@@ -269,7 +269,7 @@ def _age(row: Row) -> Cell:
 
 def controllers(watched: Watched) -> Table:
     """Return a row for each controller: what it does, its rate, and how long its update took."""
-    updates = dict(zip(watched.states.controllers, watched.states.update_ns.tolist(), strict=True))
+    updates = dict(zip(watched.states.controllers, watched.states.controller_ns.tolist(), strict=True))
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
         (Column("state", "name"), lambda one: Cell(state(one), "good" if one["active"] else "plain")),

@@ -61,8 +61,9 @@ class RobotStates(msgspec.Struct, frozen=True):
     sources: tuple[str, ...]
     source_valid: Bools
     source_age_ns: Integers
+    """-1: none ever came."""
     controllers: tuple[str, ...]
-    update_ns: Integers
+    controller_ns: Integers
     """How long each controller's update took in this cycle; 0: it had none."""
 
     def joint(self, name: str) -> dict[str, object]:
@@ -93,7 +94,7 @@ class RobotStates(msgspec.Struct, frozen=True):
 
 def encoded(states: RobotStates) -> bytes:
     """Return states as JSON; NaN becomes null."""
-    return msgspec.json.encode(states, enc_hook=np.ndarray.tolist)
+    return msgspec.json.encode(states, enc_hook=lambda array: array.tolist())
 
 
 def array(kind: type, values: object) -> object:
