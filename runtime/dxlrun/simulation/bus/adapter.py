@@ -74,25 +74,17 @@ class SimulatedAdapter:
     def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
         """Return what the host receives by a time."""
         given: list[HandOver] = []
-        if self.timer_ns:
-            while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
-                if not self._burst:
-                    self._timed_ns = due_ns
-                    self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))
+        while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
+            if self._burst:
                 given.append(self._burst.popleft())
-            return given
-        while self._arrived or passing:
-            first = self._arrived[0] if self._arrived else passing[0]
-            begin, end, size = first.given, first.given + self._piece, len(first.data)
-            due_ns = first.due_ns if end >= size else first.passed_ns(end - 1)
-            if due_ns > now_ns:
-                break
-            first.given = end
-            if end >= size:
-                self._arrived.popleft()  # what has passed to its end has arrived
-            ended = (first,) if end >= size else ()
-            given.append((due_ns, first.data[begin:end], ended))
-            self._piece = self._next_piece()
+            elif self.timer_ns:
+                self._timed_ns = due_ns
+                self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))
+            else:
+                first = self._arrived[0] if self._arrived else passing[0]
+                most = min(self._piece, len(first.data) - first.given)
+                given.append(self._gather(due_ns, most, passing))
+                self._piece = self._next_piece()
         return given
 
     def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
