@@ -9,7 +9,7 @@ import numpy as np
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.description.modes import Mode
 from dxlrun.log import schemas
-from dxlrun.log.log_writer import DIAGNOSTICS_NS, Diagnostics
+from dxlrun.log.packing.diagnostics import DIAGNOSTICS_NS, Diagnostics
 from dxlrun.messages.cdr import Codec
 
 JOINTS = ("elbow", "wheel", "head")

@@ -19,7 +19,7 @@ from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
-from dxlrun.log.log_writer import LogFile
+from dxlrun.log.log_file import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.schemas import LogHeader

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, TypeVar, cast
 
@@ -21,12 +18,13 @@ from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, deco
 from dxlrun.channels.messages import decode_message, decode_topic
 from dxlrun.channels.packets import BatchedPacket, split_packets
 from dxlrun.channels.ring import Payload, RecordKind
-from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
+from dxlrun.log.log_file import LogFile
 from dxlrun.log.packing.bus_messages import pack_packets
+from dxlrun.log.packing.diagnostics import Diagnostics
 from dxlrun.log.packing.frame_messages import Stamp, frame_messages
-from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
+from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 
@@ -41,11 +39,6 @@ _LIBRARY = "dxlrun"
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 JOINT_COMMANDS_NS = 10_000_000
 """In so much time there is one message of /joint_commands; /cycle has the goals of each cycle."""
-DIAGNOSTICS_NS = 1_000_000_000
-"""The least time between two messages of /diagnostics."""
-_OK, _ERROR, _STALE = 0, 2, 3
-"""Levels of diagnostic_msgs/msg/DiagnosticStatus."""
-_Status = tuple[int, str, str, str, tuple[tuple[str, str], ...]]
 
 
 class LogWriter:
@@ -385,101 +378,3 @@ class LogWriter:
         )
         self._writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
         self._file.sync()
-
-
-class Diagnostics:
-    """Makes a message of a cycle when the last one is old enough; rows are in the order of the joints."""
-
-    def __init__(self, joints: Sequence[str]) -> None:
-        self._joints = tuple(joints)
-        self._codec = Codec(schemas.DIAGNOSTICS)
-        self._due_ns: int | None = None
-
-    def of(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
-        """Return the message of a cycle at `t_ns`, None while the one before is new."""
-        if self._due_ns is not None and t_ns < self._due_ns:
-            return None
-        self._due_ns = t_ns + DIAGNOSTICS_NS
-        statuses = [self._status(record, row, name) for row, name in enumerate(self._joints)]
-        return self._codec.pack((stamp, ""), statuses)
-
-    def _status(self, record: np.void, row: int, name: str) -> _Status:
-        error = int(record["hardware_error"][row])
-        level, message = _OK, "answers"
-        if error:
-            level, message = _ERROR, f"hardware error 0x{error:02X}"
-        elif not record["valid"][row]:
-            level, message = _STALE, "did not answer in this cycle"
-        values = (
-            ("temperature", _number(record["temperature"][row], "deg C")),
-            ("voltage", _number(record["voltage"][row], "V")),
-            ("hardware_error", f"0x{error:02X}"),
-            ("mode", _mode(int(record["mode"][row]))),
-        )
-        return level, name, message, "", values
-
-
-def _number(value: float, unit: str) -> str:
-    return f"{value:.1f} {unit}" if np.isfinite(value) else "not read yet"
-
-
-def _mode(number: int) -> str:
-    with suppress(ValueError):
-        return Mode(number).name.lower()
-    return str(number)
-
-
-class LogFile:
-    """Unbuffered bytes on a disk; every method raises OSError when the disk does not take or keep them."""
-
-    __slots__ = ("_descriptor", "_path", "_size")
-
-    def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, LOG_MODE)
-        if os.fstat(self._descriptor).st_size:  # empty is how a name is taken before a log begins
-            os.close(self._descriptor)
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-        self._path = path
-        self._size = 0
-
-    def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Write all of `data`; Linux may take it in pieces, and the last piece shows a full disk."""
-        if os.fstat(self._descriptor).st_size < self._size:
-            raise OSError(errno.EIO, "the file was cut by another program")
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(self._descriptor, rest) :]
-        self._size += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        """Return how many bytes were written whole."""
-        return self._size
-
-    def flush(self) -> None:
-        """Nothing is held back here."""
-
-    def sync(self) -> None:
-        """Wait until the disk has what was written."""
-        os.fdatasync(self._descriptor)
-
-    def truncate(self, size: int) -> None:
-        """Cut what lies behind `size`; a file that is shorter stays so."""
-        size = min(size, os.fstat(self._descriptor).st_size)
-        os.ftruncate(self._descriptor, size)
-        os.lseek(self._descriptor, size, os.SEEK_SET)
-        self._size = size
-
-    @property
-    def gone(self) -> bool:
-        """Whether another program deleted, moved or replaced the file."""
-        ours = os.fstat(self._descriptor)
-        try:
-            there = self._path.stat()
-        except OSError:
-            return True
-        return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
-
-    def close(self) -> None:
-        """Let go of the file."""
-        os.close(self._descriptor)

@@ -51,9 +51,6 @@ FORMAT = "8"
 READ_FORMATS = ("7", FORMAT)
 """In 7, a message of /bus/NAME has the packets of one cycle, and no attachment is compressed."""
 
-LOG_MODE = 0o640
-"""Of a new log: commands and the names of clients are for its user and group."""
-
 
 def bus_topic(bus: str) -> str:
     """Return the topic of a bus' packets."""

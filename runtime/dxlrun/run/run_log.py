@@ -16,8 +16,9 @@ from dxlrun.contract.hookspecs import CONTRACT_VERSION
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
+from dxlrun.log.log_file import LOG_MODE
 from dxlrun.log.part_writer import FOLDER_MODE
-from dxlrun.log.schemas import KEPT_ATTACHMENT, LOG_MODE, LoggedController, LogHeader
+from dxlrun.log.schemas import KEPT_ATTACHMENT, LoggedController, LogHeader
 from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 

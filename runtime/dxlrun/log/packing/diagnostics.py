@@ -1,0 +1,60 @@
+"""Messages of /diagnostics: temperature, voltage, hardware error and mode of each servo, once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from dxlrun.description.modes import Mode
+from dxlrun.log.schemas import DIAGNOSTICS
+from dxlrun.messages.cdr import Codec
+
+DIAGNOSTICS_NS = 1_000_000_000
+"""The least time between two messages."""
+_OK, _ERROR, _STALE = 0, 2, 3
+"""Levels of diagnostic_msgs/msg/DiagnosticStatus."""
+_Status = tuple[int, str, str, str, tuple[tuple[str, str], ...]]
+
+
+class Diagnostics:
+    """Makes a message of a cycle when the last one is old enough; rows are in the order of the joints."""
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = tuple(joints)
+        self._codec = Codec(DIAGNOSTICS)
+        self._due_ns: int | None = None
+
+    def of(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
+        """Return the message of a cycle at `t_ns`, None while the one before is new."""
+        if self._due_ns is not None and t_ns < self._due_ns:
+            return None
+        self._due_ns = t_ns + DIAGNOSTICS_NS
+        statuses = [self._status(record, row, name) for row, name in enumerate(self._joints)]
+        return self._codec.pack((stamp, ""), statuses)
+
+    def _status(self, record: np.void, row: int, name: str) -> _Status:
+        error = int(record["hardware_error"][row])
+        level, message = _OK, "answers"
+        if error:
+            level, message = _ERROR, f"hardware error 0x{error:02X}"
+        elif not record["valid"][row]:
+            level, message = _STALE, "did not answer in this cycle"
+        values = (
+            ("temperature", _number(record["temperature"][row], "deg C")),
+            ("voltage", _number(record["voltage"][row], "V")),
+            ("hardware_error", f"0x{error:02X}"),
+            ("mode", _mode(int(record["mode"][row]))),
+        )
+        return level, name, message, "", values
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.1f} {unit}" if np.isfinite(value) else "not read yet"
+
+
+def _mode(number: int) -> str:
+    with suppress(ValueError):
+        return Mode(number).name.lower()
+    return str(number)
