@@ -15,10 +15,11 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
+from dxlrun.channels import fence
+from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.packets import PacketKind
 from dxlrun.clock import MonotonicClock
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import FREE_NS
 from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
 from dxlrun.dynamixel.hardware import DynamixelHardware
@@ -103,14 +104,14 @@ def test_kernel_and_parser_agree_on_many_streams():
 
 
 def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monkeypatch):
-    shutil.copy(kernel.LIBRARY, tmp_path / "libkernel.so")
-    kernel.load(tmp_path / "libkernel.so")
+    shutil.copy(fence.LIBRARY, tmp_path / "libkernel.so")
+    fence.library(path=tmp_path / "libkernel.so")
     (tmp_path / "kernel.c").write_text("int changed;")
-    monkeypatch.setattr(kernel, "SOURCE", tmp_path / "kernel.c")
+    monkeypatch.setattr(fence, "SOURCE", tmp_path / "kernel.c")
     with pytest.raises(StartUpError, match=r"of another source than kernel\.c .* install dxlrun again"):
-        kernel.load(tmp_path / "libkernel.so")
+        fence.library(path=tmp_path / "libkernel.so")
     with pytest.raises(StartUpError, match=r"kernel .* is missing: install dxlrun again"):
-        kernel.load(tmp_path / "absent.so")
+        fence.library(path=tmp_path / "absent.so")
 
 
 def test_structs_of_c_are_read_with_their_pointers_arrays_and_functions(tmp_path):
@@ -127,7 +128,7 @@ typedef struct Big {
     float last;
 } Big;
 """
-    small, big = kernel.structs(source).values()
+    small, big = structs(source).values()
     assert [(name, ctypes.sizeof(kind)) for name, kind in small._fields_] == [("one", 2), ("two", 2)]
     sizes = {"many": 8, "more": 8, "flags": 3, "own": 8, "call": 8, "last": 4}
     assert {name: ctypes.sizeof(kind) for name, kind in big._fields_} == sizes
@@ -380,7 +381,7 @@ def test_a_build_asks_for_a_compiler_where_none_works(build, tmp_path, monkeypat
     why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so")
     assert bool(why) != works
     if works:
-        kernel.load(tmp_path / "libkernel.so")
+        fence.library(path=tmp_path / "libkernel.so")
 
 
 def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, monkeypatch):

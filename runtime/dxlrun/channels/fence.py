@@ -1,4 +1,4 @@
-"""Fence: in which order other processes see what this one writes into shared memory.
+"""Fence: in which order other processes see what this one writes into shared memory; by the compiled kernel.
 
 Python has no memory barriers, so the exchange's kernel has one (C11, `atomic_thread_fence`). What is written
 before a fence is visible before what is written after it; what is read after a fence is no older than what
@@ -12,38 +12,35 @@ import ctypes
 from collections.abc import Callable
 from pathlib import Path
 
+from dxlrun.channels.compiled import compiled
 from dxlrun.errors import StartUpError
 
-_LIBRARY = Path(__file__).parents[1] / "dynamixel" / "exchange" / "libkernel.so"
-MISSING = "the compiled kernel of the exchange is missing: install dxlrun again, on Linux"
+SOURCE = Path(__file__).parents[1] / "dynamixel" / "exchange" / "kernel.c"
+LIBRARY = SOURCE.with_name("libkernel.so")  # Where the build puts the compiled kernel
 
 
-def _nothing() -> None:
-    """Stand in for the kernel's fence where that was not built."""
+def library(kind: type[ctypes.CDLL] = ctypes.PyDLL, path: Path | None = None) -> ctypes.CDLL:
+    """Return the functions of the compiled kernel.
 
-
-def library(path: Path = _LIBRARY) -> ctypes.PyDLL:
-    """Return the compiled kernel's functions for shared memory.
-
-    Their calls keep the interpreter: they take no time in which others could have it. Raises OSError where it
-    was not built, AttributeError where it is not a kernel.
+    By default their calls keep the interpreter: they take no time in which others could have it. Raises
+    StartUpError where it was not built, or of another source.
     """
-    found = ctypes.PyDLL(str(path))
-    address = ctypes.c_void_p
-    found.dxl_fence.argtypes, found.dxl_fence.restype = (), None
-    size = ctypes.c_uint64
-    found.dxl_append.argtypes = (address, size, size, ctypes.c_uint32, address, size)
-    found.dxl_append.restype = ctypes.c_int64
-    found.dxl_commit.argtypes, found.dxl_commit.restype = (address, size, size, address), None
+    found = compiled(SOURCE, kind, path or LIBRARY)
+    address, size, number, time = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int32, ctypes.c_int64
+    for name, result, arguments in (
+        ("fence", None, ()),
+        ("append", time, (address, size, size, ctypes.c_uint32, address, size)),
+        ("commit", None, (address, size, size, address)),
+        ("read", number, (address,)),
+        ("write", number, (address,)),
+        ("abandon", None, (address,)),
+        ("take", None, (address, number, number, address, time)),
+        ("settle", number, (address, time)),
+        ("show", None, (address, time)),
+    ):
+        function = getattr(found, f"dxl_{name}")
+        function.argtypes, function.restype = arguments, result
     return found
-
-
-def functions() -> ctypes.PyDLL:
-    """Return the installed kernel's functions; raises StartUpError where it was not compiled."""
-    try:
-        return library()
-    except (OSError, AttributeError):
-        raise StartUpError(MISSING) from None
 
 
 def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
@@ -51,20 +48,18 @@ def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
     return (ctypes.c_char * len(memory)).from_buffer(memory)
 
 
-def load(path: Path = _LIBRARY) -> Callable[[], None]:
+def _nothing() -> None:
+    """Stand in for the kernel's fence where that was not built: robot files are checked everywhere."""
+
+
+def load() -> Callable[[], None]:
     """Return the compiled fence; one that does nothing where there is none."""
     try:
-        compiled: Callable[[], None] = library(path).dxl_fence
-    except (OSError, AttributeError):
+        ordered: Callable[[], None] = library().dxl_fence
+    except StartUpError:
         return _nothing
-    return compiled
+    return ordered
 
 
 fence = load()
 """Order the memory accesses before it and behind it."""
-
-
-def require(compiled: Callable[[], None] = fence) -> None:
-    """Raise StartUpError where processes could not rely on the order of their shared memory."""
-    if compiled is _nothing:
-        raise StartUpError(MISSING)

@@ -36,7 +36,7 @@ from functools import partial
 from typing import NamedTuple, Protocol
 from zlib import crc32
 
-from dxlrun.channels.fence import array_of, fence, functions
+from dxlrun.channels.fence import array_of, fence, library
 
 RING_SECONDS = 10
 """How long a reader may be away before records are lost, at the rates that the sizes are computed for."""
@@ -176,9 +176,9 @@ class RingWriter(_Ring):
 
     __slots__ = ("_append", "_compiled", "_place")
 
-    def __init__(self, memory: int | memoryview, compiled: ctypes.PyDLL | None = None) -> None:
+    def __init__(self, memory: int | memoryview, compiled: ctypes.CDLL | None = None) -> None:
         super().__init__(memory, mmap.MAP_POPULATE)
-        self._compiled = compiled or functions()
+        self._compiled = compiled or library()
         self._place = array_of(self._bytes), self._capacity
         self._append = partial(self._compiled.dxl_append, *self._place, self.longest)
 

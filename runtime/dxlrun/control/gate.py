@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.kernel import compiled, structs
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 

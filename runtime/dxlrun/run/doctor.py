@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from dxlrun.channels import fence
 from dxlrun.control.realtime import (
     IDLE_LATENCY,
     IPC_LOCK,
@@ -23,7 +24,6 @@ from dxlrun.control.realtime import (
     lockable_bytes,
     user,
 )
-from dxlrun.dynamixel.exchange import kernel as compiled_exchange
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
 from dxlrun.errors import StartUpError
 
@@ -106,7 +106,7 @@ def may_schedule() -> bool:
 
 def _compiled() -> str:
     try:
-        compiled_exchange.load()
+        fence.library()
     except StartUpError as error:
         return f"{error}"
     return ""

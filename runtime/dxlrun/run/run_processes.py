@@ -48,7 +48,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
 
     `kept`: what its controllers kept in earlier runs. Raises StartUpError where its order is not ensured.
     """
-    fence.require()
+    fence.library()
     servos = sum(len(bus.servos) for bus in plan.buses)
     sensed = sensed_bodies(plan)
     period, cycle = plan.loop.period_ns, plan.loop.layout.size

@@ -8,23 +8,19 @@ share are those of `kernel.c`: they are read from there.
 from __future__ import annotations
 
 import ctypes
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from types import MappingProxyType
-from typing import TypeVar
-from zlib import crc32
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, Floats, States
-from dxlrun.channels.fence import MISSING, array_of
+from dxlrun.channels.fence import SOURCE, array_of, library
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
@@ -34,12 +30,10 @@ from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.errors import PortError, StartUpError
+from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import BusPlan, Field
 from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 
-LIBRARY = Path(__file__).with_name("libkernel.so")  # Where the build puts the compiled kernel
-SOURCE = Path(__file__).with_name("kernel.c")
 _ROOM = 8192  # Bytes of a line's buffer; the replies to one read may take a quarter of it
 _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32": 3}
 
@@ -59,28 +53,6 @@ class Answer(IntEnum):
 _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
-
-
-def structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
-    """Return the structs that a C source defines, by name; a pointer is an address.
-
-    Their fields are numbers of fixed size, pointers to anything, structs above, and arrays of these.
-    """
-    text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    sizes = dict(re.findall(r"#define (\w+) (\d+)", text))
-    found: dict[str, type[ctypes.Structure]] = {}
-    for body, struct in re.findall(r"typedef struct(?: \w+)? \{(.*?)\n\} (\w+);", text, re.DOTALL):
-        fields: list[tuple[str, type[ctypes._CDataType]]] = []
-        for line in body.replace("const ", "").split(";")[:-1]:
-            if function := re.search(r"\(\*(\w+)\)", line):
-                fields.append((function[1], c_void_p))
-                continue
-            kind, names = line.split(maxsplit=1)
-            for star, name, count in re.findall(r"(\*?)(\w+)(?:\[(\w+)\])?(?:, |$)", names):
-                one = c_void_p if star else found.get(kind) or getattr(ctypes, f"c_{kind.removesuffix('_t')}")
-                fields.append((name, one * int(sizes.get(count, count)) if count else one))
-        found[struct] = type(struct, (ctypes.Structure,), {"_fields_": fields})
-    return MappingProxyType(found)
 
 
 STRUCTS = structs(SOURCE.read_text())
@@ -105,39 +77,6 @@ def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
         saved_ns=50_000_000,  # what was saved in a pause is not spent at once
         enabled=1,
     )
-
-
-Library = TypeVar("Library", bound=ctypes.CDLL)
-
-
-def compiled(source: Path, kind: type[Library], path: Path | None = None) -> Library:
-    """Return what the build compiled of a C source, which lies beside it.
-
-    Raises StartUpError where it was not built, or of another source.
-    """
-    try:
-        library = kind(str(path or source.with_name(f"lib{source.stem}.so")))
-    except OSError:
-        raise StartUpError(MISSING) from None
-    if library.dxl_source() & 0xFFFFFFFF != crc32(source.read_bytes()):
-        raise StartUpError(
-            f"the compiled kernel is of another source than {source.name} beside it: {MISSING}"
-        )
-    return library
-
-
-def load(path: Path | None = None) -> ctypes.CDLL:
-    """Return the compiled kernel. Raises StartUpError as `compiled`."""
-    library = compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
-    library.dxl_read.argtypes = library.dxl_write.argtypes = library.dxl_abandon.argtypes = (c_void_p,)
-    library.dxl_abandon.restype = None
-    library.dxl_take.argtypes, library.dxl_take.restype = (
-        (c_void_p, c_int32, c_int32, c_void_p, c_int64),
-        None,
-    )
-    library.dxl_settle.argtypes = library.dxl_show.argtypes = (c_void_p, c_int64)
-    library.dxl_show.restype = None
-    return library
 
 
 class PlannedRead(msgspec.Struct, frozen=True):
@@ -253,7 +192,7 @@ class Kernel:
         clock: Clock,
         beat: Callable[[], None],
     ) -> None:
-        self._library = load()
+        self._library = library(ctypes.CDLL)
         self._known = tuple(lines)
         self._packets = packets
         self._ports = ports
