@@ -51,17 +51,17 @@ def test_a_joint_is_blocked_from_when_its_goal_left_it() -> None:
     [
         (0.04, 10.0, "joint_shakes"),
         (0.04, 4.0, "hunting_joint"),
-        (0.018, 5.0, "hunting_joint"),
+        (0.015, 5.0, "hunting_joint"),
         (0.005, 5.0, ""),
     ],
 )
 def test_a_joint_that_turns_again_and_again_shakes(swing: float, hertz: float, code: str) -> None:
     shaking = np.where(FAULT, swing * np.cos(2 * math.pi * hertz * TIME), 0.0)
-    found = findings(Joint(position=SWING + shaking), Joint(), Joint())
+    found = findings(Joint(position=behind(SWING) + shaking), Joint(), Joint())
     assert [(one.code, one.subject) for one in found] == [(code, "j0")] * bool(code)
     assert all("around its goal" in one.sentence and "times a second" in one.sentence for one in found)
     assert findings(Joint(way=shaking, position=behind(shaking, 1)), Joint(), Joint()) == []  # as it is told
-    both = [Joint(position=SWING + shaking), Joint(position=SWING + shaking)]
+    both = [Joint(position=behind(SWING) + shaking), Joint(position=behind(SWING) + shaking)]
     assert bool(findings(*both, Joint())) == (code == "joint_shakes")
 
 

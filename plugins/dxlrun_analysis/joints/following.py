@@ -319,15 +319,17 @@ def _turning(values: Floats, least: float) -> list[int]:
     moved = np.flatnonzero(step)
     turns = moved[1:][step[moved[1:]] != step[moved[:-1]]]
     found: list[int] = []
-    direction, furthest = 0.0, 0
+    direction, lowest, highest = 0, 0, 0
     for at in (*turns.tolist(), len(values) - 1):
-        gone = float(values[at] - values[furthest])
-        if gone * direction > 0:
-            furthest = at
-        elif abs(gone) >= least:
-            found.append(furthest)
-            direction, furthest = math.copysign(1.0, gone), at
-    return [*found, furthest] if direction else []
+        lowest = at if values[at] < values[lowest] else lowest
+        highest = at if values[at] > values[highest] else highest
+        if direction <= 0 and values[at] - values[lowest] >= least:
+            found.append(lowest)
+            direction, highest = 1, at
+        elif direction >= 0 and values[highest] - values[at] >= least:
+            found.append(highest)
+            direction, lowest = -1, at
+    return [*found, highest if direction > 0 else lowest] if direction else []
 
 
 def _even(at_s: Floats) -> bool:

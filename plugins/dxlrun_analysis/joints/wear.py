@@ -80,9 +80,9 @@ def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
         found = (
             _turns_badly(one, turns[at], [turn for other in others for turn in turns[other]])
             or _takes_more(one, turns[at], [turns[other] for other in others])
+            or _hunts(one, swings[at], [swings[other] for other in others])
             or _pulled(one, visits[at], [visit for other in others for visit in visits[other]], turns[at])
             or _jerked(one, jerks[at], [jerks[other] for other in others])
-            or _hunts(one, swings[at], [swings[other] for other in others])
         )
         if found is not None:
             yield found
