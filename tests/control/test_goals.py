@@ -399,24 +399,9 @@ def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(active):
     assert story.active(4) == (["leg", "careful"] if active else ["leg"])
 
 
-class TextLive(ParametersModel):
-    word: Annotated[str, LIVE] = "a"
-
-
-class Inner(ParametersModel):
-    most: Annotated[float | None, LIVE] = None
-
-
-class Outer(ParametersModel):
-    inner: Inner = Inner()
-
-
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
-        ({"Parameters": TextLive}, "whose parameter word is LIVE and is neither a number nor a bool"),
-        ({"Parameters": Outer}, "whose parameter inner.most is LIVE"),
-        ({"Goals": frozenset({"jump"})}, "whose goal jump is none of its Commands"),
         ({"Goals": frozenset({3})}, "whose Goals is of a wrong type"),
         ({"on_goal": Controller.on_goal}, "which has Goals and no method on_goal"),
         ({"on_goal": lambda self, goal: None}, "whose on_goal(goal) cannot be called as"),

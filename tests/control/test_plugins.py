@@ -100,8 +100,6 @@ BROKEN = {
         "publishes = '/joint_states'"
     ),
     "whose Topics is of a wrong type: Expected `object`": declares("Topics = ('state',)"),
-    "whose Topics has 'my state', which is no name of a topic": declares("Topics = {'my state': int}"),
-    "whose Topics has '/state', which is no name of a topic": declares("Topics = {'/state': int}"),
     "whose topic state has no message of ROS 2: dict is no dataclass; put @dataclass above": declares(
         "Topics = {'state': dict}"
     ),

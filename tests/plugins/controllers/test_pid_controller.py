@@ -1,13 +1,10 @@
 """pid_controller: references, set-points, holding, limits and gains that change in a run."""
 
-from typing import Annotated
-
 import numpy as np
 import pytest
 from tests.kit.stages import Stage
 
-from dxlrun import LIVE, ParametersModel
-from dxlrun.control.controllers.live_parameters import live_mistake, live_names, value_of, with_values
+from dxlrun.control.controllers.live_parameters import live_names, value_of, with_values
 from dxlrun_controllers.pid_controller import PidController
 from dxlrun_controllers.plugin import dxlrun_controllers
 
@@ -202,10 +199,6 @@ def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(interface):
     robot.commands_are(0.2, 0.0)
 
 
-class TextByJoint(ParametersModel):
-    inner: Annotated[dict[str, str], LIVE]
-
-
 def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
     model = PidController.Parameters.model_validate(TWO | {"gains": {"p": {"a": 1.0, "b": 2.0}, "i": 0.5}})
     assert list(live_names(model)) == [f"gains.{name}" for name in ("p.a", "p.b", "i", "d", "feed_forward")]
@@ -216,8 +209,6 @@ def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
     for unknown in ("gains.p", "gains.p.c", "gains.i.a", "output_limit"):
         with pytest.raises(ValueError, match="is no live parameter"):
             with_values(model, {unknown: 1.0})
-    assert live_mistake(PidController.Parameters) == ""
-    assert live_mistake(TextByJoint) == "inner"
 
 
 def test_its_state_is_published_fifty_times_a_second():

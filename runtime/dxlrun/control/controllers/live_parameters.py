@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from types import UnionType
-from typing import Annotated, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
@@ -60,30 +59,3 @@ def _changed(inner: object, path: list[str], value: object) -> object:
     if isinstance(inner, BaseModel):
         return inner.model_copy(update={first: found})
     return {**inner, first: found} if isinstance(inner, Mapping) else inner
-
-
-def live_mistake(model: type[BaseModel], seen: tuple[type, ...] = ()) -> str:
-    """Return the parameter that is marked live and is neither a number nor a bool; empty: there is none."""
-    for name, field in model.model_fields.items():
-        kind = field.annotation
-        if any(isinstance(mark, Live) for mark in field.metadata):
-            if not _of_numbers(kind):
-                return name
-            continue
-        if isinstance(kind, type) and issubclass(kind, BaseModel) and kind not in seen:
-            mistake = live_mistake(kind, (*seen, model))
-            if mistake:
-                return f"{name}.{mistake}"
-    return ""
-
-
-def _of_numbers(kind: object) -> bool:
-    """Return whether a type is a number or a bool, or a mapping of names to them, or either."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _of_numbers(inner[0])
-    if origin in (Union, UnionType):
-        return all(map(_of_numbers, inner))
-    if origin is dict:
-        return inner[0] is str and _of_numbers(inner[1])
-    return kind in (bool, int, float)

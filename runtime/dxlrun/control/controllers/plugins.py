@@ -7,7 +7,6 @@ the types of what is declared; the rest is the author's.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
@@ -23,7 +22,6 @@ from pydantic import ValidationError
 from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Mismatch, RobotModel
 from dxlrun.contract.hookspecs import CONTRACT_VERSION, GROUP, HookSpecs
 from dxlrun.contract.sensor import Sensor
-from dxlrun.control.controllers.live_parameters import live_mistake
 from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
@@ -35,8 +33,6 @@ from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
 
 _MOST_MISTAKES = 5
-_TOPIC = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-"""Part of a topic's name, by the page "Topic and Service names to DDS" of ROS 2's design."""
 ControllerClass = type[Controller[Any]]
 
 _METHODS = (
@@ -414,11 +410,6 @@ def controller_breach(controller: object) -> Breach | None:
         return breach
     if not is_model(controller.Parameters, ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
-    if mistaken := live_mistake(controller.Parameters):
-        return (
-            f"whose parameter {mistaken} is LIVE and is neither a number nor a bool",
-            "mark only parameters of type float, int and bool",
-        )
     for name, (kind, fix) in _DECLARED.items():
         try:
             msgspec.convert(getattr(controller, name), kind)
@@ -431,8 +422,6 @@ def _commands_breach(controller: ControllerClass) -> Breach | None:
     commands, goals = controller.Commands, controller.Goals
     if wrong := [kind for kind, model in commands.items() if not is_model(model, CommandModel)]:
         return f"whose command {wrong[0]} is no model of a command", "derive it from dxlrun.CommandModel"
-    if unknown := sorted(goals - set(commands)):
-        return f"whose goal {', '.join(unknown)} is none of its Commands", "name some of them"
     if goals and controller.on_goal is Controller.on_goal:
         return "which has Goals and no method on_goal", "write it"
     return None
@@ -440,11 +429,6 @@ def _commands_breach(controller: ControllerClass) -> Breach | None:
 
 def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
     for topic, message in topics.items():
-        if not _TOPIC.fullmatch(topic):
-            return (
-                f"whose Topics has {topic!r}, which is no name of a topic",
-                "use letters, digits and _, a letter first; it becomes /CONTROLLER/TOPIC",
-            )
         try:
             declared_message(message, "any")
         except WrongMessage as wrong:
