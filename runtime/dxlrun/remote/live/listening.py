@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import select
 import socket
 from collections.abc import AsyncIterator, Iterator, Mapping
@@ -96,6 +95,8 @@ class Listening:
             self.close()
 
     async def __aiter__(self) -> AsyncIterator[TopicMessage]:
+        import asyncio  # most clients do not use it
+
         receive = asyncio.get_running_loop().sock_recv
         try:
             while not self._ended:
