@@ -53,6 +53,11 @@ def test_packets_of_the_manual_go_in_and_come_out(make_line2):
     assert line.receive() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
 
 
+def test_a_place_without_an_item_is_not_read_one_beside_items_is(line2):
+    assert line2.request(1, READ, b"\x0e\x00\x02\x00") == (1, ErrorNumber.ACCESS, b"")  # 14 and 15
+    assert line2.request(1, READ, b"\x0d\x00\x02\x00") == (1, 0, b"\x02\x00")  # Protocol Type (13) and 14
+
+
 def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2):
     line2.put(operating_mode=4, goal_position=100_000)
     line2.put(goal_position=0, operating_mode=3)
