@@ -14,7 +14,7 @@ from dxlrun.channels.process import MessageChannel
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import InputError
 from dxlrun.plan.simulation_plan import SimulationConfig
-from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
+from dxlrun.simulation.bus.ledger import FAULT, Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.on_links import fix_to_links
@@ -36,7 +36,7 @@ GATHER_NS = 250_000
 """Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
 hand-over costs the processor, and the host's, more than a reply."""
 
-IDLE_NS = 300_000  # So long the mechanics of a few steps and the lines of the ledger may take
+IDLE_NS = 300_000  # So long the mechanics of a few steps may take
 
 _GOAL_MODES = (3, 4, 5)
 """Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
@@ -129,7 +129,6 @@ class Server:
     def _work_in_idle_time(self, now_ns: int) -> int | None:
         """Do what is not urgent; return when there is more of it."""
         self._mechanics.advance(now_ns)
-        self._ledger.encode(SOME_ENTRIES)
         times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
         if self._held:
             for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:

@@ -18,9 +18,6 @@ Direction = Literal["in", "out", "note"]
 _MODE = 0o640
 _BUFFER = 1 << 16  # Bytes that are written out together
 
-SOME_ENTRIES, _MOST_ENTRIES = 24, 256
-"""So many are encoded together, where there is time for it and at the latest."""
-
 FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
 
 
@@ -79,7 +76,6 @@ class Ledger:
         self._file: IO[bytes] | None = None
         if path is not None:
             self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
-        self._new: list[_Line] = []  # Entries that are not encoded yet
         self._unflushed_ns: int | None = None
 
     def add(
@@ -92,29 +88,19 @@ class Ledger:
         *,
         late_ns: int = 0,
     ) -> None:
-        """Enter bytes or a note; `encode` and `flush_if_due` bring it into a file, at the latest its end."""
+        """Enter bytes or a note; `flush_if_due` brings it into a file, at the latest its end."""
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            self._new.append(_Line(t_ns, bus, direction, data.hex(), note, late_ns))
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
-            if len(self._new) >= _MOST_ENTRIES:
-                self.encode()
-        if direction == "note" and self.on_note is not None:
-            self.on_note(note)
-
-    def encode(self, least: int = 1) -> None:
-        """Make lines of so many new entries or more: for a moment in which nothing else is to be done."""
-        if len(self._new) < least:
-            return
-        lines = _encoder.encode_lines(self._new)
-        self._new.clear()
-        if self._file is not None:
             try:
-                self._file.write(lines)
+                line = _Line(t_ns, bus, direction, data.hex(), note, late_ns)
+                self._file.write(_encoder.encode(line) + b"\n")
             except OSError as error:
                 self._give_up(error)
+        if direction == "note" and self.on_note is not None:
+            self.on_note(note)
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -129,7 +115,6 @@ class Ledger:
     def flush(self) -> None:
         """Write the file out."""
         self._unflushed_ns = None
-        self.encode()
         if self._file is not None:
             try:
                 self._file.flush()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import fnmatch
 import functools
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 import msgspec
 from msgspec.structs import replace
@@ -71,11 +69,15 @@ class _Gain(msgspec.Struct, frozen=True):
     source: str
 
 
+class _Scaled(msgspec.Struct, frozen=True):
+    models: tuple[str, ...]  # Patterns
+    like: str  # An identified model
+
+
 class _Motors(msgspec.Struct, frozen=True):
-    identified: Mapping[str, MotorModel]
-    scaled: tuple[tuple[str, str], ...]
-    """Pattern of models, and the identified model that they are like"""
-    gains: tuple[_Gain, ...]
+    identified: tuple[MotorModel, ...]
+    scaled: tuple[_Scaled, ...]
+    gain: tuple[_Gain, ...]
 
 
 def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
@@ -94,13 +96,13 @@ def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
 
 def _known(table: ControlTable) -> Motor:
     motors, model = _motors(), table.model.partition("-FW")[0]
-    if (identified := motors.identified.get(model)) is not None:
-        motor = identified_motor(identified)
+    identified = {each.model: each for each in motors.identified}
+    if model in identified:
+        motor = identified_motor(identified[model])
     else:
-        like = next(like for pattern, like in motors.scaled if fnmatch.fnmatchcase(model, pattern))
-        motor = _scaled(table, motors.identified[like])
-    for gain in motors.gains:
-        if gain.item in table.items and any(fnmatch.fnmatchcase(model, each) for each in gain.models):
+        motor = _scaled(table, identified[next(one.like for one in motors.scaled if _among(model, one))])
+    for gain in motors.gain:
+        if gain.item in table.items and _among(model, gain):
             known = "" if model in gain.identified else f"[i] as {gain.identified[0]}; "
             return replace(motor, p_gain_duty=gain.duty_per_rad, gain_source=known + gain.source)
     return motor
@@ -153,15 +155,10 @@ def _scaled(table: ControlTable, like: MotorModel) -> Motor:
     )
 
 
+def _among(model: str, those: _Scaled | _Gain) -> bool:
+    return any(fnmatch.fnmatchcase(model, pattern) for pattern in those.models)
+
+
 @functools.cache
 def _motors() -> _Motors:
-    data = tomllib.loads(_FILE.read_text("utf-8"))
-    identified = [MotorModel(**entry) for entry in data["identified"]]
-    return _Motors(
-        MappingProxyType({each.model: each for each in identified}),
-        tuple((pattern, entry["like"]) for entry in data["scaled"] for pattern in entry["models"]),
-        tuple(
-            _Gain(**{**entry, "models": tuple(entry["models"]), "identified": tuple(entry["identified"])})
-            for entry in data["gain"]
-        ),
-    )
+    return msgspec.convert(tomllib.loads(_FILE.read_text("utf-8")), _Motors)
