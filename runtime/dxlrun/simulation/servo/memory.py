@@ -27,8 +27,6 @@ class Cells(NamedTuple):
     direct: bool  # True when none of them is Indirect Data
     read_only: bool  # True when one of the items is
     eeprom: bool  # True when one of the items is in the EEPROM area
-    single: str
-    """Name of the item that they are, whole, where none of them is Indirect Data; else empty."""
     live: tuple[tuple[str, Callable[[], int]], ...]
     """What shows something else whenever it is looked at, and what it shows now."""
 
@@ -179,9 +177,7 @@ class Memory:
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
-        cells = self._cells_at.get((address, len(data))) or self.cells(address, len(data))
-        if cells.single:
-            return (Run(address, data, cells, {cells.single: int.from_bytes(data, "little")}),)
+        cells = self.cells(address, len(data))
         if cells.direct:
             return (self._run(address, data, cells),)
         return tuple(
@@ -217,7 +213,6 @@ class Memory:
                 whole=whole,
                 touched=bool(owned),
                 direct=direct,
-                single=names[0] if whole and direct and len(names) == 1 else "",
                 read_only=any(item.access == "R" for item in items),
                 eeprom=any(item.area == "EEPROM" for item in items),
                 live=tuple((name, self._live[name]) for name in dict.fromkeys(owned) if name in self._live),
