@@ -20,8 +20,8 @@ ROUGH_NS = 150_000
 DISORDER_NS = RING_SECONDS * 1_000_000_000
 """A log has the records of several rings in the order in which the recorder got them: no further apart."""
 _MS = 1_000_000
-_LAST_BIN = 100_000
-"""us; what is later is in the last bin."""
+LATE_BINS_US = 100_000
+"""Wake-ups are counted in bins of 1 us; what is later is in the last one."""
 _MOST_RATES = 4
 """More are not listed one by one."""
 _MOST_KEPT = 1000
@@ -134,6 +134,11 @@ def begins(log: Log) -> bool:
     return log.activation is not None or len(log.cycles) > 0
 
 
+def late_bins(late_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many wake-ups were so many us late, shape (LATE_BINS_US + 1,); earlier ones count as 0."""
+    return np.bincount(np.clip(late_ns // 1000, 0, LATE_BINS_US), minlength=LATE_BINS_US + 1)
+
+
 def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
     """Return the period in which each cycle ran, ns: the time to the next deadline, shape (cycles,).
 
@@ -217,7 +222,7 @@ class Punctuality:
         self._nominal_ns = self._period_ns = 1
         self._sum = self._squares = self._max_ns = 0
         self._over = [0, 0, 0]
-        self._bins = np.zeros(_LAST_BIN + 1, np.int64)
+        self._bins = np.zeros(LATE_BINS_US + 1, np.int64)
         self._rates: dict[int, None] = {}
         self.slowest: Slowest | None = None
         """The cycle that exceeded its period most; None where none did."""
@@ -260,7 +265,7 @@ class Punctuality:
         self._max_ns = max(self._max_ns, int(late.max()))
         for index, limit in enumerate((ROUGH_NS, _MS, each)):
             self._over[index] += int(np.count_nonzero(late > limit))
-        np.add.at(self._bins, np.clip(late // 1000, 0, _LAST_BIN), 1)
+        self._bins += late_bins(late)
         exceeded = cycles["written_ns"] - cycles["woken_ns"] - each
         worst = int(np.argmax(exceeded))
         if exceeded[worst] > (0 if self.slowest is None else self.slowest.exceeded_ns):

@@ -8,10 +8,11 @@ import numpy as np
 
 from dxlrun.errors import counted
 from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
+from dxlrun_analysis.cycles.latency import late_bins
 from dxlrun_analysis.latency.statistics import Block, Figures, Result
 from dxlrun_analysis.latency.tables import blocks_table, duration, statistics_table, title
 from dxlrun_analysis.page.canvas import MANY, Canvas, Line
-from dxlrun_analysis.page.curves import LEAST_US, Curves, late_bins
+from dxlrun_analysis.page.curves import LEAST_US, Curves
 from dxlrun_analysis.page.envelope import Envelope
 from dxlrun_analysis.page.wake_ups import WakeUps, wake_up_plots
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.log.reader import Log
-from dxlrun_analysis.cycles.latency import ROUGH_NS, STEPS, cycle_periods_ns
+from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS, STEPS, cycle_periods_ns, late_bins
 from dxlrun_analysis.page.envelope import Envelope, Rows, Samples, Times
 
 BYTES_OF_CURVES = 7_000_000
@@ -30,8 +30,6 @@ _WINDOW_NS = 1_000_000_000
 """Around a worst cycle."""
 LEAST_US = 1.0
 """Earlier wake-ups are drawn here: the axis is logarithmic."""
-LATE_BINS_US = 100_000
-"""Wake-ups are counted in bins of 1 us; what is later is in the last one."""
 _LEAST_NS = 100
 """Steps that took less, or no time at all on virtual time, are drawn here."""
 _QUANTITIES = ("position", "velocity", "effort")
@@ -175,11 +173,6 @@ class CurveCollector:
         rows = np.flatnonzero(inside)[: max(0, room)]
         if len(rows):
             self._kept.append((times[rows].copy(), values[rows]))
-
-
-def late_bins(late_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many wake-ups were so many us late, shape (LATE_BINS_US + 1,); earlier ones count as 0."""
-    return np.bincount(np.clip(late_ns // 1000, 0, LATE_BINS_US), minlength=LATE_BINS_US + 1)
 
 
 def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[int, int]]:

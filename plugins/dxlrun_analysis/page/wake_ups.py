@@ -14,9 +14,9 @@ from bokeh.models import Range1d
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun_analysis.cycles.latency import ROUGH_NS
+from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS
 from dxlrun_analysis.page.canvas import ERROR, WARNING, Canvas, Line, Plot
-from dxlrun_analysis.page.curves import LATE_BINS_US, Curves
+from dxlrun_analysis.page.curves import Curves
 
 ROUGH_US = ROUGH_NS // 1000
 _SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.99999, 0.999999)
