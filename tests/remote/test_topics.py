@@ -131,7 +131,8 @@ def test_events_and_every_cycle_are_topics_too(desk):
     desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "second")
     desk.link.collect()
     stream = desk.link.listen(["/events", "/joint_states", "/cycle"], newest=False)
-    event, states, cycle = desk.frames(stream)[:3]
+    event, states, cycle, *newest = desk.frames(stream)
+    assert [(one.place, one.number) for one in newest] == [(1, 1), (2, 1), (0, 2)]
     codecs = [Codec(MessageType(one.type, one.definition)) for one in (event, states, cycle)]
     desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "third")
     desk.link.collect()

@@ -60,7 +60,6 @@ from dxlrun.remote.parameters import Change, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,
     RefusedRequest,
-    bounded,
     invalid,
     refused,
     unknown_controllers,
@@ -424,7 +423,7 @@ class GatewayApp:
         async with self._changing:  # what is checked against the values of now must meet them in the loop
             loaded = self._known(request)
             now = self._preparation.parameters(loaded.plan)
-            change = changed(loaded.plan, now, given.values, bounded)
+            change = changed(loaded.plan, now, given.values)
             noted = partial(self._note_parameters, loaded, change)
             done = await self._link.for_loop("parameters", change.request, origin(request), noted)
         return Changed(done.cycle, change.shown)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from msgspec.structs import replace
@@ -17,7 +16,7 @@ from dxlrun.control.steering import Parameters
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.remote.preparation import RefusedRequest, invalid, mistakes, refused
+from dxlrun.remote.preparation import invalid, mistakes, plugin_code, refused
 from dxlrun.remote.replies import NewValue, Parameter, Written
 
 _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
@@ -55,16 +54,8 @@ def _range(field: FieldInfo) -> str:
     return ", ".join(f"{words} {value:g}" for words, value in bounds if isinstance(value, int | float))
 
 
-def changed(
-    plan: ControllerPlan,
-    now: ParametersModel,
-    values: Mapping[str, Written],
-    bounded: Callable[[str], AbstractContextManager[None]],
-) -> Change:
-    """Return a change of live parameters; raises RefusedRequest with the reason.
-
-    `now` are the values of the plan; `bounded` limits how long the model's own code may compute.
-    """
+def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Written]) -> Change:
+    """Return a change of live parameters, whose values are `now`; raises RefusedRequest with the reason."""
     if not values:
         raise invalid('nothing to change; write for example {"values": {"speed": "20 deg/s"}}')
     known = {parameter.name: parameter for parameter in parameters_of(now)}
@@ -74,18 +65,16 @@ def changed(
     written = json.loads(plan.parameters)
     for name, value in values.items():
         _put(written, name.split("."), value, now)
-    try:
-        with bounded(plan.name):
+    with plugin_code(plan.name, f"the parameters of {plan.name}"):
+        try:
             new = model.model_validate(written)
-    except RefusedRequest:
-        raise
-    except ValidationError as error:
-        problem = mistakes(error, plan.name, model)
-        wrong = {".".join(map(str, details["loc"])) for details in error.errors(include_url=False)}
-        ranges = [f"{name}: {known[name].range}" for name in values if name in wrong and known[name].range]
-        raise invalid(problem + (f" ({'; '.join(ranges)})" if ranges else "")) from error
-    except (Exception, SystemExit) as error:  # a plug-in's code
-        raise invalid(f"the parameters of {plan.name}: {type(error).__name__}: {error}") from error
+        except ValidationError as error:
+            problem = mistakes(error, plan.name, model)
+            wrong = {".".join(map(str, details["loc"])) for details in error.errors(include_url=False)}
+            ranges = [
+                f"{name}: {known[name].range}" for name in values if name in wrong and known[name].range
+            ]
+            raise invalid(problem + (f" ({'; '.join(ranges)})" if ranges else "")) from error
     flat = {name: _number(value_of(new, name)) for name in live_names(new)}
     before = {parameter.name: parameter.value for parameter in known.values()}
     after = {parameter.name: parameter.value for parameter in parameters_of(new)}

@@ -102,6 +102,25 @@ def bounded(controller: str) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+@contextmanager
+def plugin_code(controller: str, where: str, model: type[BaseModel] | None = None) -> Iterator[None]:
+    """Run a plug-in's code, `bounded`; what it raises becomes a RefusedRequest that begins with `where`.
+
+    `model`: of an input, whose mistakes are named one by one.
+    """
+    try:
+        with bounded(controller):
+            yield
+    except RefusedRequest:
+        raise
+    except ValueError as error:  # the way in which a plug-in refuses
+        if isinstance(error, ValidationError) and model is not None:
+            raise invalid(mistakes(error, where, model)) from error
+        raise invalid(f"{where}: {_one_line(str(error))}") from error
+    except (Exception, SystemExit) as error:  # its mistake
+        raise invalid(f"{where}: {_one_line(f'{type(error).__name__}: {error}')}") from error
+
+
 @dataclass(frozen=True, slots=True)
 class Prepared:
     """A command, ready for the loop."""
@@ -202,20 +221,11 @@ class Preparation:
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
             body = in_si(body, what, known.joints)
-        try:
-            with bounded(plan.name):
-                command = model.model_validate_json(body, strict=True)
-                prepared = controller.prepare(kind, command, known.parameters)
-                data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
-                beyond = tuple(beyond_limits(known.joints, command))
-        except RefusedRequest:
-            raise
-        except ValidationError as error:
-            raise invalid(mistakes(error, what, model)) from error
-        except ValueError as error:  # the way in which a plug-in refuses
-            raise invalid(f"{what}: {_one_line(str(error))}") from error
-        except (Exception, SystemExit) as error:  # a plug-in's mistake
-            raise invalid(f"{what}: {_raised(error)}") from error
+        with plugin_code(plan.name, what, model):
+            command = model.model_validate_json(body, strict=True)
+            prepared = controller.prepare(kind, command, known.parameters)
+            data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
+            beyond = tuple(beyond_limits(known.joints, command))
         return Prepared(plan.name, kind, data, beyond, body)
 
     def known(self, plan: ControllerPlan) -> Known:
@@ -226,13 +236,8 @@ class Preparation:
         offer = self.plugins.controllers.get(plan.type)
         if offer is None:
             raise invalid(f"no plug-in offers the type {plan.type} of {plan.name} any more")
-        try:
-            with bounded(plan.name):
-                parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
-        except RefusedRequest:
-            raise
-        except (Exception, SystemExit) as error:  # a plug-in's code
-            raise invalid(f"the parameters of {plan.name}: {_raised(error)}") from error
+        with plugin_code(plan.name, f"the parameters of {plan.name}"):
+            parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         joints = tuple(self.joints[joint] for joint in plan.joints)
         known = self._known[plan.name] = Known(plan, offer.controller, parameters, joints)
         return known
@@ -302,17 +307,11 @@ class Preparation:
         self, name: str, offer: Offer, written: ControllerEntry
     ) -> tuple[Interfaces, tuple[str, ...]]:
         """Return the interfaces that a controller's class asks for with these parameters, and its topics."""
-        try:
-            with bounded(name):
-                parameters = offer.controller.Parameters.model_validate(written.parameters)
-                interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
-                topics = tuple(offer.controller.topics(parameters))
-        except RefusedRequest:
-            raise
-        except ValidationError as error:
-            raise invalid(mistakes(error, name, offer.controller.Parameters)) from error
-        except (Exception, SystemExit) as error:  # a plug-in's code
-            raise invalid(f"the interfaces of {name} are not known: {_raised(error)}") from error
+        with plugin_code(name, name, offer.controller.Parameters):
+            parameters = offer.controller.Parameters.model_validate(written.parameters)
+        with plugin_code(name, f"the interfaces of {name} are not known"):
+            interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
+            topics = tuple(offer.controller.topics(parameters))
         if breach := interfaces_breach(interfaces, chained=bool(written.into)):
             raise invalid(f"{name} ({offer.distribution}) {breach[0]}; report it to its author: {breach[1]}")
         if unknown := [joint for joint in interfaces.joints if joint not in self.joints]:
@@ -321,13 +320,8 @@ class Preparation:
         if len(set(interfaces.joints)) != len(interfaces.joints):
             raise invalid(f"{name} names a joint twice; name it once")
         joints = [self.joints[joint] for joint in interfaces.joints]
-        try:
-            with bounded(name):
-                found = mismatches(offer.controller, parameters, interfaces.motors, joints, self.urdf)
-        except RefusedRequest:
-            raise
-        except (Exception, SystemExit) as error:  # a plug-in's code
-            raise invalid(f"{name} cannot be compared with the robot: {_raised(error)}") from error
+        with plugin_code(name, f"{name} cannot be compared with the robot"):
+            found = mismatches(offer.controller, parameters, interfaces.motors, joints, self.urdf)
         if found:
             raise invalid(f"{name} {found[0].what}; {found[0].fix}")
         return interfaces, topics
@@ -472,10 +466,6 @@ def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRe
     if len(shown) > 1:
         hints = [f"{name}: {hint}" for name, hint in zip(shown, hints, strict=True)]
     return refused(Code.UNKNOWN_CONTROLLER, {"controller": shown, "hint": "; ".join(hints)})
-
-
-def _raised(error: BaseException) -> str:
-    return _one_line(f"{type(error).__name__}: {error}")
 
 
 def _one_line(text: str) -> str:
