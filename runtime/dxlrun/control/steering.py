@@ -167,7 +167,8 @@ class Steering:
                 found = manager.hand(command, time_ns)
                 goals = (found,) if isinstance(found, int) and found else ()
                 answer = found if isinstance(found, Refusal) else Done(record.cycle, goals=goals)
-            self._report(command, answer, place)
+            if for_loop or isinstance(answer, Refusal):
+                self._report(command, answer, place)
             if for_loop and self.paused:
                 self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
             count += not (for_loop or isinstance(answer, Refusal))
@@ -323,19 +324,17 @@ class Steering:
     # Reports
 
     def _report(self, command: Command, answer: Answer | None, place: int) -> None:
-        """Report what came of a command; one that a controller took has an event of the controller."""
+        """Report a command that was refused, or is for the loop; what a controller took has its event."""
         refusal = answer if isinstance(answer, Refusal) else None
         if refusal is not None:
             code, severity, source = EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller or "loop"
             text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-        elif command.controller == LOOP:
+        else:
             code, severity, source = EventCode.STEERED, Severity.INFO, "loop"
             shown = command.data.partition(b"\n")[0].decode(errors="replace")
             if len(shown) > LONGEST_SHOWN:
                 shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
             text = f"{f'{command.kind} {shown}'.strip()} from {command.origin}"
-        else:
-            return
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
         self.events.emit(code, severity, source, text, data)
 

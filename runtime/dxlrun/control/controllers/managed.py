@@ -281,7 +281,8 @@ class Managed:
         """Hand over a prepared command, which never runs out. Raises ControllerFault."""
         self.on(Event.COMMAND)
         self.until_ns = 0
-        self._inputs.gather()
+        if self._inputs.gathered:
+            self._inputs.gather()
         self._call(ControllerMethod.ON_COMMAND, kind, self.controller.on_command, kind, data, time_ns)
 
     @property
