@@ -249,7 +249,8 @@ class Traffic:
         servo, of = replies.servo[answers], replies.exchange[answers]
         took_ns = replies.last_ns[answers] - exchanges.asked_ns[of]
         self._reply_us.take(servo, took_ns // 1000)
-        np.maximum.at(self._reply_max_ns, servo, took_ns)
+        slower = took_ns > self._reply_max_ns[servo]
+        np.maximum.at(self._reply_max_ns, servo[slower], took_ns[slower])
         self._extra(exchanges, of, answers)
 
     def _extra(self, exchanges: Exchanges, of: Numbers, answers: Numbers) -> None:
@@ -273,7 +274,8 @@ class Traffic:
         alone, after_rest = np.flatnonzero(due == 1), rested(exchanges).astype(np.int64)
         servo = exchanges.bus * IDS + exchanges.requests.ids[exchanges.request, -1]
         for counts, at in ((self._late, np.intersect1d(rows, alone)), (self._alone, alone)):
-            np.add.at(counts, (after_rest[at], servo[at]), 1)
+            found = np.bincount(after_rest[at] * len(self._asked) + servo[at], minlength=counts.size)
+            np.add(counts, found.reshape(counts.shape), out=counts)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS
