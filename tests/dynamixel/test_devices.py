@@ -187,7 +187,7 @@ def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
 @pytest.mark.parametrize("fast", [True, False])
 def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     rig = started(("speed",), ("speed",), fast=fast)
-    monkeypatch.setattr(device(rig), "_answer_group_read", lambda read, entry: None)
+    monkeypatch.setattr(device(rig), "_takes_part", lambda read: False)
     for cycle in range(30):
         poke(rig, "profile_velocity", cycle)
         rig.cycle()

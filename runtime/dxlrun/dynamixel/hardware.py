@@ -14,10 +14,10 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, Lines, LineState
+from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, Lines
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
-from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine
+from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelLine
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
@@ -215,16 +215,20 @@ class DynamixelHardware:
         return ready
 
     def _interrupt(self) -> None:
-        for (bus, servos), line in zip(self._pairs, self._kernel.interrupt(), strict=True):
+        for index, (bus, servos) in enumerate(self._pairs):
+            line, failure = self._kernel.line(index)
             if bus.failure is not None:
                 continue
-            if line.failure is not None:
-                bus.fail(line.failure)
-            if line.done or line.state is not LineState.IDLE or line.failure is not None:
+            if failure is not None:
+                bus.fail(failure)
+            if line.done or line.state or failure is not None:
                 servos.reads.begin(line.done)
-                bus.continue_from(servos.reads, line)
-            else:
-                bus.take_pieces(line)
+                bus.load(servos.reads)
+            if line.state == AWAITING:
+                bus.resume(line.at_ns, line.sent_ns, line.deadline_ns)
+            for data, at_ns in self._kernel.pieces(index):
+                bus.take(data, at_ns)
+        self._kernel.abandon()
 
     def _parse(self) -> None:
         """Read packet by packet what was not read in this cycle."""

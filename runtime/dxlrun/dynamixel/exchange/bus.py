@@ -8,10 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
-from enum import IntEnum, unique
 from typing import TypeAlias
-
-import msgspec
 
 from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.clock import Clock
@@ -58,28 +55,6 @@ _INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
 
 _Shape: TypeAlias = tuple[int, int]  # ID and number of parameter bytes of a status packet
 _FAST: _Shape = (BROADCAST_ID, 0)  # Of the one status packet of a fast form, whatever its length
-
-
-@unique
-class LineState(IntEnum):
-    """Where the exchange kernel is on a line in a cycle."""
-
-    IDLE = 0
-    AWAITING = 1  # A read was sent
-    THROUGH = 2  # All its reads are done
-
-
-class Interrupted(msgspec.Struct, frozen=True):
-    """Where a line stood when the exchange kernel ended: the parser continues there."""
-
-    state: LineState
-    done: int  # How many of its reads are done; the next one was sent where the line is AWAITING
-    sent_ns: int
-    deadline_ns: int
-    received_ns: int  # When the replies to the read before it came
-    pieces: tuple[tuple[bytes, int], ...]
-    """What was received beyond them, and when, ns: of the awaited replies, or stray."""
-    failure: PortError | None  # Why the next one could not be sent
 
 
 class Bus:
@@ -185,25 +160,26 @@ class Bus:
         if self.failure is not None:
             raise self.failure
 
-    def continue_from(self, job: Job, line: Interrupted) -> None:
-        """Continue with a job in whose transaction the exchange kernel was interrupted."""
-        self.load(job)
-        if line.state is LineState.AWAITING and self._job is not None:
-            if self.receiver.pending:
-                self.receiver.flush()
-            self._awaited = transaction = job.advance(None)
-            assert transaction is not None  # noqa: S101  its instruction was sent
-            self._last_byte_ns = max(self._last_byte_ns, line.received_ns)
-            self._await(transaction, line.sent_ns)
-            self._deadline_ns = line.deadline_ns
-        self.take_pieces(line)
+    def resume(self, received_ns: int, sent_ns: int, deadline_ns: int) -> None:
+        """Await the replies to the loaded job's next transaction, which the exchange kernel sent.
 
-    def take_pieces(self, line: Interrupted) -> None:
-        """Take what the exchange kernel received beyond the replies that it has kept."""
-        for data, at_ns in line.pieces:
-            self._last_byte_ns = at_ns
-            self.receiver.feed(data, at_ns)
-            self._skip_headers()
+        `received_ns`: when the replies to the one before came.
+        """
+        if self._job is None:
+            return
+        if self.receiver.pending:
+            self.receiver.flush()
+        self._awaited = transaction = self._job.advance(None)
+        assert transaction is not None  # noqa: S101  its instruction was sent
+        self._last_byte_ns = max(self._last_byte_ns, received_ns)
+        self._await(transaction, sent_ns)
+        self._deadline_ns = deadline_ns
+
+    def take(self, data: bytes, at_ns: int) -> None:
+        """Take bytes that the exchange kernel received and could not use."""
+        self._last_byte_ns = at_ns
+        self.receiver.feed(data, at_ns)
+        self._skip_headers()
 
     # Time
 

@@ -8,11 +8,10 @@ share are those of `kernel.c`: they are read from there.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
 from functools import partial
-from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -23,7 +22,7 @@ from dxlrun.channels.cycle import Commands, Floats, States
 from dxlrun.channels.fence import SOURCE, array_of, library
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
+from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus
 from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
 from dxlrun.dynamixel.exchange.samples import Samples
@@ -50,6 +49,7 @@ class Answer(IntEnum):
     SILENCE = 5  # Nothing was sent: servos had no instruction for longer than their watchdogs wait
 
 
+AWAITING = 1  # State of a line: a read was sent; 0: none was in this cycle
 _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
@@ -361,7 +361,7 @@ class Kernel:
         """Raise what came up while the kernel was at work."""
         if (error := self._raised) is not None:
             self._raised, self._kernel.raised = None, 0
-            self._library.dxl_abandon(self._pointer)
+            self.abandon()
             raise error
 
     def _keep_raised(self, error: BaseException) -> None:
@@ -428,20 +428,20 @@ class Kernel:
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
 
-    def interrupt(self) -> list[Interrupted]:
-        """End the cycle; return where each line stands."""
-        found: list[Interrupted] = []
-        for index, line in enumerate(self._lines[: len(self._known)]):
-            ends = [0, *(line.piece[number].end for number in range(line.pieces))]
-            data = self._buffers[index].raw
-            pieces = tuple(
-                (data[start:end], line.piece[number].at_ns)
-                for number, (start, end) in enumerate(pairwise(ends))
-            )
-            times = line.sent_ns, line.deadline_ns, line.at_ns
-            found.append(Interrupted(LineState(line.state), line.done, *times, pieces, self._failure(index)))
+    def line(self, index: int) -> tuple[ctypes.Structure, PortError | None]:
+        """Return where a line stands in a cycle that did not come to its end, and why it took no bytes."""
+        return self._lines[index], self._failure(index)
+
+    def pieces(self, index: int) -> Iterator[tuple[bytes, int]]:
+        """Yield what was received on a line and could not be used, and when, ns."""
+        line, start = self._lines[index], 0
+        for piece in line.piece[: line.pieces]:
+            yield ctypes.string_at(line.buffer + start, piece.end - start), piece.at_ns
+            start = piece.end
+
+    def abandon(self) -> None:
+        """End a cycle that did not come to its end."""
         self._library.dxl_abandon(self._pointer)
-        return found
 
 
 def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
