@@ -193,6 +193,10 @@ def test_a_stream_stays_open_while_it_is_read_or_quiet_and_a_sleeping_listener_i
         until = asyncio.get_running_loop().time() + 60
         while not (connections := [one for one in gc.get_objects() if type(one) is server.Connection]):
             await asyncio.sleep(0.001)
+        connections[0].last_byte_s = 0.0
+        connections[0].pause_writing()
+        connections[0].resume_writing()  # as when a slow listener has taken a part
+        assert connections[0].last_byte_s > 0.0
         read = 0
         while asyncio.get_running_loop().time() < until:
             for _ in range(50):

@@ -92,7 +92,7 @@ LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
 LONGEST_WAIT_S = 5.0
 """For the end of a goal; a client that waits longer asks again."""
-_SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.001, 0.02
+_SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.0005, 0.02
 """Between two looks of a stream into the rings: half a period of the loop, within these."""
 BEAT_S = 2.0
 """After so long without a message a stream shows that the gateway is alive."""

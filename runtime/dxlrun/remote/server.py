@@ -11,6 +11,7 @@ import asyncio
 import ctypes
 import math
 import os
+import selectors
 import signal
 import socket
 import struct
@@ -68,9 +69,15 @@ def main() -> None:
     channel.send(Listening(str(path)))
     link.let_begin()
     try:
-        asyncio.run(serve(link, gateway, listener, control))
+        with asyncio.Runner(loop_factory=_event_loop) as runner:
+            runner.run(serve(link, gateway, listener, control))
     finally:
         path.unlink(missing_ok=True)
+
+
+def _event_loop() -> asyncio.AbstractEventLoop:
+    """Return an event loop that waits parts of a millisecond: epoll(7), the usual way, counts whole ones."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
 async def serve(link: Link, gateway: GatewayApp, listener: socket.socket, control: socket.socket) -> None:
