@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.kinds import COMMANDED, MOVES_WORSE
-from dxlrun_analysis.lost import CODES, HURTS, SPOILT, severe_of, subject_of
+from dxlrun_analysis.lost import CODES, HURTS, SPOILT, severe_of, subject_of, waited_in_vain
 from dxlrun_analysis.tally import RealTime, RunTotals
 
 _REPLIES = (
@@ -85,7 +85,7 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
 
     What holds for the machine or a whole bus stands for all its servos, and what only says that replies are
     missing goes where anything else is known of its bus. Servos that failed, or followed worse, are then not
-    accused besides.
+    accused besides; nor those that followed worse while replies before theirs were missing.
     """
     bus_of = {subject_of(servo): servo.bus for servo in totals.servos}
     named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
@@ -98,10 +98,14 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
             kept.append(one)
     whole = {one.subject for one in kept if one.subject not in bus_of}
     whole |= {one.subject for one in found if one.code in ("busy_machine", "bus_lost")}
+    waited = waited_in_vain(totals)
     return tuple(
         replace(one, remedy="")
-        if one.code in (*CODES.values(), *MOVES_WORSE)
-        and {"machine", bus_of.get(one.subject, one.subject)} & whole
+        if (
+            one.code in (*CODES.values(), *MOVES_WORSE)
+            and {"machine", bus_of.get(one.subject, one.subject)} & whole
+        )
+        or (one.code in MOVES_WORSE and one.subject in waited)
         else one
         for one in found
         if one.code not in _REPLIES or one in kept

@@ -161,15 +161,10 @@ def _joined(parts: Sequence[str]) -> str:
 
 def invalid_states(totals: RunTotals) -> Iterable[Finding]:
     """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
-    cycles = totals.periods.records
-    counts = {
-        joint: count
-        for joint, count in zip(totals.joints, totals.invalid, strict=False)
-        if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
-    }
+    cycles, counts = totals.periods.records, _invalid(totals)
     if not counts:
         return
-    waited = _waited(totals, counts)
+    waited = waited_in_vain(totals)
     ordered = sorted((-count / cycles, joint) for joint, count in counts.items() if joint not in waited)
     most = max(counts.values()) / cycles
     if ordered:
@@ -200,8 +195,19 @@ def _head(totals: RunTotals, buses: Sequence[str]) -> str:
     return "the first servo of the chain" + (f", {_name(heads[0])}," if len(heads) == 1 else "")
 
 
-def _waited(totals: RunTotals, counts: Mapping[str, int]) -> set[str]:
-    """Return the joints whose missing replies are for the most part not their servos' own."""
+def _invalid(totals: RunTotals) -> dict[str, int]:
+    """Return how many states of each joint were invalid, where they were so too often."""
+    cycles = totals.periods.records
+    return {
+        joint: count
+        for joint, count in zip(totals.joints, totals.invalid, strict=False)
+        if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
+    }
+
+
+def waited_in_vain(totals: RunTotals) -> set[str]:
+    """Return the joints that were invalid too often, but mostly not by lost replies of their own servos."""
+    counts = _invalid(totals)
     servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
     found = set()
     for joint, movers in totals.plan.movers.items():

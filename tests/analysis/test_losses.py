@@ -201,3 +201,48 @@ def test_of_a_joint_that_loses_replies_when_it_is_fast_it_is_said_and_of_one_of_
     assert (finding.code, finding.subject) == ("loose_cable", "knee")
     assert "97% of 40 above 57 deg/s, where it was for 30% of the time" in finding.sentence
     assert not list(Losses(states).findings(0, bus, {**losses, 2: ServoLosses(500, 30, 9)}))
+
+
+@pytest.mark.parametrize(("every", "episodes"), [(8, 17), (400, 1), (1, 1)], ids=["often", "once", "always"])
+def test_losses_again_and_again_are_episodes_of_a_fifth_of_a_second(
+    every: int, episodes: int, write: Make, wire: Make
+) -> None:
+    read, packets = bytes.fromhex("fffffd0003070002840004001d15"), []
+    for at in range(800):  # 4 s
+        packets.append(wire(ASK, 3, 5000 * at, read))
+        if at == 0 or at % every:
+            packets.append(wire(STATUS, 3, 5000 * at + 400, status(3)))
+    (servo,) = analyze_log(write([], packets)).servos
+    assert servo.losses is not None
+    assert servo.losses.episodes == episodes
+
+
+BROKEN = bytes.fromhex("fffffd00030800550001")
+LOW = {3: "hip", 7: "knee", 4: "foot"}
+
+
+@pytest.mark.parametrize("fast", [False, True], ids=["sync", "fast"])
+@pytest.mark.parametrize(("of_first", "of_second"), [(12, 0), (9, 0), (12, 2)])
+def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(
+    fast: bool, of_first: int, of_second: int, write: Make, wire: Make
+) -> None:
+    head = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" if fast else b""
+    replies = [bytes((0, servo, 1, 2, 3, 4, 5, 6)) if fast else status(servo) for servo in LOW]
+    packets = []
+    for number in range(60):
+        at = 20_000 * number
+        intact = 0 if number < of_first else 1 if number < of_first + of_second else 3
+        packets.append(wire(ASK, 254, at, FAST_READ if fast else SYNC_READ))
+        if fast and intact:
+            packets.append(wire(STATUS, 254, at + 400, head + b"".join(replies[:intact])))
+        elif not fast:
+            packets += [
+                wire(STATUS, servo, at + 400, data)
+                for servo, data in list(zip(LOW, replies, strict=True))[:intact]
+            ]
+        packets += [wire(NOISE, 254, at + 500, BROKEN)] * (intact < 3)
+    servos = [{"joint": name, "servo_id": servo} for servo, name in LOW.items()]
+    plan = {"buses": [{"name": "main", "protocol": 2.0, "servos": servos}]}
+    findings = analyze_log(write([], packets, plan=plan)).verdict.findings
+    named = [one.subject for one in findings if one.code == "broken_replies"]
+    assert named == ["hip"] * ((of_first, of_second) == (12, 0))

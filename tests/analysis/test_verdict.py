@@ -155,7 +155,7 @@ def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bo
 
 
 def answered(joint: str, servo_id: int, asked: int, missing: int, own: int) -> ServoTraffic:
-    losses = ServoLosses(asked, own, own)
+    losses = ServoLosses(asked, own, own, broken_off=missing - own if servo_id == 0 else 0)
     counts = (0, asked, missing, asked - missing, 0, (), 900.0, 990.0, 950.0)
     return ServoTraffic("main", servo_id, joint, *counts, losses=losses)
 
@@ -181,9 +181,15 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
     servos = [LoggedServo(joint, at, row=at) for at, joint in enumerate(("elbow", "wrist"))]
     plan = LoggedPlan(buses=[LoggedBus(name="main", servos=servos)])
     replies = (answered("elbow", 0, 1000, 50, own), answered("wrist", 1, 1000, 50, 0))
-    found = judge(totals(plan=plan, invalid=(50, 50), servos=replies)).findings[1]
-    assert (found.code, found.subject) == ("invalid_states", subject)
+    worse = tuple(accusing("joint_shakes", joint, rank=Rank.CAUSE) for joint in ("elbow", "wrist"))
+    findings = judge(totals(plan=plan, invalid=(50, 50), servos=replies, findings=worse)).findings
+    (found,) = (one for one in findings if one.code == "invalid_states")
+    assert found.subject == subject
     assert found.sentence.startswith(sentence)
+    assert ("servo 0 (elbow)" in found.sentence) is (subject == "main")
+    # what moves worse while replies before its own are missing is not accused
+    blamed = {one.subject for one in findings if one.code == "joint_shakes" and one.remedy}
+    assert blamed == ({"elbow"} if subject == "elbow" else set())
 
 
 @pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])

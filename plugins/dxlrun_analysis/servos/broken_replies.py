@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dxlrun.errors import counted
+from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges
+from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
 
 _FEWEST = 5
@@ -21,15 +22,19 @@ class BrokenReplies:
     """Counts broken replies of each ID."""
 
     def __init__(self, buses: int) -> None:
-        self._broken, self._cut = np.zeros((2, buses * IDS), np.int64)
-        """Of each servo; of these at the end of a shared status packet."""
+        self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
+        """Of each servo; of these as the first of several, none of them intact; and at the end of a shared
+        status packet."""
         self._noisy = np.zeros(buses, np.int64)
         """Exchanges of each bus."""
 
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""
         due, buses = exchanges.due, len(self._noisy)
-        rows = np.flatnonzero(due.broken & exchanges.ended[due.exchange])
+        # of a chain of which nothing is intact although bytes came, the first reply is broken at least
+        first = (due.loss == Loss.LINE) & (due.place == 0) & (exchanges.noise[due.exchange] > 0)
+        self._first += np.bincount(due.servo[first & exchanges.ended[due.exchange]], minlength=buses * IDS)
+        rows = np.flatnonzero((due.broken | first) & exchanges.ended[due.exchange])
         servo, request = due.servo[rows], exchanges.request[due.exchange[rows]]
         ends = due.place[rows] == exchanges.requests.servos[request] - 1
         cut = servo[ends & exchanges.requests.fast[request]]
@@ -47,7 +52,12 @@ class BrokenReplies:
         broken, lost = int(mine[servo_id]), losses.get(servo_id)
         if broken < _ALONE * total or lost is None or lost.angles is not None:
             return ()
-        name = bus.names.get(servo_id) or f"servo {servo_id}"
+        # in a short chain the line spoils the first one often, too
+        head = int(self._first[index * IDS + servo_id])
+        behind = broken - head >= max(_FEWEST, _ALONE * (total - head))
+        if not behind and not has_them_alone(broken, total - broken):
+            return ()
+        name, asked = bus.names.get(servo_id) or f"servo {servo_id}", lost.asked + lost.broken_off
         end = self._cut[index * IDS + servo_id] >= _ALONE * broken
         cut = "; or the end of the status packet that all share, which is its part, is lost" if end else ""
         return (
@@ -55,11 +65,11 @@ class BrokenReplies:
                 "broken_replies",
                 name,
                 f"The replies of {name} (servo {servo_id} on bus {bus.name}) come broken, "
-                f"{counted(broken, 'time', 'times')} of {lost.asked}, and those of the others do not: two "
+                f"{counted(broken, 'time', 'times')} of {asked}, and those of the others do not: two "
                 f"servos have its ID, or its own driver or plug is bad{cut}.",
                 f"Unplug {name} and run `dxlrun scan {bus.port or 'PORT'}`: if ID {servo_id} still answers, "
                 "two servos have it; else check its plugs, and exchange it where a new cable does not help.",
                 Rank.CAUSE,
-                broken / max(lost.asked, 1),
+                broken / max(asked, 1),
             ),
         )

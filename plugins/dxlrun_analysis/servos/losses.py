@@ -5,7 +5,8 @@ Whose: of a chain of replies only the first that is missing is a servo's own, th
 be lost: that is the line's, but for the test of angles, for which it may be the first servo's.
 
 Independent: losses are one episode until the servo has answered again, and for 0.2 s. A cable that is cut for
-a second is one, however often its servo is read.
+a second is one, however often its servo is read. At which angle or speed they begin is asked of those that
+are 0.2 s behind the last loss: of a contact that flickers only the first.
 
 At which angle: each joint has a histogram of the time it spent in bins of 5 deg, and of the angles at which
 episodes began; the angle at a lost reply is taken from the states before and behind it. A range is named that
@@ -121,7 +122,8 @@ class Losses:
         self._states = states
         servos = len(states.joint_of)
         self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
-        self._last_ns = np.full(servos, -(1 << 62), np.int64)
+        self._last_ns, self._begun_ns = np.full((2, servos), -(1 << 62), np.int64)
+        """When each servo's last reply was lost, and when its last episode began."""
         self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // IDS), np.int64)
         self._chains, self._broken_off, self._alone, self._lost_alone = np.zeros((4, servos), np.int64)
         """Reads of several servos, by the first; those of which nothing came; reads of one; lost ones."""
@@ -149,7 +151,7 @@ class Losses:
         first = np.full(len(count), IDS, np.int64)
         first[exchange] = due.place[rows]
         could = ended & (due.reply >= 0) & (due.place < first[due.exchange])
-        begins = self._begins(exchanges, servo, exchange)
+        episodes, begins = self._begins(exchanges, servo, exchange)
         for counts, servos in (
             (self._chains, head[asked & several]),
             (self._broken_off, head[exchange[~own]]),
@@ -157,8 +159,8 @@ class Losses:
             (self._lost_alone, head[exchange[own & ~several[exchange]]]),
             (self._asked, np.append(due.servo[could], servo[own])),
             (self._lost, servo[own]),
-            (self._episodes, servo[begins & own]),
-            (self._line_episodes, bus[begins]),
+            (self._episodes, servo[episodes & own]),
+            (self._line_episodes, bus[episodes]),
             (self._exchanges, exchanges.bus[exchanges.request > 0]),
             (self._noisy, exchanges.bus[_noisy(exchanges)]),
         ):
@@ -170,18 +172,22 @@ class Losses:
         self._count_places(servo, exchanges.cycle[exchange], begins, places)
 
     def _begins(self, exchanges: Exchanges, servo: Numbers, exchange: Numbers) -> NDArray[np.bool_]:
-        """Return which losses begin an episode: its servo has answered since the last, a while ago."""
+        """Return which losses begin an episode: its servo has answered since the last loss, and the last
+        episode began a while ago; and of which the last loss was so long ago. Shape (2, losses)."""
         due = exchanges.due
         answered, answers = due.servo[due.reply >= 0], due.exchange[due.reply >= 0]
         keys = np.sort((answered << _ROWS) + answers) if len(servo) else answers
         before = np.searchsorted(keys, (servo << _ROWS) + exchange) - np.searchsorted(keys, servo << _ROWS)
         before += self._answered[servo]
         self._answered += np.bincount(answered, minlength=len(self._answered))
-        begins = np.zeros(len(servo), np.bool_)
+        begins = np.zeros((2, len(servo)), np.bool_)
         for at in np.argsort(exchange, kind="stable").tolist():
             one, at_ns = servo[at], exchanges.asked_ns[exchange[at]]
             since = before[at] - self._answered_before[one]
-            begins[at] = since > 0 and at_ns - self._last_ns[one] > _EPISODE_NS
+            past_ns = at_ns - np.array([self._begun_ns[one], self._last_ns[one]])
+            begins[:, at] = (since > 0) & (past_ns > _EPISODE_NS)
+            if begins[0, at]:
+                self._begun_ns[one] = at_ns
             self._answered_before[one], self._last_ns[one] = before[at], at_ns
         return begins
 
