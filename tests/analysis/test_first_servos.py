@@ -81,3 +81,21 @@ def test_few_late_replies_are_no_finding(found: Make) -> None:
         not {"slow_servo", "late_now_and_then"}
         & found(late_us=lambda cycle, servo: 3000 * (cycle % 127 == 0)).keys()
     )
+
+
+def test_where_single_servos_are_in_time_it_is_not_the_adapter_that_is_late(found: Make) -> None:
+    findings = found(late_us=lambda cycle, servo: 6000 * (servo == 0 and cycle % 3 == 0))
+    assert not {"late_replies", "latency_timer"} & findings.keys()
+    assert "whether it is one servo or the adapter" in findings["late_now_and_then"].sentence
+    findings = found(late_us=lambda cycle, servo: 6000 * (cycle % 3 == 0))
+    assert findings["late_replies"].subject == "main"
+
+
+@pytest.mark.parametrize(("every", "told"), [(1, True), (11, True), (60, False)])
+def test_what_is_late_for_long_is_as_many_moments_as_twentieths_of_a_second(
+    every: int, told: bool, found: Make
+) -> None:
+    def late_us(cycle: int, servo: int) -> int:
+        return 3000 * (cycle < 30 if every == 1 else cycle % every == 0)
+
+    assert ("late_now_and_then" in found(late_us=late_us)) is told

@@ -40,8 +40,8 @@ _RULES: dict[CauseKind, _Rule] = {
     "own work": _Rule("own_work", "The loop's own work, or what interrupted it, took {took}."),
     "late reply": _Rule(
         "late_exchanges",
-        "{subject} made cycles too long: replies were later than planned by {took}.",
-        "Check cable, adapter (latency timer, driver, USB hub) and return_delay_time.",
+        "{subject} made cycles too long: replies were later than planned by {took}; servo or adapter.",
+        "Check return_delay_time of the servos, cable, and adapter (latency timer, driver, USB hub).",
     ),
     "write call": _Rule(
         "slow_writes",

@@ -31,6 +31,8 @@ class LateReplies:
     def __init__(self, buses: int) -> None:
         self._given_up = np.zeros(buses * IDS, np.int64)
         self._longest_ns, self._exchanges = np.zeros((2, buses), np.int64)
+        self._often = np.zeros(buses, np.int64)
+        """In how many twentieths of a second each bus was late."""
         self._moments: Counter[int] = Counter()
         """How many there were, by the buses that were late in them, a bit each."""
 
@@ -48,6 +50,8 @@ class LateReplies:
         np.maximum.at(self._longest_ns, exchanges.bus[rows], at_ns - exchanges.sent_ns[rows])
         times = np.concatenate([late_at_ns, at_ns])
         buses = np.concatenate([late_bus, exchanges.bus[rows]])
+        bins = np.unique(np.stack([buses, times // _MOMENT_NS]), axis=1)[0]
+        self._often += np.bincount(bins, minlength=count)
         order = np.argsort(times, kind="stable")
         begins = np.flatnonzero(np.diff(times[order], prepend=-(1 << 62)) > _MOMENT_NS)
         if len(begins):
@@ -70,8 +74,8 @@ class LateReplies:
         return sum(n for mask, n in self._moments.items() if mask >> bus & 1 and mask & others)
 
     def moments(self, bus: int) -> int:
-        """Return at how many moments a bus was late."""
-        return sum(n for mask, n in self._moments.items() if mask >> bus & 1)
+        """Return at how many moments a bus was late; many that follow each other are as many."""
+        return int(self._often[bus])
 
     def everywhere(self, indices: Sequence[int], buses: Sequence[LoggedBus]) -> Finding:
         """Name what several buses that are late `together` have in common."""

@@ -34,6 +34,7 @@ _FEWEST_MOMENTS = 10
 _FEWEST_SERVOS = 4
 """Of so many it is no chance that only one was late."""
 _FEWEST = 20
+_FEWEST_ALONE = 10
 _OFTEN = 3
 """Late replies of a servo from which they are no chance."""
 _KINDS = max(PacketKind) + 1
@@ -172,9 +173,9 @@ class Traffic:
                 continue  # what is late, missing or spoilt then is a consequence
             somewhere = tuple(self._reply_times.somewhere(index, plan))
             if index not in together:
-                if not somewhere and is_late(
-                    bus, len(plan.servos), self._late[:, index * IDS : (index + 1) * IDS].sum(axis=0)
-                ):
+                ids = slice(index * IDS, (index + 1) * IDS)
+                alone = (self._late[:, ids].sum(axis=0), self._alone[:, ids].sum(axis=0))
+                if not somewhere and is_late(bus, len(plan.servos), *alone):
                     findings.append(_late_replies(bus))
                     continue
                 findings += somewhere or self._late_replies.findings(index, plan)
@@ -334,17 +335,24 @@ def usually_late(bus: BusTraffic) -> bool:
     return bus.extra_us >= bus.planned_latency_us + LATE_US
 
 
-def is_late(bus: BusTraffic, servos: int, late: Numbers) -> bool:
+def is_late(bus: BusTraffic, servos: int, late: Numbers, alone: Numbers) -> bool:
     """Return whether the adapter of a bus keeps replies back longer than planned.
 
-    `servos`: how many it has; `late`: how often each was late when it was asked alone, shape (256,). Where it
-    is one of several, it is that servo, not the adapter.
+    `servos`: how many it has; `late`: how often each was late when it was asked alone, and `alone`: how often
+    it was asked so, shape (256,). Where only one of several was late then, or none although as many of
+    those replies as of all would be ten, it is a servo, not the adapter.
     """
     if bus.extra_us is None or bus.planned_latency_us is None:
         return False
     if not usually_late(bus) and bus.late_share < _LATE_SHARE:
         return False
-    return servos < 2 or np.count_nonzero(late >= _OFTEN) != 1
+    if servos < 2:
+        return True
+    most = int(np.argmax(late))
+    expected = bus.late_share * int(alone.sum() - alone[most])
+    if expected >= _FEWEST_ALONE and late.sum() - late[most] < expected / _FEWEST_ALONE:
+        return False
+    return int(np.count_nonzero(late >= _OFTEN)) != 1
 
 
 def _late_replies(bus: BusTraffic) -> Finding:
