@@ -191,7 +191,12 @@ def test_a_stream_stays_open_while_it_is_read_or_quiet_and_a_sleeping_listener_i
         await asyncio.get_running_loop().sock_connect(sleeping, door.path)
         sleeping.send(STREAM)
         until = asyncio.get_running_loop().time() + 60
-        while not (connections := [one for one in gc.get_objects() if type(one) is server.Connection]):
+        await quiet.readuntil(b"\r\n\r\n")
+        await reading.readuntil(b"\r\n\r\n")
+        connections = []
+        while len(connections) < 3:
+            found = [one for one in gc.get_objects() if type(one) is server.Connection and one.transport]
+            connections = [one for one in found if not one.transport.is_closing()]
             await asyncio.sleep(0.001)
         connections[0].last_byte_s = 0.0
         connections[0].pause_writing()
