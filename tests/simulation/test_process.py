@@ -20,7 +20,7 @@ from dxlrun.dynamixel.control_table import control_table
 from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlrun.simulation.bus.ledger import Ledger, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.pseudo_terminal import PseudoTerminal
+from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
@@ -345,3 +345,17 @@ def test_a_host_that_floods_the_line_feels_its_rate(start_buses):
                 sent += os.write(port, bytes(4096))
         assert sent < 1_000_000
     assert running.hang_up() == 0
+
+
+def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path):
+    file, link = tmp_path / "file", tmp_path / "link"
+    file.write_text("mine")
+    with pytest.raises(FileExistsError, match="is no link"):
+        DeviceLink(file).point("/dev/null")
+    one, other = DeviceLink(link), DeviceLink(link)
+    one.point("/dev/null")
+    other.point("/dev/zero")
+    one.remove()
+    assert os.readlink(link) == "/dev/zero"
+    other.remove()
+    assert os.listdir(tmp_path) == ["file"]
