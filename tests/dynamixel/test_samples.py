@@ -2,12 +2,14 @@
 
 import math
 import random
+import struct
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig
 
+import fuzz_kernel as fuzz
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
@@ -191,6 +193,54 @@ def test_states_are_what_the_rules_make_of_each_servo(name, order):
             assert states.age_ns[row] == (-1 if one.shown_ns is None else robot.now_ns - one.shown_ns)
         quick += all(one.valid for one in ones)
     assert 20 < quick < 145
+
+
+NUMBERS = {"unsigned": "BHI", "twos_complement": "bhi", "float32": "  f"}
+"""Formats of Python's `struct` for one, two and four bytes."""
+
+
+def told(field, data):
+    """Return the state that a block of bytes has of a device, by plain rules."""
+    place = field.place
+    (number,) = struct.unpack_from("<" + NUMBERS[place.encoding][place.size // 2], data, place.offset)
+    if place.bit is not None:
+        number = number >> place.bit & 1
+    return number * field.scale + field.offset
+
+
+@pytest.mark.parametrize("name", ["bulk read with devices", "fast bulk read with devices"])
+def test_states_of_devices_are_what_the_rules_make_of_their_bytes(name):
+    rng = random.Random(name)
+    plans, _ = fuzz.robot(name, 2)
+    side = fuzz.Side(plans)
+    samples, sources, now_ns = side.hardware._samples, side.sources, SECOND_NS
+    shown, values = [-1] * len(sources.valid), np.full(len(sources.values), np.nan)
+    seen = set()
+    for _ in range(200):
+        now_ns += 10 * MS
+        valid = [False] * len(shown)
+        for bus, plan in zip(samples.buses, plans, strict=True):
+            bus.clear()
+            member = len(plan.servos)
+            for device in plan.devices:
+                found, times = {}, []
+                for block in device.blocks:
+                    data, at_ns = rng.randbytes(block.length), now_ns - rng.randrange(4 * MS)
+                    if rng.random() < 0.8:
+                        bus.take(member, data, at_ns)
+                        times.append(at_ns)
+                        found |= {field.column: told(field, data) for field in block.fields}
+                    member += 1
+                if len(times) == len(device.blocks) and all(map(math.isfinite, found.values())):
+                    valid[device.source], shown[device.source] = True, min(times)
+                    for column, value in found.items():
+                        values[column] = value
+        samples.settle(now_ns)
+        assert sources.valid.tolist() == valid
+        assert sources.values == pytest.approx(values, nan_ok=True, rel=1e-12)
+        assert sources.age_ns.tolist() == [-1 if at_ns < 0 else now_ns - at_ns for at_ns in shown]
+        seen.add(tuple(valid))
+    assert len(seen) > 4
 
 
 class TestJumps:
