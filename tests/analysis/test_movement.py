@@ -197,9 +197,6 @@ INNOCENT = {
         way=0.8 * np.sign(np.sin(TIME)),
         position=np.interp(TIME % 6.28, [0, 1.6, 3.14, 4.74, 6.28], [-0.8, 0.8, 0.8, -0.8, -0.8]),
     ),
-    "rests at the end of its way": Joint(
-        way=np.minimum(SWING, 0.55), position=np.minimum(behind(SWING), 0.5)
-    ),
 }
 
 

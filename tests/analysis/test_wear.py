@@ -105,9 +105,41 @@ def test_a_joint_that_is_held_back_on_one_side_the_more_the_further_it_goes_is_p
     assert "of its torque instead of" in one.sentence
 
 
-def test_a_spring_that_was_always_there_or_a_little_one_is_not_told() -> None:
-    for away in (0.12 * FAR, np.where(FAULT, 0.05 * FAR, 0.0)):
-        assert found(Joint(position=behind(SWING) - away, load=PEER.load)) == []
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_spring_that_was_always_there_bends_too_sharply_for_a_weight(side: int) -> None:
+    sprung = Joint(side * SWING, side * (behind(SWING) - 0.12 * FAR), PEER.load)
+    (one,) = found(sprung)
+    assert (one.code, one.rank) == ("pulled_joint", Rank.REMARK)
+    assert f"the more the further it goes {'beyond' if side > 0 else 'below -'}" in one.sentence
+    assert "and nowhere else (other joints: at most 0." in one.sentence
+    stopped = Joint(np.minimum(SWING, 0.55), np.minimum(behind(SWING), 0.5), PEER.load)
+    assert [one.code for one in found(stopped)] == ["pulled_joint"]
+
+
+WEIGHTS = {
+    "a little spring": behind(SWING) - np.where(FAULT, 0.05 * FAR, 0.0),
+    "a weight": behind(SWING) - 0.15 * np.cos(behind(SWING)),
+    "a hanging weight": behind(SWING) - 0.15 * np.sin(behind(SWING)),
+    "a weight for one stroke": behind(SWING) - np.where((TIME > 9.0) & (TIME < 9.4), 0.12 * FAR, 0.0),
+}
+
+
+@pytest.mark.parametrize("case", WEIGHTS)
+def test_what_pulls_but_little_or_by_the_sine_of_the_angle_is_not_told(case: str) -> None:
+    assert found(Joint(position=WEIGHTS[case], load=PEER.load)) == []
+
+
+def test_two_joints_that_are_not_well_are_both_told_unless_they_are_mirror_images() -> None:
+    loose = Joint(position=slack(behind(SWING), 0.05), load=PEER.load)
+    rubs = Joint(position=slack(behind(SWING), 0.07), load=np.where(FAULT, 0.4, 0.05) * np.sign(FAST))
+    seen = findings(loose, rubs, PEER, PEER, PEER)
+    assert [(one.code, one.subject) for one in seen] == [("play", "j0"), ("friction", "j1")]
+    assert findings(loose, loose, loose, PEER, PEER) == []
+    looser = Joint(position=slack(behind(SWING), 0.07), load=PEER.load)
+    assert len(findings(loose, looser, PEER, PEER, PEER)) == 2
+    assert findings(loose, looser, PEER, PEER) == []  # of few others the worst counts
+    names = ("left_knee", "right_knee", "neck", "left_hip", "right_hip")
+    assert findings(loose, looser, PEER, PEER, PEER, names=names) == []
 
 
 def test_a_joint_that_is_off_everywhere_is_told_as_it_was_seen() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,7 +48,7 @@ class Joint:
     """Where that controller is to move it"""
 
 
-def findings(*joints: Joint, name: str = "j") -> list[Finding]:
+def findings(*joints: Joint, names: Sequence[str] = ()) -> list[Finding]:
     """Judge joints; all others beside them follow well."""
     kind = [("read_ns", np.int64), *((field, np.float64, len(joints)) for field in FIELDS)]
     kind += [
@@ -67,7 +68,7 @@ def findings(*joints: Joint, name: str = "j") -> list[Finding]:
         cycles["goal_position"][:, row] = joint.way
         cycles["goal_effort"][:, row], cycles["reference"][:, row] = joint.effort, joint.sought
         facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
-        planned.append(PlannedJoint(f"{name}{row}", **facts))
+        planned.append(PlannedJoint(names[row] if names else f"j{row}", **facts))
     references = [f"pid/{joint.name}/position" for joint in planned]
     movement = Movement(planned, int(cycles["read_ns"][0]), references)
     ways = np.array([joint.way for joint in joints]).T

@@ -10,14 +10,15 @@
 - *jerked*: it is thrown off its way again and again, within 80 ms, while its goals are even.
 - *hunts*: it swings evenly around its goal, by 0.6 deg, three times a second or more, where that does not.
 
-All of it three times as much as in any other joint that moved: where others show it too, it is the motion,
-the ground or the supply. A joint that other rules name is left to them.
+All of it three times as much as in any other joint that moved, or any but one: where others show it too, it
+is the motion, the ground or the supply. A joint that other rules name is left to them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence, Set
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ from dxlrun_analysis.joints.following import STROKE_RAD, Followed, Turn, Visit
 
 _OTHERS = 3.0
 """So many times what any other joint shows."""
+_FEWEST_OTHERS = 4
+_SIDE = re.compile("left|right|(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
 _BEHIND_RAD = 0.03
 """1.7 deg"""
 _FEWEST_TURNS = 2
@@ -68,66 +71,98 @@ class Worn(NamedTuple):
     """What it does, behind its name"""
 
 
+class _Seen(NamedTuple):
+    """One joint that no other rule names."""
+
+    one: Followed
+    turns: list[Turn]
+    visits: list[Visit]
+    jerks: Floats
+    swings: Floats
+
+
+class _Others(NamedTuple):
+    """The joints beside one."""
+
+    of: _Seen
+    all: list[_Seen]
+
+    def most(self, shown: Callable[[_Seen], Iterable[float]]) -> float:
+        """Return the most that others show, 0 at least.
+
+        Of many others the worst may be another one that is not well; unless it is its mirror image, which the
+        same happens to.
+        """
+        values = sorted((max(shown(each), default=0.0), _plain(each) == _plain(self.of)) for each in self.all)
+        alone = len(values) >= _FEWEST_OTHERS and not values[-1][1]
+        return max(0.0, values[-2 if alone else -1][0]) if values else 0.0
+
+    def beside(self, theirs: float) -> str:
+        """Return how a sentence compares with them."""
+        return f" (other joints: at most {_deg(theirs)})" if self.all else ""
+
+
 def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
     """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
-    sound = [one for one in joints if one.row not in named]
-    turns = [one.turns() for one in sound]
-    visits = [list(one.visits(_OFF_RAD / 2, _LOAD / 2)) for one in sound]
-    jerks = [one.jerks() for one in sound]
-    swings = [one.swings() for one in sound]
-    for at, one in enumerate(sound):
-        others = [other for other in range(len(sound)) if other != at]
-        found = (
-            _turns_badly(one, turns[at], [turn for other in others for turn in turns[other]])
-            or _takes_more(one, turns[at], [turns[other] for other in others])
-            or _hunts(one, swings[at], [swings[other] for other in others])
-            or _pulled(one, visits[at], [visit for other in others for visit in visits[other]], turns[at])
-            or _jerked(one, jerks[at], [jerks[other] for other in others])
-        )
+    seen = [
+        _Seen(one, one.turns(), list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.jerks(), one.swings())
+        for one in joints
+        if one.row not in named
+    ]
+    for mine in seen:
+        others = _Others(mine, [each for each in seen if each is not mine])
+        found = next(filter(None, (rule(mine, others) for rule in _RULES)), None)
         if found is not None:
             yield found
 
 
-def _turns_badly(one: Followed, turns: list[Turn], others: list[Turn]) -> Worn | None:
-    theirs = max((turn.behind for turn in others), default=0.0)
+def _plain(seen: _Seen) -> str:
+    return _SIDE.sub("", seen.one.joint.name)
+
+
+def _turns_badly(mine: _Seen, others: _Others) -> Worn | None:
+    one, turns = mine.one, mine.turns
+    theirs = others.most(lambda each: (turn.behind for turn in each.turns))
     least = max(_BEHIND_RAD, _OTHERS * theirs)
     bad = [turn for turn in turns if turn.behind > least]
-    if not bad or (len(bad) < _FEWEST_TURNS and bad[0].behind < 2 * least):
+    if not bad:
         return None
     worst = max(bad, key=lambda turn: turn.behind)
     usual = [turn for turn in turns if turn.at_s < bad[0].at_s and turn.behind < _BEHIND_RAD / 2]
     behind, stood = (float(np.median([turn[at] for turn in bad])) for at in (1, 3))
-    stands = stood > max(_STOOD * behind, _OTHERS * max((turn.stood for turn in others), default=0.0))
-    text = f"is {_deg(worst.behind)} behind in both directions{_beside(theirs, others)}"
+    theirs_stood = others.most(lambda each: (turn.stood for turn in each.turns))
+    stands = stood > max(_STOOD * behind, _OTHERS * theirs_stood)
+    text = f"is {_deg(worst.behind)} behind in both directions{others.beside(theirs)}"
     if stands and (usual or one.alike >= _FEWEST_ALIKE):
         text += f", and stands still at each turn until its goal is {_deg(stood)} back"
-        code, takes = _rubs(worst, usual, others)
+        code, takes = _rubs(worst, usual, [turn.load for each in others.all for turn in each.turns])
         return Worn(code, one.row, bad[0].at_s, text + takes)
     late_s, *before_s = (one.lag_s + turn.behind / turn.speed for turn in (worst, *usual))
-    if stands or not before_s or late_s < max(_SOFTER * max(before_s), max(before_s) + _LATE_S):
+    once = len(bad) < _FEWEST_TURNS and worst.behind < 2 * least
+    if stands or once or not before_s or late_s < max(_SOFTER * max(before_s), max(before_s) + _LATE_S):
         return None
     return Worn("softer_joint", one.row, bad[0].at_s, f"{text}, and was not at its first turns")
 
 
-def _rubs(worst: Turn, usual: list[Turn], others: list[Turn]) -> tuple[str, str]:
+def _rubs(worst: Turn, usual: list[Turn], others: list[float]) -> tuple[str, str]:
     """Return what makes a joint stand still at its turns, and the torque that it takes."""
     if math.isnan(worst.load):
         return "lost_motion", ""
-    before = max(0.0, usual[0].load if usual else float(np.median([turn.load for turn in others])))
+    before = max(0.0, usual[0].load if usual else float(np.median(others)))
     compared = f"{before:.0%} {'before' if usual else 'in the others'}"
     rubs = worst.load > max(before + _LOAD, 1.5 * before)
     takes = f", which takes {max(0.0, worst.load):.0%} of its torque ({compared})"
     return ("friction" if rubs else "play"), takes
 
 
-def _takes_more(one: Followed, turns: list[Turn], others: list[list[Turn]]) -> Worn | None:
-    theirs = max((more for other in others for _, _, more in _loaded(other)), default=0.0)
-    bad = [each for each in _loaded(turns) if each[2] > max(_LOAD, each[1], _OTHERS * theirs)]
+def _takes_more(mine: _Seen, others: _Others) -> Worn | None:
+    theirs = others.most(lambda each: (more for _, _, more in _loaded(each.turns)))
+    bad = [each for each in _loaded(mine.turns) if each[2] > max(_LOAD, each[1], _OTHERS * theirs)]
     if len(bad) < _FEWEST_TURNS:
         return None
     worst, before, _ = max(bad, key=lambda each: each[2])
     text = f"takes {worst.load:.0%} of its torque in both directions (before: {before:.0%})"
-    return Worn("friction", one.row, bad[0][0].at_s, text)
+    return Worn("friction", mine.one.row, bad[0][0].at_s, text)
 
 
 def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
@@ -139,12 +174,13 @@ def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
             yield turn, most, turn.load - most
 
 
-def _pulled(one: Followed, visits: list[Visit], others: list[Visit], turns: list[Turn]) -> Worn | None:
-    rubs = 2 * max((abs(turn.behind) for turn in turns[:2]), default=0.0)
-    theirs = max((each.change for each in others), default=0.0)
+def _pulled(mine: _Seen, others: _Others) -> Worn | None:
+    one, visits = mine.one, mine.visits
+    rubs = 2 * max((abs(turn.behind) for turn in mine.turns[:2]), default=0.0)
+    theirs = others.most(lambda each: (visit.change for visit in each.visits))
     least = max(_OFF_RAD, rubs, _OTHERS * theirs)
     off = [each for each in visits if each.change > least]
-    theirs_load = max((each.load_change for each in others), default=0.0)
+    theirs_load = others.most(lambda each: (visit.load_change for visit in each.visits))
     loaded = [each for each in visits if each.load_change > max(_LOAD, _OTHERS * theirs_load)]
     bad = off if _lasts(off) else loaded
     if not _lasts(bad):
@@ -160,7 +196,7 @@ def _pulled(one: Followed, visits: list[Visit], others: list[Visit], turns: list
     if bad is loaded:
         return Worn("off_its_way", one.row, since_s, takes) if alike else None
     most = _deg(max(each.change for each in bad))
-    text = f"is off by up to {most} more than before at the same places{_beside(theirs, others)}"
+    text = f"is off by up to {most} more than before at the same places{others.beside(theirs)}"
     side = _one_side(bad, [each for each in visits if each.at_s > since_s and each not in bad])
     text += f", the more the further it goes {side}" if side else ""
     text += f", with {load:.0%} of its torque instead of {was:.0%}" if alike else ""
@@ -186,29 +222,41 @@ def _one_side(bad: list[Visit], good: list[Visit]) -> str:
     return f"below {math.degrees(places.max()):.0f} deg" if below and along < -_ALONG else ""
 
 
-def _jerked(one: Followed, jerks: Floats, others: list[Floats]) -> Worn | None:
-    theirs = max((float(np.nanmax(each, initial=0.0)) for each in others), default=0.0)
+def _bent(mine: _Seen, others: _Others) -> Worn | None:
+    bend = mine.one.bend()
+    theirs = others.most(lambda each: [abs(each.one.bend().off)])
+    if abs(bend.off) < max(_OFF_RAD, _OTHERS * theirs):
+        return None
+    side = f"{'beyond' if bend.above else 'below'} {math.degrees(bend.place):.0f} deg"
+    text = f"is off by {_deg(abs(bend.off))}, the more the further it goes {side}, and nowhere else"
+    return Worn("pulled_joint", mine.one.row, bend.since_s, text + others.beside(theirs))
+
+
+def _jerked(mine: _Seen, others: _Others) -> Worn | None:
+    one, jerks = mine.one, mine.jerks
+    theirs = others.most(lambda each: [float(np.nanmax(each.jerks, initial=0.0))])
     times = one.at_s[np.nan_to_num(jerks) > max(_JERK_RAD, _OTHERS * theirs)]
     count = int((np.diff(times, prepend=-math.inf) > _APART_S).sum())
     if count < _JERKS:
         return None
     most = _deg(float(np.nanmax(jerks)))
     text = f"is thrown off its way {count} times while its goals are even, by up to {most} within 80 ms"
-    return Worn("jerked_joint", one.row, float(times[0]), text + _beside(theirs, others))
+    return Worn("jerked_joint", one.row, float(times[0]), text + others.beside(theirs))
 
 
-def _hunts(one: Followed, at_s: Floats, others: list[Floats]) -> Worn | None:
-    theirs = max((len(each) for each in others), default=0)
+def _hunts(mine: _Seen, others: _Others) -> Worn | None:
+    at_s = mine.swings
+    theirs = others.most(lambda each: [float(len(each.swings))])
     if len(at_s) < max(_SWINGS, _OTHERS * theirs):
         return None
     hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
     text = f"swings to and fro around its goal {hertz:.0f} times a second, {len(at_s) // 2} times in a row"
-    return Worn("hunting_joint", one.row, float(at_s[0]), text)
-
-
-def _beside(theirs: float, others: Sequence[object]) -> str:
-    return f" (other joints: at most {_deg(max(0.0, theirs))})" if others else ""
+    return Worn("hunting_joint", mine.one.row, float(at_s[0]), text)
 
 
 def _deg(rad: float) -> str:
     return f"{math.degrees(rad):.1f} deg"
+
+
+_RULES = (_turns_badly, _takes_more, _hunts, _pulled, _bent, _jerked)
+"""The most direct evidence first"""
