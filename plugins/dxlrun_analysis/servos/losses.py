@@ -335,7 +335,10 @@ class Losses:
             elif most[1].lost >= _EVEN * lost:
                 # of a chain of which nothing came it is open whether it is the first servo's or the line's
                 name = names.get(most[0]) or f"servo {most[0]}"
-                how = f"replies, in {line} episodes, mostly a whole chain: the first servo's or the line's"
+                heads = np.flatnonzero(self._broken_off[index * IDS : (index + 1) * IDS])
+                first = f", {names.get(int(heads[0]), heads[0])}," if len(heads) == 1 else ""
+                how = f"replies, in {line} episodes, mostly a whole chain: either its first servo{first} is "
+                how += "silent, or the instruction is lost"
                 how += f"; of {single} of single servos {most[1].lost} are of {name}" if lost else ""
             else:
                 how = f"replies of its servos evenly: {lost} replies of single servos, in {line} episodes"

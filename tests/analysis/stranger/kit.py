@@ -431,6 +431,8 @@ class Story:
                         group.turns[each.turn].servo_id if group else each.data[2 if bus.protocol < 2 else 4]
                     )
                     data = change(servo_id, each.data, each.due_ns / S)
+                    if not data:
+                        return
                     if data != each.data:
                         each.data = data
                 arrive(each)
