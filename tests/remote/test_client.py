@@ -147,6 +147,29 @@ def test_what_may_have_been_received_is_never_sent_again(peer, said, monkeypatch
     assert len(one.heard) == 1
 
 
+def test_an_answer_after_ctrl_c_does_not_meet_the_next_question(peer, monkeypatch):
+    one = peer(OK, OK)
+    with monkeypatch.context() as patch:
+        patch.setattr("dxlrun.remote.sockets._answer", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            one.robot.pause()
+    one.robot.resume()
+    assert one.connections == 2
+
+
+def interrupt(end):
+    """Be interrupted when the answer has come."""
+    end.recv(65536)
+    raise KeyboardInterrupt
+
+
+def test_a_connection_that_the_gateway_will_close_is_not_used_again(peer):
+    one = peer(OK.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n"), OK)
+    one.robot.pause()
+    one.robot.resume()
+    assert one.connections == 2
+
+
 def test_a_connection_that_was_closed_while_idle_is_opened_anew(peer):
     one = peer(OK, OK)
     one.robot.pause()

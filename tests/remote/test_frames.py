@@ -75,6 +75,8 @@ def test_the_body_turns_with_its_imu(desk):
 
     assert robot.pose("pan", "odom").rpy == pytest.approx((np.pi / 2, 0, 0))
     states = robot.states()
+    assert states.joint("pan")["position"] == 0.0
+    assert states.joint("pan")["temperature"] is None
     assert (states.source_states[0], states.source_state[0]) == ("imu/orientation.x", 2.0)
 
 

@@ -87,9 +87,8 @@ class RobotOnVirtualTime:
         log_path = str(log) if log else None
         seconds = itertools.count()  # one a request: an experiment may make as many as it likes
         self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()
-        self._waiting = _VirtualTime(lambda: self.now_s, self._turn)
-        self._due: Callable[[], bool] = lambda: True
-        """Ends the robot's turn."""
+        self._waiting = _VirtualTime(lambda: self.now_s, self.turn)
+        self._closing = False
         self._robots_turn, self._our_turn = threading.Semaphore(0), threading.Semaphore(0)
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -121,7 +120,7 @@ class RobotOnVirtualTime:
             self._cycles.append(bytes(payload))
             self._heartbeat.cycle(self.simulated.cycles + 1, self.simulated.skipped)
             self.each_cycle(cycle)
-            if self._due():
+            if not self._closing:
                 self._our_turn.release()
                 self._robots_turn.acquire()
 
@@ -132,26 +131,16 @@ class RobotOnVirtualTime:
         """Virtual time, s."""
         return self.simulated.clock.now_ns() * 1e-9
 
-    def until(self, due: Callable[[], bool]) -> None:
-        """Let the robot run until a cycle at whose end `due` is true. Raises RunGone when it ends before."""
-        self._require_running()
-        self._due = due
-        self._robots_turn.release()
-        self._our_turn.acquire()
-        if self._error is not None or self.simulated.result is not None:
-            self._thread.join()
-            if not due():
-                self._require_running()
-
-    def _require_running(self) -> None:
+    def turn(self) -> None:
+        """Let the robot run a cycle, and the gateway take what that left. Raises RunGone after its end."""
         if not self._thread.is_alive():
             result = self.simulated.result
             detail = str(self._error or (result.detail if result else ""))
             raise RunGone(f"the run of {self.name} ended{f': {detail}' if detail else ''}")
-
-    def _turn(self) -> None:
-        """Let the robot run a cycle, and the gateway take what that left."""
-        self.until(lambda: True)
+        self._robots_turn.release()
+        self._our_turn.acquire()
+        if self._error is not None or self.simulated.result is not None:
+            self._thread.join()
         self.gateways_link.collect()
 
     def new(self) -> tuple[Cycles, Sequence[Event]]:
@@ -204,7 +193,7 @@ class RobotOnVirtualTime:
         """End the run."""
         if self._thread.is_alive():
             self.simulated.stop.request()
-            self._due = lambda: False
+            self._closing = True
             self._robots_turn.release()
             self._thread.join()
         self._waiting.close()

@@ -180,6 +180,23 @@ def test_an_abort_before_the_first_segment_moves_nothing(stage):
     assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
 
 
+def test_what_is_only_looked_at_takes_no_cycle_and_a_run_that_ended_is_an_error(stage):
+    rig = stage.rig(stage.arm)
+    link = rig.robot.link
+    cycles = link.simulated.cycles
+    assert rig.rate == 400
+    assert rig.joints()
+    assert link.simulated.cycles == cycles
+    rig.robot.rate(200)
+    assert link.simulated.cycles == cycles + 1
+    link.simulated.stop.request()
+    while link.alive:
+        link.turn()
+    assert rig.joints()
+    with pytest.raises(RunGone, match="the run of effort_arm ended"):
+        rig.robot.rate(400)
+
+
 def test_an_abort_in_a_motion_cancels_its_goal(stage):
     """So that the joints come to rest before the player leaves."""
     rig = stage.rig(stage.arm)
@@ -235,5 +252,7 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
     assert all(part.whole for part in done.recorded[:-1])
     assert not rig.robot.link.simulated.robot.loop.steering.inbox.take()
-    rig.robot.link.until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
+    limit_s = rig.now_s + 1.0
+    while rig.now_s < limit_s:
+        rig.robot.link.turn()
     assert abs(rig.robot.link.simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"
