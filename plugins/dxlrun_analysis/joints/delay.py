@@ -52,7 +52,7 @@ class DelayFit:
                 continue
             difference = position[first:] - goals[before + first - back : len(goals) - back]
             difference = difference[np.isfinite(difference)]
-            self.squares[index] += difference @ difference
+            self.squares[index] += np.square(difference).sum()  # a product would start threads
             self.counts[index] += len(difference)
         self.goals = goals[-_DELAYS * self.step - 1 :]
 
