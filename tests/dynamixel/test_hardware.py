@@ -84,6 +84,15 @@ class OneBus:
         assert rig.packets.received() == rig.out_of_bus()
         assert rig.events.of(EventCode.BUS_NOISE) != []
 
+    def test_noise_that_is_not_reported_yet_is_reported_a_second_later(self, rig):
+        for _ in range(2):
+            rig.cycles(5)
+            rig.buses[0].inject_noise(b"\x12\x13", rig.clock.now_ns() + 15_000_000)
+        rig.cycles(20)
+        assert len(rig.events.of(EventCode.BUS_NOISE)) == 1
+        rig.cycles(60)
+        assert len(rig.events.of(EventCode.BUS_NOISE)) == 2
+
     def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(self, rig):
         rig.cycle()
         here = rig.states.position.copy()

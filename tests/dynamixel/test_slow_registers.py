@@ -51,6 +51,9 @@ def test_slow_registers_make_no_cycle_late_and_wait_for_ever_where_there_is_no_t
     rig.cycles(300)
     assert np.isnan(rig.states.voltage).all()
     assert rig.events.of(EventCode.OVERRUN) == []
+    rig.period_ns = 2_000_000
+    rig.cycles(200)
+    assert not np.isnan(rig.states.voltage).any()
 
 
 def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_cooled():

@@ -241,7 +241,6 @@ class Servos:
             self._bus.failure is not None
             or self._bus.receiver.pending
             or self._plan.devices
-            or self.reads.stale
             or self.life.torque_changed
             or not _RESTING.issuperset(self.life.states)
             or self._alerts
