@@ -208,10 +208,10 @@ def test_a_long_run_keeps_its_begin_and_its_end() -> None:
         part = slice(begin, begin + 999)
         trail.take(at_ns[part], column[part], column[part], column[part])
     kept = trail.samples()
-    assert len(kept.at_s) == 16_384
-    assert kept.way[:8192, 0].tolist() == list(range(8192))
-    assert np.isnan(kept.way[8192, 0])
-    assert kept.way[8193:, 0].tolist() == list(range(cycles - 8191, cycles))
+    assert len(kept.at_s) == 8_192
+    assert kept.way[:4096, 0].tolist() == list(range(4096))
+    assert np.isnan(kept.way[4096, 0])
+    assert kept.way[4097:, 0].tolist() == list(range(cycles - 4095, cycles))
 
 
 def test_of_many_cycles_one_is_kept_each_20_ms() -> None:

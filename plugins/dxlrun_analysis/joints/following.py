@@ -40,6 +40,8 @@ _AGAIN_S = 0.5
 _CREEPS_RAD_S = 0.1
 """By less it is nearly at rest, and may be on either side of what rubs."""
 _FASTER = 1.5
+_MOST_BEFORE = 12
+"""Stays at a place that later ones are compared with: the first ones of a run"""
 _AT_ONCE = round(0.08 / STEP_S)
 _BENDS_RAD_S = 0.6
 """A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
@@ -118,8 +120,10 @@ class _Stay(NamedTuple):
 
     def is_like(self, later: _Stay) -> bool:
         """Return whether a later one may be compared with it: it goes the same way as fast."""
-        slow, fast = sorted((self.speed, later.speed))
-        return later.direction == self.direction and fast <= _FASTER * slow + _CREEPS_RAD_S
+        if self.direction != later.direction:
+            return False
+        slow, fast = (self.speed, later.speed) if self.speed < later.speed else (later.speed, self.speed)
+        return fast <= _FASTER * slow + _CREEPS_RAD_S
 
 
 class Followed(NamedTuple):
@@ -193,23 +197,31 @@ class Followed(NamedTuple):
         keys = np.column_stack([known, place, direction])
         starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1)).tolist()
         usual: dict[int, list[_Stay]] = defaultdict(list)
-        load, bends = self._load_at_rest(), self._bends()
+        times, bends = self.at_s.tolist(), self._bends()
+        values = [each.tolist() for each in (np.abs(speed), self.off, self._load_at_rest())]
         for begin, end in zip(starts, [*starts[1:], len(keys)], strict=True):
             if not known[begin]:
                 continue
-            here, inside = int(place[begin]), slice(begin, end)
-            values = [float(np.median(each[inside])) for each in (np.abs(speed), self.off, load)]
-            stay = _Stay(float(self.at_s[end - 1]), int(direction[begin]), *values)
-            at_s = float(self.at_s[begin])
-            near = (one for one_place in (here - 1, here, here + 1) for one in usual[one_place])
-            before = [one for one in near if one.end_s < at_s - _AGAIN_S and one.is_like(stay)]
+            here, at_s = int(place[begin]), times[begin]
+            middles = (sorted(each[begin:end])[(end - begin) // 2] for each in values)
+            stay = _Stay(times[end - 1], int(direction[begin]), *middles)
+            before = [
+                one
+                for near in (here - 1, here, here + 1)
+                for one in usual[near]
+                if one.end_s < at_s - _AGAIN_S and one.is_like(stay)
+            ]
             was = _nearest(stay.off, [one.off for one in before])
             took = _nearest(stay.load, [one.load for one in before if math.isfinite(one.load)])
-            if abs(stay.off - was) < least and not abs(stay.load - took) >= least_load:
+            if (
+                len(before) < _MOST_BEFORE
+                and abs(stay.off - was) < least
+                and not abs(stay.load - took) >= least_load
+            ):
                 usual[here].append(stay)
             if before:
                 seconds, middle = stay.end_s - at_s + STEP_S, (here + 0.5) * _PLACE_RAD
-                even = not bends[inside].any()
+                even = not bends[begin:end].any()
                 yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even)
 
     def _load_at_rest(self) -> Floats:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 
 STEP_S = 0.02
-_MOST = 16_384
-"""Samples kept, some five minutes: of a longer run the first half of them, and the newest."""
+_MOST = 8_192
+"""Samples kept, nearly three minutes: of a longer run the first half of them, and the newest."""
 
 
 class Samples(NamedTuple):

@@ -18,13 +18,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
-from dxlrun_analysis.joints.following import STROKE_RAD, Followed, Turn, Visit
+from dxlrun_analysis.joints.following import STROKE_RAD, Bend, Followed, Turn, Visit
 
 _OTHERS = 3.0
 """So many times what any other joint shows."""
@@ -79,6 +79,9 @@ class _Seen(NamedTuple):
     visits: list[Visit]
     jerks: Floats
     swings: Floats
+    bend: Bend
+    most: dict[str, float]
+    """The most that it shows of each quantity, 0.0 at least"""
 
 
 class _Others(NamedTuple):
@@ -87,15 +90,15 @@ class _Others(NamedTuple):
     of: _Seen
     all: list[_Seen]
 
-    def most(self, shown: Callable[[_Seen], Iterable[float]]) -> float:
-        """Return the most that others show, 0 at least.
+    def most(self, quantity: str) -> float:
+        """Return the most that others show, 0.0 at least.
 
         Of many others the worst may be another one that is not well; unless it is its mirror image, which the
         same happens to.
         """
-        values = sorted((max(shown(each), default=0.0), _plain(each) == _plain(self.of)) for each in self.all)
+        values = sorted((each.most[quantity], _plain(each) == _plain(self.of)) for each in self.all)
         alone = len(values) >= _FEWEST_OTHERS and not values[-1][1]
-        return max(0.0, values[-2 if alone else -1][0]) if values else 0.0
+        return values[-2 if alone else -1][0] if values else 0.0
 
     def beside(self, theirs: float) -> str:
         """Return how a sentence compares with them."""
@@ -104,16 +107,29 @@ class _Others(NamedTuple):
 
 def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
     """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
-    seen = [
-        _Seen(one, one.turns(), list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.jerks(), one.swings())
-        for one in joints
-        if one.row not in named
-    ]
+    seen = [_seen(one) for one in joints if one.row not in named]
     for mine in seen:
         others = _Others(mine, [each for each in seen if each is not mine])
         found = next(filter(None, (rule(mine, others) for rule in _RULES)), None)
         if found is not None:
             yield found
+
+
+def _seen(one: Followed) -> _Seen:
+    turns, visits = one.turns(), list(one.visits(_OFF_RAD / 2, _LOAD / 2))
+    jerks, swings, bend = one.jerks(), one.swings(), one.bend()
+    shown: dict[str, Iterable[float]] = {
+        "behind": (turn.behind for turn in turns),
+        "stood": (turn.stood for turn in turns),
+        "takes": (more for _, _, more in _loaded(turns)),
+        "off": (visit.change for visit in visits),
+        "load": (visit.load_change for visit in visits),
+        "jerk": jerks[np.isfinite(jerks)].tolist(),
+        "swings": (float(len(swings)),),
+        "bend": (abs(bend.off),),
+    }
+    most = {quantity: max(0.0, max(values, default=0.0)) for quantity, values in shown.items()}
+    return _Seen(one, turns, visits, jerks, swings, bend, most)
 
 
 def _plain(seen: _Seen) -> str:
@@ -122,7 +138,7 @@ def _plain(seen: _Seen) -> str:
 
 def _turns_badly(mine: _Seen, others: _Others) -> Worn | None:
     one, turns = mine.one, mine.turns
-    theirs = others.most(lambda each: (turn.behind for turn in each.turns))
+    theirs = others.most("behind")
     least = max(_BEHIND_RAD, _OTHERS * theirs)
     bad = [turn for turn in turns if turn.behind > least]
     if not bad:
@@ -130,7 +146,7 @@ def _turns_badly(mine: _Seen, others: _Others) -> Worn | None:
     worst = max(bad, key=lambda turn: turn.behind)
     usual = [turn for turn in turns if turn.at_s < bad[0].at_s and turn.behind < _BEHIND_RAD / 2]
     behind, stood = (float(np.median([turn[at] for turn in bad])) for at in (1, 3))
-    theirs_stood = others.most(lambda each: (turn.stood for turn in each.turns))
+    theirs_stood = others.most("stood")
     stands = stood > max(_STOOD * behind, _OTHERS * theirs_stood)
     text = f"is {_deg(worst.behind)} behind in both directions{others.beside(theirs)}"
     if stands and (usual or one.alike >= _FEWEST_ALIKE):
@@ -156,7 +172,7 @@ def _rubs(worst: Turn, usual: list[Turn], others: list[float]) -> tuple[str, str
 
 
 def _takes_more(mine: _Seen, others: _Others) -> Worn | None:
-    theirs = others.most(lambda each: (more for _, _, more in _loaded(each.turns)))
+    theirs = others.most("takes")
     bad = [each for each in _loaded(mine.turns) if each[2] > max(_LOAD, each[1], _OTHERS * theirs)]
     if len(bad) < _FEWEST_TURNS:
         return None
@@ -177,10 +193,10 @@ def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
 def _pulled(mine: _Seen, others: _Others) -> Worn | None:
     one, visits = mine.one, mine.visits
     rubs = 2 * max((abs(turn.behind) for turn in mine.turns[:2]), default=0.0)
-    theirs = others.most(lambda each: (visit.change for visit in each.visits))
+    theirs = others.most("off")
     least = max(_OFF_RAD, rubs, _OTHERS * theirs)
     off = [each for each in visits if each.change > least]
-    theirs_load = others.most(lambda each: (visit.load_change for visit in each.visits))
+    theirs_load = others.most("load")
     loaded = [each for each in visits if each.load_change > max(_LOAD, _OTHERS * theirs_load)]
     bad = off if _lasts(off) else loaded
     if not _lasts(bad):
@@ -223,8 +239,8 @@ def _one_side(bad: list[Visit], good: list[Visit]) -> str:
 
 
 def _bent(mine: _Seen, others: _Others) -> Worn | None:
-    bend = mine.one.bend()
-    theirs = others.most(lambda each: [abs(each.one.bend().off)])
+    bend = mine.bend
+    theirs = others.most("bend")
     if abs(bend.off) < max(_OFF_RAD, _OTHERS * theirs):
         return None
     side = f"{'beyond' if bend.above else 'below'} {math.degrees(bend.place):.0f} deg"
@@ -234,7 +250,7 @@ def _bent(mine: _Seen, others: _Others) -> Worn | None:
 
 def _jerked(mine: _Seen, others: _Others) -> Worn | None:
     one, jerks = mine.one, mine.jerks
-    theirs = others.most(lambda each: [float(np.nanmax(each.jerks, initial=0.0))])
+    theirs = others.most("jerk")
     times = one.at_s[np.nan_to_num(jerks) > max(_JERK_RAD, _OTHERS * theirs)]
     count = int((np.diff(times, prepend=-math.inf) > _APART_S).sum())
     if count < _JERKS:
@@ -246,7 +262,7 @@ def _jerked(mine: _Seen, others: _Others) -> Worn | None:
 
 def _hunts(mine: _Seen, others: _Others) -> Worn | None:
     at_s = mine.swings
-    theirs = others.most(lambda each: [float(len(each.swings))])
+    theirs = others.most("swings")
     if len(at_s) < max(_SWINGS, _OTHERS * theirs):
         return None
     hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
