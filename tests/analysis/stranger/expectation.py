@@ -43,6 +43,17 @@ GARBLED = (
     r"|bit error|flipp|incomplet|truncat|not (be )?(parsed|understood)|unreadable|distort|EMI|spoil|intact"
 )
 REBOOTS = r"re-?boot|re-?start|start(ed|s)? again|power|brown|reset|lost its (power|torque)|limp"
+WAKES = MACHINE + r"|wak|woke|\blate\b|sched|deadline|jitter|overrun|skipp|stall|oversle"
+WEAK = SOFT + r"|" + FOLLOWS + r"|" + LOAD + r"|slow|sluggish|stiffness|yield"
+OPPOSED = WEAK + r"|" + STUCK + r"|friction|stiff|drag|resist|spring|contact|outside|overload|rub|angle"
+SHAKES = (
+    r"oscillat|vibrat|shak|swing|overshoot|hunt|unstable|instab|resonan|jitter|trembl|\brings?\b|ringing"
+    r"|limit cycle|chatter|back and forth|Hz"
+)
+TURNS = (
+    r"switch|take[ -]?over|took over|activat|hand(ed|s|ing)?[ -]?(over|back)|flap|alternat|in turns?"
+    r"|back and forth|controllers?\b[^.]*\b(times|client)|client"
+)
 """Words with which a sentence may name such a cause."""
 
 

@@ -45,6 +45,8 @@ HEAD = ("head_yaw", "head_pitch")
 LEFT = ("left_shoulder", "left_elbow", "left_knee")
 RIGHT = ("right_shoulder", "right_elbow", "right_knee")
 JOINTS = (*HEAD, *LEFT, *RIGHT)
+ARMS = tuple(name for name in JOINTS if name.endswith(("shoulder", "elbow")))
+KNEES = ("left_knee", "right_knee")
 Spec = dict[str, Any]
 Broken = Any
 """A controller that is made to fail."""
@@ -616,3 +618,8 @@ def _hold_back(story: Story, bus: SimulatedBus, late_s: Callable[[float], float]
         return inner if not held else min(held[0][0], inner if inner is not None else held[0][0])
 
     bus.take, bus.next_due_ns = late, next_due_ns  # type: ignore[method-assign]
+
+
+def stronger(story: Story, old: float, new: float) -> float:
+    """Return a torque for a robot of Protocol 1.0, or one of Protocol 2.0 with its stronger servos."""
+    return old if story.kind.protocol == 1.0 else new

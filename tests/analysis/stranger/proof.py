@@ -95,3 +95,10 @@ def start_refused(story: Story) -> None:
 def _travel(log: Log, since_s: float) -> float:
     later = log.cycles[log.cycles["scheduled_ns"] > since_s * S]
     return float(np.nanmax(np.ptp(later["goal_position"], axis=0)))
+
+
+def turns(values: Any) -> int:
+    """Return how often what a joint was told to do turned about."""
+    ways = np.sign(np.diff(values[~np.isnan(values)]))
+    ways = ways[ways != 0]
+    return int(np.count_nonzero(ways[1:] != ways[:-1]))

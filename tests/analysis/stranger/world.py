@@ -140,3 +140,91 @@ def imu_gives(story: Story, change: Callable[[float, np.ndarray[Any, Any]], None
         sensor.read = changed  # type: ignore[method-assign]
 
     story.prepared.append(plan)
+
+
+def rubs(story: Story, joint: str, friction: Callable[[float, float, float], float], kind: str) -> None:
+    """Let a joint have a friction (Nm) by time (s), angle (rad) and speed (rad/s), of its own beside it."""
+
+    def plan() -> None:
+        shaft = story.servo(joint).shaft
+        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
+        plant, own = mechanics.plant, float(mechanics.plant._friction[shaft.index])
+        step = plant.step
+
+        def rubbed(drive: Any, damping: Any, dt_s: float) -> None:
+            speed = sign * float(plant.velocity[index])
+            more = friction(mechanics.grid_ns / S, story.q(joint), speed)
+            story.evidence[kind] += more > 0
+            plant._friction[index] = own + more
+            step(drive, damping, dt_s)
+
+        plant.step = rubbed  # type: ignore[method-assign]
+
+    story.prepared.append(plan)
+    story.every(0.02, lambda t_s: story.servo(joint).shaft.mechanics._wake(), joint)
+
+
+def transmits(story: Story, joint: str, change: Callable[[float, float], float], kind: str) -> None:
+    """Change by the time (s) which torque (Nm of the joint) of a motor arrives at its output."""
+
+    def plan() -> None:
+        shaft = story.servo(joint).shaft
+        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
+        step = mechanics.plant.step
+
+        def changed(drive: Any, damping: Any, dt_s: float) -> None:
+            was = sign * float(drive[index])
+            now = change(mechanics.grid_ns / S, was)
+            if now != was:
+                story.evidence[kind] += 1
+                drive = drive.copy()
+                drive[index] = sign * now
+            step(drive, damping, dt_s)
+
+        mechanics.plant.step = changed  # type: ignore[method-assign]
+
+    story.prepared.append(plan)
+
+
+def heats(story: Story, joint: str, celsius: Callable[[float], float], *, trips: bool = False) -> None:
+    """Let a servo have a temperature (degrees C) by time (s), and trip above its limit if it is to."""
+    for bus in story.spec["buses"].values():
+        bus["slow_registers"] = {"rate": 4}
+
+    def heat(t_s: float) -> None:
+        story.evidence["heated"] += 1
+        if trips:
+            story.servo(joint).set_temperature(celsius(t_s))
+        else:
+            story.servo(joint).temperature = celsius(t_s)
+
+    story.every(0.1, heat, joint, 0.5)
+
+
+def cut_tails(story: Story, joint: str | int, share: float, bytes_left: range, since_s: float) -> None:
+    """Let the adapter lose the rest of what it received in a share of the group reads, from a byte on."""
+    state: dict[str, int | None] = {"from": None, "got": 0}
+
+    def decide(ids: tuple[int, ...], t_s: float) -> None:
+        cut = len(ids) > 1 and t_s > since_s and story.random.random() < share
+        state.update({"from": story.random.choice(bytes_left) if cut else None, "got": 0})
+
+    def plan() -> None:
+        bus = story.bus(joint)
+        take = bus.take
+
+        def short(now_ns: int, *, handed_ns: int | None = None) -> bytes:
+            data = take(now_ns, handed_ns=handed_ns)
+            begin, cut = state["got"] or 0, state["from"]
+            state["got"] = begin + len(data)
+            if cut is None or begin + len(data) <= cut:
+                return data
+            story.evidence["bytes lost"] += begin + len(data) - max(begin, cut)
+            if begin <= cut:
+                story.evidence["tails cut"] += 1
+            return data[: max(0, cut - begin)]
+
+        bus.take = short  # type: ignore[method-assign]
+
+    story.on_request(joint, decide)
+    story.prepared.append(plan)

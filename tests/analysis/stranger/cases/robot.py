@@ -7,14 +7,13 @@ import math
 import numpy as np
 from msgspec.structs import replace
 from tests.analysis.stranger.expectation import SOFT, Case, collector, others
-from tests.analysis.stranger.kit import JOINTS, MS, Broken, Story
+from tests.analysis.stranger.kit import ARMS, JOINTS, MS, Broken, Story
 from tests.analysis.stranger.proof import column, said
 
 from dxlrun.log.reader import Log
 
 CASES: list[Case] = []
 case = collector(CASES)
-ARMS = tuple(name for name in JOINTS if name.endswith(("shoulder", "elbow")))
 
 
 @case("robot", "mx_bulk x_fast", cause=r"(swing|motion|body|trajector).*\d deg", good=True, first=0)
