@@ -211,3 +211,12 @@ def test_a_controller_is_shown_while_it_is_called(robot, page, at):
     name = at if at == "update" else f"on_{at}"
     assert set(seen) == {f"{name} of controller arm"}
     assert not page.activity
+
+
+def test_a_child_that_foreign_machine_code_forked_ends_with_the_call(page):
+    activity, children = Activity(page), []
+    fork = ctypes.PyDLL(None).fork  # no audit event reports it
+    activity.call(0, ControllerMethod.UPDATE, "", lambda: children.append(fork()))
+    if children == [0]:
+        os._exit(1)  # the child came back
+    assert os.waitpid(children[0], 0)[1] == 0
