@@ -140,6 +140,11 @@ def test_an_error_that_grew_is_told_with_since_when_and_by_how_much(position: Fl
     assert "other joints: 1." in finding.sentence
 
 
+def test_a_joint_that_moves_at_one_speed_with_all_its_torque_is_held_back() -> None:
+    position, *_ = HELD_BACK["at one speed"]
+    assert only(Joint(position=position, load=0.9)).code == "far_from_goal"
+
+
 def test_a_joint_that_stands_still_without_load_has_only_a_greater_error() -> None:
     for ticks in (1, 4):
         shaking = FROZEN + np.where(FAULT, ticks * TICK * (np.arange(600) % 2), 0.0)

@@ -538,6 +538,17 @@ def test_servos_that_are_lost_at_once_share_a_cable(events: tuple[EventGroup, ..
     assert any("they share a supply or a cable" in one.sentence for one in verdict.findings) is shared
 
 
+def test_why_a_servo_did_not_come_back_is_told_where_few_were_lost() -> None:
+    for joints in (("elbow", "wrist"), ("elbow", "wrist", "hand")):
+        returns = {"elbow": ["answers garbled or twice", "answers too late"]}
+        servos = on_bus("elbow", "wrist", "hand", "head")
+        events = tuple(lost(joint, 400 * at) for at, joint in enumerate(joints))
+        verdict = judge(totals(events=events, returns=returns, servos=servos, plan=plan(REAL)))
+        assert any("elbow answers too late." in one.sentence for one in verdict.findings) is (
+            len(joints) == 2
+        )
+
+
 def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:
     slow = (accusing("slow_servo"),)
     real_time, virtual = (

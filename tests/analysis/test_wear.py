@@ -77,6 +77,12 @@ def _play(way: Floats, half: float) -> tuple[Floats, Floats]:
     return np.array(moved), np.array(moved)
 
 
+def test_one_that_is_behind_no_more_than_three_times_another_is_not_told() -> None:
+    loose = Joint(position=slack(behind(SWING), 0.05), load=PEER.load)
+    assert [one.code for one in found(loose)] == ["play"]
+    assert found(loose, Joint(position=behind(SWING, 3), load=PEER.load), PEER) == []
+
+
 def test_what_all_joints_do_is_the_motions_or_the_supplys() -> None:
     loose = Joint(position=slack(behind(SWING), 0.05), load=PEER.load)
     assert found(loose, loose, PEER) == []
@@ -159,11 +165,12 @@ WEIGHT = 0.4 + 0.05 * np.sign(FAST)
     [
         (np.where(FAULT, 0.05 * np.sign(FAST), WEIGHT), "carries_nothing"),
         (np.where(FAULT, WEIGHT, 0.05 * np.sign(FAST)), "off_its_way"),
+        (np.where(FAULT, WEIGHT - 0.2, WEIGHT), "off_its_way"),
         (np.where(FAULT, 0.05, 0.0) + 0.05 * np.sign(FAST), ""),
         (WEIGHT, ""),
         (0.4 * np.sin(7.9 * TIME), ""),  # by the time, not by the place
     ],
-    ids=["less", "more", "a little", "always", "changing"],
+    ids=["nothing", "more", "half", "a little", "always", "changing"],
 )
 def test_a_load_that_is_another_one_at_the_same_places_is_told(load: Floats, code: str) -> None:
     seen = found(Joint(position=behind(SWING), load=load))

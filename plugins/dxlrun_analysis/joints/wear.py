@@ -213,7 +213,7 @@ def _pulled(mine: _Seen, others: _Others) -> Worn | None:
         return Worn("off_its_way", one.row, since_s, takes) if alike else None
     most = _deg(max(each.change for each in bad))
     text = f"is off by up to {most} more than before at the same places{others.beside(theirs)}"
-    side = _one_side(bad, [each for each in visits if each.at_s > since_s and each not in bad])
+    side = _one_side(bad, [each for each in visits if each.at_s > since_s and each.change < least / 2])
     text += f", the more the further it goes {side}" if side else ""
     text += f", with {load:.0%} of its torque instead of {was:.0%}" if alike else ""
     return Worn("pulled_joint" if side else "off_its_way", one.row, since_s, text)
