@@ -96,7 +96,31 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
         sentence += f" It was at once, while others of their bus {'ran on' if rebooted else 'answered'}: "
         sentence += "they share a supply or a cable."
         fix = "Look at the cable, the plug or the fuse that they share, between them and the others."
-    yield Finding(CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
+    subject = ordered[0][0]
+    if bus := _disturbed(totals, by_source):
+        sentence += f" Bytes that belong to no packet came on bus {bus} then, and others missed replies, too."
+        subject, fix = bus, "Look for what disturbed the line then: its shield, ground and termination."
+    yield Finding(CODES[first], subject, sentence, fix, Rank.SERVO)
+
+
+def _disturbed(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> str:
+    """Return the bus whose noise made it lose all servos that failed; empty: none did.
+
+    It came just before, and two others at least missed replies of their own: a servo's broken replies cost
+    those behind it theirs, but none that they could have given.
+    """
+    bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
+    bus, *more = {bus_of.get(source, "") for source in failed}
+    groups = [group for of_one in failed.values() for group in of_one]
+    lost = all(group.code == EventCode.SERVO_LOST and group.count == 1 for group in groups)
+    begins = [one.t_ns for one in totals.events if one.code == EventCode.BUS_NOISE and one.source == bus]
+    then = any(0 <= group.t_ns - begin <= _AT_ONCE_NS for begin in begins for group in groups)
+    others = [
+        servo
+        for servo in totals.servos
+        if servo.bus == bus and servo.joint not in failed and servo.losses and servo.losses.lost
+    ]
+    return bus if lost and then and not more and len(others) >= _FEWEST_OF_BUS else ""
 
 
 def _share_a_cable(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:

@@ -493,6 +493,34 @@ def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> 
     assert "as in the robot file" in servo.remedy
 
 
+@pytest.mark.parametrize(
+    ("noise_ms", "others", "code", "accused"),
+    [
+        (0, 2, EventCode.SERVO_LOST, False),
+        (0, 1, EventCode.SERVO_LOST, True),
+        (-900, 2, EventCode.SERVO_LOST, True),
+        (100, 2, EventCode.SERVO_LOST, True),
+        (None, 2, EventCode.SERVO_LOST, True),
+        (0, 2, EventCode.SERVO_REBOOTED, True),
+    ],
+    ids=["noise", "few others", "noise long before", "noise behind it", "no noise", "a reboot"],
+)
+def test_a_servo_that_was_lost_while_the_line_was_disturbed_is_not_accused(
+    noise_ms: int | None, others: int, code: EventCode, accused: bool
+) -> None:
+    at_ns = 4 * 10**9
+    events = [EventGroup(code, Severity.ERROR, "elbow", 1, at_ns, "missed 3 replies")]
+    if noise_ms is not None:
+        t_ns = at_ns + noise_ms * MS
+        events.append(EventGroup(EventCode.BUS_NOISE, Severity.WARNING, "main", 1, t_ns, "9 bytes"))
+    servos = [answered("elbow", 0, 1000, 3, 3)]
+    servos += [answered(f"j{at}", at, 1000, 1, int(at <= others)) for at in range(1, 4)]
+    verdict = judge(totals(events=tuple(events), servos=tuple(servos)))
+    (servo,) = (one for one in verdict.findings if one.code in {"servo_lost", "servo_rebooted"})
+    assert servo.subject == ("elbow" if accused else "main")
+    assert ("Bytes that belong to no packet" in servo.sentence) is not accused
+
+
 def test_servos_of_a_lost_bus_are_not_accused() -> None:
     gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
     for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):
