@@ -222,10 +222,15 @@ LOW = {3: "hip", 7: "knee", 4: "foot"}
 
 
 @pytest.mark.parametrize("fast", [False, True], ids=["sync", "fast"])
-@pytest.mark.parametrize(("of_first", "of_second"), [(12, 0), (9, 0), (12, 2)])
+@pytest.mark.parametrize(
+    ("broken", "is_named"),
+    [((12, 0, 0), True), ((9, 0, 0), False), ((12, 2, 0), False), ((12, 0, 20), False)],
+    ids=["its own", "few", "another's too", "more bytes than its reply has"],
+)
 def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(
-    fast: bool, of_first: int, of_second: int, write: Make, wire: Make
+    fast: bool, broken: tuple[int, int, int], is_named: bool, write: Make, wire: Make
 ) -> None:
+    of_first, of_second, more = broken
     head = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" if fast else b""
     replies = [bytes((0, servo, 1, 2, 3, 4, 5, 6)) if fast else status(servo) for servo in LOW]
     packets = []
@@ -240,9 +245,9 @@ def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(
                 wire(STATUS, servo, at + 400, data)
                 for servo, data in list(zip(LOW, replies, strict=True))[:intact]
             ]
-        packets += [wire(NOISE, 254, at + 500, BROKEN)] * (intact < 3)
+        packets += [wire(NOISE, 254, at + 500, BROKEN + bytes(more))] * (intact < 3)
     servos = [{"joint": name, "servo_id": servo} for servo, name in LOW.items()]
     plan = {"buses": [{"name": "main", "protocol": 2.0, "servos": servos}]}
     findings = analyze_log(write([], packets, plan=plan)).verdict.findings
     named = [one.subject for one in findings if one.code == "broken_replies"]
-    assert named == ["hip"] * ((of_first, of_second) == (12, 0))
+    assert named == ["hip"] * is_named

@@ -14,6 +14,8 @@ from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
 
 _FEWEST = 5
+_BESIDE = 12
+"""Bytes of a status packet beside its data, at most; others that came belong to another sender."""
 _ALONE = 0.7
 """Share of the exchanges of a bus with such bytes from which they are one ID's."""
 
@@ -31,8 +33,11 @@ class BrokenReplies:
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""
         due, buses = exchanges.due, len(self._noisy)
-        # of a chain of which nothing is intact although bytes came, the first reply is broken at least
-        first = (due.loss == Loss.LINE) & (due.place == 0) & (exchanges.noise[due.exchange] > 0)
+        # of a chain of which nothing is intact although bytes came, but no more than of its first reply
+        longest = np.array([max(kind.sizes, default=0) + _BESIDE for kind in exchanges.requests.kinds])
+        noise = exchanges.noise[due.exchange]
+        first = (due.loss == Loss.LINE) & (due.place == 0) & (noise > 0)
+        first &= noise <= longest[exchanges.request[due.exchange]]
         self._first += np.bincount(due.servo[first & exchanges.ended[due.exchange]], minlength=buses * IDS)
         rows = np.flatnonzero((due.broken | first) & exchanges.ended[due.exchange])
         servo, request = due.servo[rows], exchanges.request[due.exchange[rows]]
