@@ -78,6 +78,8 @@ def test_a_joint_that_a_controller_moves_with_an_effort_shakes_around_its_refere
     )
     swung = Joint(np.full(600, np.nan), SWING + shaking, effort=SWING, sought=SWING + shaking)
     assert findings(swung, Joint(), Joint()) == []
+    by_hand = Joint(np.full(600, np.nan), SWING + shaking, torque=Torque.RELEASED, sought=SWING)
+    assert findings(by_hand, Joint(), Joint()) == []
 
 
 def test_a_joint_that_is_sent_in_steps_does_not_shake() -> None:

@@ -250,8 +250,6 @@ class Followed(NamedTuple):
             offs = np.array([both[cell] for cell in cells])
             way = np.abs(np.array(cells) - cells[0]) * _PLACE_RAD if cells else offs
             for at in np.flatnonzero(way >= _FLAT_RAD).tolist():
-                if np.ptp(offs[: at + 1]) > _FLAT_OFF_RAD:
-                    break
                 usual = float(np.median(offs[: at + 1]))
                 behind = offs[(way > way[at]) & (way <= way[at] + _BENDS_IN_RAD)] - usual
                 if len(behind) and abs(behind[-1]) > abs(best.off):
