@@ -22,6 +22,7 @@ from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.clients import Clients
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.sensors import Sensors
+from dxlrun_analysis.conduct.spikes import Spikes
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
@@ -91,7 +92,7 @@ class Tally:
         self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
         self._trends, self._tracking = Trends(), Tracking()
         self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
-        self._clients = Clients()
+        self._clients, self._spikes = Clients(), Spikes()
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
         self._granted = False
@@ -102,7 +103,7 @@ class Tally:
         for take in (
             *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
             *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
-            self._clients.take,
+            *(self._clients.take, self._spikes.take),
         ):
             take(log)
         for event in log.events:
@@ -148,7 +149,7 @@ class Tally:
             damage=log.damage,
             findings=(
                 *(*self._traffic.findings, *movement, *self._trends.findings(movement)),
-                *(*self._sensors.findings(), *self._clients.findings()),
+                *(*self._sensors.findings(), *self._spikes.findings(), *self._clients.findings()),
             ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),

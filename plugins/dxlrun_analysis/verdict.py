@@ -250,7 +250,16 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
     parts += [f"{refused} refused"] if refused else []
     still = sum(pause.end_s - pause.begin_s for pause in pauses)
     paused = f"; it was paused for {microseconds(still * 1e6)}" if pauses else ""
-    yield Finding("steered", "", f"It was steered from outside: {', '.join(parts)}{paused}.")
+    ends = "".join(
+        f"; the stream for {stream.controller} ended by its lease at {stream.ended_s:.1f} s"
+        f"{', and its joints were held since' if stream.held else ''}"
+        for stream in streams
+        if stream.ended_s is not None
+    )
+    share = 0.5 if any(stream.held for stream in streams) else 0.0
+    yield Finding(
+        "steered", "", f"It was steered from outside: {', '.join(parts)}{paused}{ends}.", share=share
+    )
 
 
 _OTHER_RULES = frozenset((*HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, EventCode.RECORDER_GAP))

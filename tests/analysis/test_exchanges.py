@@ -12,6 +12,7 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Pairing
 from dxlrun_analysis.servos.losses import ServoLosses
+from dxlrun_analysis.servos.other_host import OtherHosts
 
 ASK, STATUS, NOISE, LATE = PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.NOISE, PacketKind.LATE
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000)
@@ -116,3 +117,51 @@ def test_only_of_a_shared_packet_the_end_may_be_cut(read: bytes, shared: bool) -
     (finding,) = broken.findings(0, BUS, dict.fromkeys((3, 7, 4), ServoLosses(5, 5, 5)))
     assert "servo 4" in finding.sentence
     assert ("which all share" in finding.sentence or "that all share" in finding.sentence) == shared
+
+
+WRITE_7 = bytes((0xFF, 0xFF, 0xFD, 0, 7, 6, 0, 3, 64, 0, 1, 0, 0))
+SYNC_WRITE = bytes.fromhex("fffffd00fe0b00834000010007010401 0000")
+
+
+@pytest.mark.parametrize(
+    ("wires", "unasked"),
+    [
+        ([(ASK, 7, PING_7, 0), (STATUS, 7, status(7), 1), (STATUS, 4, status(4), 2)], [4]),
+        ([(ASK, 254, SYNC_WRITE, 0), (STATUS, 4, status(4), 2)], [4]),
+        ([(ASK, 7, PING_7, 0), (STATUS, 7, status(7), 1), (STATUS, 7, status(7), 2)], []),
+        ([(ASK, 7, WRITE_7, 0), (STATUS, 7, status(7), 1)], []),
+        ([(ASK, 254, PING_ALL, 0), (STATUS, 7, status(7), 1), (STATUS, 4, status(4), 2)], []),
+        ([(ASK, 7, PING_7, 0), (ASK, 254, SYNC_WRITE, 9), (STATUS, 7, status(7), 10)], []),
+        ([(ASK, 7, PING_7, 0), (ASK, 254, SYNC_WRITE, 9), (LATE, 4, status(4), 10)], []),
+        ([(STATUS, 7, status(7), 0), (ASK, 7, PING_7, 1)], []),
+    ],
+    ids=["behind", "nothing asked", "twice", "acknowledged", "all asked", "owed", "late", "before all"],
+)
+def test_a_reply_that_nothing_asked_for(wires: Wires, unasked: list[int]) -> None:
+    assert paired(wires).unasked.tolist() == unasked
+
+
+@pytest.mark.parametrize(
+    ("count", "ids", "told"),
+    [
+        (9, (4,), ""),
+        (10, (4,), "10 replies came that this run did not ask for (of ID 4), or that servo sends by itself."),
+        (12, (4, 9), "12 replies came that this run did not ask for (of IDs 4, 9)."),
+    ],
+)
+def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(
+    count: int, ids: tuple[int, ...], told: str
+) -> None:
+    wires = []
+    for number in range(count):
+        servo_id = ids[number % len(ids)]
+        wires += [(ASK, 7, PING_7, 10 * number), (STATUS, 7, status(7), 10 * number + 1)]
+        wires += [(STATUS, servo_id, status(servo_id), 10 * number + 2)]
+    others = OtherHosts(1)
+    others.take(paired(wires))
+    found = others.findings(0, BUS)
+    assert others.explains(0) is bool(told)
+    assert [(one.code, one.subject) for one in found] == [("another_host", "main")] * bool(told)
+    assert "".join(one.sentence for one in found) == (
+        f"Another host uses bus main, or its adapter: {told}" if told else ""
+    )

@@ -128,6 +128,30 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert "switch activate tail; deactivate head" in shown
 
 
+@pytest.mark.parametrize(
+    ("later", "ends"),
+    [
+        ({}, "; the stream for head ended by its lease at 0.4 s, and its joints were held since"),
+        ({25: [send(0.2, 0.2)]}, ""),
+        (
+            {25: [ask("switch", activate=["tail"], deactivate=["head"])]},
+            "; the stream for head ended by its lease at 0.4 s",
+        ),
+        ({cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(18, 100)}, ""),
+    ],
+    ids=["held", "asked again", "handed over", "to the end"],
+)
+def test_a_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, ends: str) -> None:
+    stream = {cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(5, 18)}
+    report = analyze(run(tmp_path, {**stream, **later}))
+    (steered,) = (one for one in report.verdict.findings if one.code == "steered")
+    assert steered.remedy == ""
+    sentence = steered.sentence.removesuffix(".")
+    assert sentence.endswith(ends)
+    assert bool(ends) == ("ended by its lease" in sentence)
+    assert (report.verdict.findings[1] == steered) is ends.endswith("since")
+
+
 def test_a_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
     asked = {5: [ask("rate", rate=200)], 60: [ask("rate", rate=25)]}
     log = run(tmp_path, asked)

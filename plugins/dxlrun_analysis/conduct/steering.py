@@ -16,6 +16,7 @@ from dxlrun_analysis.cycles.latency import DISORDER_NS, begins, first_deadline_n
 
 _LONGEST = 80
 _ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
+_HELD = "its joints are held"
 _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])
 """What is kept of a cycle until it is known what was asked in it."""
 
@@ -51,6 +52,12 @@ class Act:
     """Why it was not done; empty: it was."""
     set_points: int = 0
     """Of a stream; 0: this is none."""
+    controller: str = ""
+    """Of a stream."""
+    ended_s: float | None = None
+    """When its lease ran out, of a stream that none went on for its controller; None: it did not."""
+    held: bool = False
+    """The controller held its joints from then on, to the end of the run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +89,10 @@ class SteeringHistory:
         """Cycle and deadline in which a pause began that has not ended."""
         self._streams: dict[str, tuple[int, TakenCommand]] = {}
         self._last: TakenCommand | None = None
+        self._stale: dict[str, tuple[int, bool]] = {}
+        """When the last stream of each controller ran out, and whether its joints were held then ..."""
+        self._left_ns: dict[str, int] = {}
+        """... and when it was deactivated later."""
 
     def take(self, log: Log) -> None:
         """Take the next slice."""
@@ -93,6 +104,10 @@ class SteeringHistory:
         for event in log.events:
             if event.code in _ANSWERS:
                 self._events.append(event)
+            elif event.code == EventCode.STALE_COMMAND:
+                self._stale[event.source] = event.t_ns, _HELD in event.text
+            elif event.code == EventCode.CONTROLLER_DEACTIVATED and event.source in self._stale:
+                self._left_ns[event.source] = event.t_ns
         rows = np.zeros(len(log.cycles), _CYCLE)
         for name in _CYCLE.names or ():
             rows[name] = log.cycles[name]
@@ -110,7 +125,15 @@ class SteeringHistory:
             return (), ()
         commands = self._commands[-1:] or ([self._last] if self._last is not None else [])
         begun = policy_begun(replace(self._log, cycles=self._cycles, commands=tuple(commands)))
+        end_ns = int(self._cycles["updated_ns"][-1]) if len(self._cycles) else 0
         self._digest(None)
+        for controller, (index, last) in self._streams.items():
+            ended_ns, held = self._stale.get(controller, (0, False))
+            if ended_ns > last.t_ns and not self._acts[index].refusal:
+                left_ns = self._left_ns.get(controller, 0)
+                held &= not ended_ns < left_ns < end_ns
+                ended_s = (ended_ns - self._start_ns) / 1e9
+                self._acts[index] = replace(self._acts[index], ended_s=ended_s, held=held)
         if begun is not None:
             self._acts.append(_act(ClientCommand(begun, ""), self._start_ns))
         if self._since is not None and len(self._cycles):
@@ -189,6 +212,7 @@ def _act(one: ClientCommand, start_ns: int) -> Act:
         origin=command.origin,
         refusal=one.refusal,
         set_points=int(streamed),
+        controller=command.controller if streamed else "",
     )
 
 

@@ -114,6 +114,8 @@ class Exchanges(NamedTuple):
     """Instructions of other hosts on the line."""
     echoes: Numbers
     """The bus of each own instruction that came back."""
+    unasked: Numbers
+    """The servo of each intact reply that no instruction of this host asks for."""
     stray: PacketColumns
     """Bytes that belong to no intact packet."""
 
@@ -139,6 +141,8 @@ class Replies(NamedTuple):
     """When it would have been there by wire and return delay, with all replies before it."""
     answers: Flags
     """True: requested, in time, and the servo's first in the exchange."""
+    strange: Flags
+    """True: a whole status packet of one servo that its exchange does not request."""
 
 
 @unique
@@ -271,6 +275,9 @@ class Pairing:
         due.broken[noise_bytes[due.exchange] <= 0] = False
         late = np.append(np.flatnonzero(kind == PacketKind.LATE), noise[blocks])
         ids = np.append(packets.servo_id[late[: len(late) - len(blocks)]], block_ids)
+        to = np.full(size, -1, np.int64)
+        to[at] = packets.servo_id[rows]
+        to[at[(to[at] == BROADCAST_ID) & (instruction_of(packets.take(rows)) == _PING)]] = -1
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
         return Exchanges(
@@ -290,6 +297,7 @@ class Pairing:
             _late(bus[late] * IDS + ids, exchange[late], packets.last_ns[late], sent_ns, due),
             packets.take(others[~back]),
             np.append(bus[others[back]], bus[kind == PacketKind.ECHO]),
+            _unasked(replies, due, to),
             packets.take(noise),
         )
 
@@ -359,6 +367,7 @@ class Pairing:
             before_ns[row],
             due_ns[row],
             (place >= 0) & ~late[rows[row]],
+            (place < 0) & ~late[rows[row]] & ~joint[row],
         )
 
     def _blocks(
@@ -412,6 +421,21 @@ class Pairing:
         found &= noise.length == np.array(size, np.int64) + 4
         found &= (waited_ns >= 0) & (waited_ns < _LATEST_NS)
         return rows[found], noise.byte(1)[found]
+
+
+def _unasked(replies: Replies, due: Due, to: Numbers) -> Numbers:
+    """Return the servo of each reply that nothing asks for; `to`: the ID of each instruction, -1: all.
+
+    A servo may acknowledge what is written to it, and one whose last reply is missing is late with that.
+    """
+    rows = np.flatnonzero(replies.strange)
+    exchange, servo = replies.exchange[rows], replies.servo[rows]
+    asked = np.append((due.servo << _ROWS) + due.exchange, -1)
+    order = np.argsort(asked)
+    last = order[np.searchsorted(asked[order], (servo << _ROWS) + exchange, side="right") - 1]
+    owed = (asked[last] >> _ROWS == servo) & (np.append(due.reply, -1)[last] < 0)
+    unasked: Numbers = servo[(to[exchange] >= 0) & (to[exchange] != servo % IDS) & ~owed]
+    return unasked
 
 
 def _last_ns(sent_ns: Numbers, replies: Replies) -> Numbers:

@@ -2,12 +2,12 @@
 
 One that sends at the same time as a servo spoils its reply, and its own instruction: what is left of that
 ends as an instruction does, by length and code. A reply does not: it has its error, or 0x55, in the place of
-a code.
+a code. Of one that uses the same adapter only the replies are seen, which nothing here asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits.
 Of those that write items of a servo one is enough."""
+_FEWEST_UNASKED = 10
+"""Replies that nothing asked for: a servo that is late once or a spoilt ID makes no more of them."""
 _MOST_NAMED = 3
 _ALL = 0.9
 """Of the instructions from which an adapter always echoes, which it may."""
@@ -37,7 +39,7 @@ class OtherHosts:
     """Collects the instructions of other hosts, in memory that does not grow with the log."""
 
     def __init__(self, buses: int) -> None:
-        self._sent, self._pieces = Counts(), Counts()
+        self._sent, self._pieces, self._unasked = Counts(), Counts(), Counts()
         self._stray, self._lost, self._echoes, self._asked = np.zeros((4, buses), np.int64)
         self.writes = ForeignWrites()
 
@@ -47,6 +49,7 @@ class OtherHosts:
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         for packet in others:
             self.writes.take(packet.bus, exchanges.buses[packet.bus], packet)
+        self._unasked.take(exchanges.unasked // IDS, exchanges.unasked % IDS)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
         self._pieces.take(*_ends(stray, second[stray.bus]))
@@ -70,8 +73,9 @@ class OtherHosts:
 
     def explains(self, index: int) -> bool:
         """Return whether a bus has another host that may have spoilt its missing replies."""
-        sent = int(self._of(index)[1].sum())
-        return sent >= _FEWEST and 2 * sent >= self._lost[index]
+        sent, unasked = int(self._of(index)[1].sum()), int(self._unasked.of(index)[1].sum())
+        seen = max(sent if sent >= _FEWEST else 0, unasked if unasked >= _FEWEST_UNASKED else 0)
+        return seen > 0 and 2 * seen >= int(self._lost[index])
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
         """Name the other host of a bus, or an adapter that began to echo; none: neither."""
@@ -91,8 +95,9 @@ class OtherHosts:
         values, counts = self._of(index)
         total = int(counts.sum())
         written, failed = self.writes.of(index)
+        where = f" (`fuser {bus.port}` shows it)" if bus.port else ""
         if total < _FEWEST and not written:
-            return ()
+            return tuple(self._by_replies(index, bus, where))
         instructions = values // IDS
         codes = sorted(set(instructions.tolist()), key=lambda code: -int(counts[instructions == code].sum()))
         kinds = [
@@ -102,7 +107,6 @@ class OtherHosts:
         if len(codes) > _MOST_NAMED:
             kinds.append("others")
         wrote = f"; it wrote {written}" if written else ""
-        where = f" (`fuser {bus.port}` shows it)" if bus.port else ""
         return (
             Finding(
                 "another_host",
@@ -114,6 +118,22 @@ class OtherHosts:
                 Rank.CAUSE,
                 5.0 if failed else 1.5 if self.explains(index) else 0.0,
             ),
+        )
+
+    def _by_replies(self, index: int, bus: LoggedBus, where: str) -> Iterable[Finding]:
+        """Name another host of which only the replies to it are seen."""
+        ids, counts = self._unasked.of(index)
+        if (total := int(counts.sum())) < _FEWEST_UNASKED:
+            return
+        one = ", or that servo sends by itself" if len(ids) == 1 else ""
+        yield Finding(
+            "another_host",
+            bus.name,
+            f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did not "
+            f"ask for (of {_ids(ids.tolist())}){one}.",
+            f"Stop the other program{where}: it takes replies of the run, and the replies to it spoil them.",
+            Rank.CAUSE,
+            1.5 if self.explains(index) else 0.0,
         )
 
 

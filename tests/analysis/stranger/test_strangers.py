@@ -16,14 +16,7 @@ from tests.analysis.stranger.campaign import CASES, PAIRS
 from tests.analysis.stranger.expectation import Case, judged
 from tests.conftest import SEED as COMMIT
 
-UNNAMED: dict[tuple[str, str], str] = {
-    ("stream_runs_out", "ax_single"): "the end of a stream is not told",
-    ("stream_runs_out", "x_fast"): "the end of a stream is not told",
-    ("script_reads_by_our_adapter", "mx_bulk"): "replies that nobody asked for are taken for losses",
-    ("script_reads_by_our_adapter", "x_fast"): "replies that nobody asked for are taken for losses",
-    ("foot_board_spikes", "mx_bulk"): "values that jump are not looked for",
-    ("foot_board_spikes", "x_fast"): "values that jump are not looked for",
-}
+UNNAMED: dict[tuple[str, str], str] = {}
 """Pairs that are known not to be named, and why."""
 COUNT = int(os.environ.get("DXLRUN_STRANGERS", "4"))
 SEED = os.environ.get("DXLRUN_STRANGERS_SEED", COMMIT)
