@@ -118,7 +118,7 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     Of a simulated part there is nothing to check or to exchange, whatever its rule proposes for a real one.
     """
     part = finding.code in _REPLIES or finding.subject not in _NO_PARTS
-    part &= finding.code not in COMMANDED
+    part &= finding.code not in _OF_CONTROLLERS
     if not finding.remedy or not part or not totals.plan.is_simulated(finding.subject):
         return finding.remedy
     if finding.code in _OF_TIME and not totals.virtual:
@@ -130,6 +130,8 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
 
 
 _NO_PARTS = ("", "loop", "machine", "log")
+_OF_CONTROLLERS = ("slow_controller", "stream_ran_out", "controllers_flap", *COMMANDED)
+"""Codes that accuse a controller, or its commands, whose name may be that of a bus."""
 
 
 def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:

@@ -132,11 +132,12 @@ class LoggedPlan(msgspec.Struct):
         """Return whether what a finding accuses is simulated.
 
         In a robot with a simulated bus all is that the plan does not have elsewhere: on a real bus, as a
-        controller or a sensor.
+        controller or a sensor. A controller may have the name of its bus: the bus is meant then.
         """
         if not any(bus.simulated for bus in self.buses):
             return False
         real = {one.name for one in self.loop.controllers} | {one.name for one in self.loop.sensors}
+        real -= self.by_name.keys()
         for bus in self.buses:
             if not bus.simulated:
                 real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}

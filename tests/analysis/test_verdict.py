@@ -384,6 +384,14 @@ def test_of_two_buses_each_has_its_own_remedies(subject: str, simulated: bool) -
     assert ("simulated" in finding.remedy) is simulated
 
 
+@pytest.mark.parametrize(("code", "simulated"), [("power_lost", True), ("slow_controller", False)])
+def test_a_controller_may_have_the_name_of_a_simulated_bus(code: str, simulated: bool) -> None:
+    buses = [structs.replace(bus, name="arm") for bus in plan(SIMULATED).buses]
+    named = LoggedPlan(plan(SIMULATED).loop, buses)
+    (_, finding, _) = judge(totals(findings=(accusing(code, "arm"),), plan=named)).findings
+    assert ("simulated" in finding.remedy) is simulated
+
+
 # One accused part for one symptom
 
 
