@@ -11,12 +11,14 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dxlrun.channels.events import EventCode, GoalReport, Severity
+from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import ROBOT, Finding, Rank
 from dxlrun_analysis.tally import RunTotals
 
 _MOST_NAMED = 3
+_AT_ONCE_NS = 500_000_000
+"""What happens to joints within that time has one time."""
 _NOTICED_RAD = math.radians(0.05)
 _FAILED = {
     EventCode.SERVO_LIMP: "went limp",
@@ -82,7 +84,7 @@ def _reason(worst: Finding, totals: RunTotals, found: Sequence[Finding]) -> str:
 
 
 def _failures(totals: RunTotals) -> Iterator[str]:
-    """Yield a fall, and what went limp, was lost or rebooted, with the time of the first of each."""
+    """Yield a fall, and what went limp, was lost or rebooted: as it came, for the same joints together."""
     conduct = totals.conduct
     fallen = next((one for one in conduct.takeovers if one.fell), None)
     if conduct.lies or fallen:
@@ -93,12 +95,29 @@ def _failures(totals: RunTotals) -> Iterator[str]:
     for bus, group in gone.items():
         yield f"bus {bus} was lost{_at(group.t_ns, conduct.begin_ns)}"
     theirs = {servo.joint for servo in totals.servos if servo.bus in gone}
-    for code, what in _FAILED.items():
+    told: dict[frozenset[str], list[list[EventGroup]]] = {}
+    for code in _FAILED:
         groups = [group for group in severe if group.code == code and group.source not in theirs]
         if groups:
-            joints = _named([group.source for group in groups])
-            verb = what if len(groups) == 1 else what.replace("was ", "were ")
-            yield f"{joints} {verb}{_at(min(group.t_ns for group in groups), conduct.begin_ns)}"
+            groups.sort(key=lambda group: group.t_ns)
+            told.setdefault(frozenset(group.source for group in groups), []).append(groups)
+    for same in told.values():
+        same.sort(key=lambda groups: groups[0].t_ns)
+    for same in sorted(told.values(), key=lambda same: same[0][0].t_ns):
+        happened = [f"{_what(groups)}{_when(groups, conduct.begin_ns)}" for groups in same]
+        yield f"{_named([group.source for group in same[0]])} {', '.join(happened)}"
+
+
+def _what(groups: Sequence[EventGroup]) -> str:
+    what = _FAILED[EventCode(groups[0].code)]
+    return what if len(groups) == 1 else what.replace("was ", "were ")
+
+
+def _when(groups: Sequence[EventGroup], begin_ns: int) -> str:
+    """Return when it was, or from when on where the joints did it one after the other."""
+    first = _at(groups[0].t_ns, begin_ns)
+    later = first and groups[-1].t_ns - groups[0].t_ns > _AT_ONCE_NS
+    return f"{first.replace(' at ', ' from ')} on" if later else first
 
 
 def _at(t_ns: int, begin_ns: int) -> str:

@@ -94,8 +94,23 @@ def test_what_fails_comes_before_what_was_played() -> None:
         happened(EventCode.SERVO_LOST, "knee", 8.0),
     )
     assert line(events=events, conduct=conduct(reached=1, failed=(missed,))) == (
-        "Not good: elbow went limp at 12.3 s; hip, knee were lost at 3.0 s; wave of arm aborted (elbow "
+        "Not good: knee, hip were lost from 3.0 s on; elbow went limp at 12.3 s; wave of arm aborted (elbow "
         "12.0 deg off); played wave (2 motions) within 0.3 deg (wrist); 1 of 2 goals reached."
+    )
+
+
+def test_what_happened_to_the_same_joints_is_told_together_as_it_came() -> None:
+    events = [
+        happened(code, joint, at_s + at / 10)
+        for code, at_s in (
+            (EventCode.SERVO_LIMP, 8.2),
+            (EventCode.SERVO_LOST, 8.0),
+            (EventCode.SERVO_REBOOTED, 8.1),
+        )
+        for at, joint in enumerate(("knee", "hip"))
+    ]
+    assert line(events=tuple(events)).startswith(
+        "Not good: knee, hip were lost at 3.0 s, rebooted at 3.1 s, went limp at 3.2 s; played wave "
     )
 
 
