@@ -20,6 +20,7 @@ TREMBLES = 4.0 + 0.02 * RANDOM.normal(size=COUNT)
 OTHER = 5.0 + 0.02 * RANDOM.normal(size=COUNT)
 SOME = np.arange(COUNT) % 17 == 5
 """53 samples, one by one."""
+BURSTS = np.where(np.arange(COUNT) % 60 < 15, RANDOM.uniform(-8.0, 8.0, COUNT), 0.0)
 
 
 def findings(values: Floats, other: Floats = OTHER, name: str = "foot", slices: int = 170) -> list[Any]:
@@ -58,14 +59,15 @@ def test_it_does_not_depend_on_how_the_log_is_cut(slices: int) -> None:
     [
         (TREMBLES, OTHER),
         (SOME.astype(np.float64), OTHER),
-        (np.round(TREMBLES, 2) * 0 + np.where(SOME, 3.0, RANDOM.integers(0, 2, COUNT)), OTHER),
+        (np.where(SOME, 300.0, RANDOM.integers(0, 4, COUNT)), OTHER),
+        (TREMBLES + BURSTS, OTHER),
         (TREMBLES + 8.0 * (np.arange(COUNT) // 30 % 2), OTHER),
         (TREMBLES + 8.0 * (np.arange(COUNT) // 3 % 10 == 0), OTHER),
         (np.where(SOME, 3 * TREMBLES, TREMBLES), np.where(SOME, 3 * OTHER, OTHER)),
         (np.where(SOME & (np.arange(COUNT) < 150), 3 * TREMBLES, TREMBLES), OTHER),
         (np.sin(np.arange(COUNT) * 0.9), OTHER),
     ],
-    ids=["noise", "a button", "few values", "steps", "pulses", "impacts", "seldom", "fast"],
+    ids=["noise", "a button", "few values", "bursts", "steps", "pulses", "impacts", "seldom", "fast"],
 )
 def test_what_has_a_reason_is_not_told(values: Floats, other: Floats) -> None:
     assert findings(values, other) == []
