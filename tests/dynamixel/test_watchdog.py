@@ -151,6 +151,26 @@ class TestWhileOthersAreArmed:
         assert all(map(math.isnan, rig.hardware._servos[0].life.ceiling))
 
 
+def test_a_process_that_stands_still_again_and_again_before_a_read_shows_no_older_states(started):
+    """Each time behind what was done about the one before, and before the read."""
+    started.cycles(5)
+    prepare, left = started.hardware._prepare_read, [SECOND_NS] * 2
+
+    def prepared():
+        prepare()
+        if left:
+            started.wait(left.pop())
+
+    started.hardware._prepare_read = prepared
+    started.wait(SECOND_NS)
+    started.hardware.read()
+    assert not left
+    assert started.states.valid.all()
+    assert max(started.states.age_ns) < started.period_ns
+    started.cycles(100)
+    assert armed(started) == [10] * 4
+
+
 class TestLeftHolding:
     """A robot that is left with its torque on: nothing is sent any more, so no watchdog may be armed."""
 

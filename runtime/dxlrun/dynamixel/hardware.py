@@ -179,11 +179,10 @@ class DynamixelHardware:
             self._samples.follow_modes()
 
     def _finish_read(self, code: int) -> None:
-        answer = self._kernel.finish_read(code)
-        if answer is Answer.SILENCE:
+        while (answer := self._kernel.finish_read(code)) is Answer.SILENCE:
             self._look = True
             self._prepare_read()
-            answer = self._kernel.finish_read(self._read())
+            code = self._read()  # this process may have stood still again
         if answer is Answer.UNEXPECTED:
             self._look = True
             if self._by_kernel:
