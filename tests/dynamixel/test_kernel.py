@@ -110,7 +110,7 @@ def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monk
     monkeypatch.setattr(fence, "SOURCE", tmp_path / "kernel.c")
     with pytest.raises(StartUpError, match=r"of another source than kernel\.c .* install dxlrun again"):
         fence.library(path=tmp_path / "libkernel.so")
-    with pytest.raises(StartUpError, match=r"kernel .* is missing: install dxlrun again"):
+    with pytest.raises(StartUpError, match=r"^the compiled kernel is missing: install dxlrun again"):
         fence.library(path=tmp_path / "absent.so")
 
 

@@ -12,7 +12,7 @@ from zlib import crc32
 
 from dxlrun.errors import StartUpError
 
-_MISSING = "the compiled kernel of the exchange is missing: install dxlrun again, on Linux"
+_HINT = "install dxlrun again, on Linux"
 Library = TypeVar("Library", bound=ctypes.CDLL)
 
 
@@ -25,10 +25,10 @@ def compiled(source: Path, kind: type[Library], path: Path | None = None) -> Lib
         library = kind(str(path or source.with_name(f"lib{source.stem}.so")))
         known = library.dxl_source() & 0xFFFFFFFF
     except (OSError, AttributeError):
-        raise StartUpError(_MISSING) from None
+        raise StartUpError(f"the compiled {source.stem} is missing: {_HINT}") from None
     if known != crc32(source.read_bytes()):
         raise StartUpError(
-            f"the compiled kernel is of another source than {source.name} beside it: {_MISSING}"
+            f"the compiled {source.stem} is of another source than {source.name} beside it: {_HINT}"
         )
     return library
 

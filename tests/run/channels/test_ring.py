@@ -217,7 +217,7 @@ def test_without_a_compiled_fence_nothing_is_written_but_all_else_works(tmp_path
     monkeypatch.setattr(fence, "LIBRARY", tmp_path / "libkernel.so")
     fence.LIBRARY.write_bytes(b"of another architecture")
     assert fence.load()() is None
-    with pytest.raises(StartUpError, match=r"kernel of the exchange is missing: install dxlrun again"):
+    with pytest.raises(StartUpError, match=r"^the compiled kernel is missing: install dxlrun again"):
         RingWriter(descriptor)
 
 
