@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from dxlrun.channels import fence
+from dxlrun.control import gate
 from dxlrun.control.realtime import UNLIMITED
 from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
 
@@ -336,3 +338,9 @@ def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
     found = look(compiled="its kernel is missing: install dxlrun again")["exchange"]
     assert found.state == "missing"
     assert found.mend == "install dxlrun again"
+
+
+@pytest.mark.parametrize("what", ["kernel", "gate"])
+def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr({"kernel": fence, "gate": gate}[what], "SOURCE", tmp_path / f"{what}.c")
+    assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again, on Linux"

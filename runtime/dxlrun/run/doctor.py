@@ -7,11 +7,14 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from ctypes import PyDLL
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from dxlrun.channels import fence
+from dxlrun.channels.compiled import compiled
+from dxlrun.control import gate
 from dxlrun.control.realtime import (
     IDLE_LATENCY,
     IPC_LOCK,
@@ -106,7 +109,8 @@ def may_schedule() -> bool:
 
 def _compiled() -> str:
     try:
-        fence.library()
+        for source in (fence.SOURCE, gate.SOURCE):
+            compiled(source, PyDLL)
     except StartUpError as error:
         return f"{error}"
     return ""
@@ -129,7 +133,7 @@ class Machine:
     lockable: int = 0
     """Bytes; UNLIMITED with the capability."""
     compiled: str = ""
-    """Why the compiled part of the exchange with servos cannot be used; empty: it can."""
+    """Why what is compiled, the exchange with servos and the gate, cannot be used; empty: it can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
     may_write: Callable[[Path], bool] = field(default=_open_to_us)
 
@@ -206,8 +210,10 @@ def _system(machine: Machine) -> Finding:
 
 
 def _exchange(machine: Machine) -> Finding:
-    """Whether the compiled part of the exchange with the servos can be used."""
-    check = _Check("exchange", "a compiled kernel exchanges bytes with the servos in every cycle")
+    """Whether the compiled parts of a cycle can be used: the exchange with the servos, and the gate."""
+    check = _Check(
+        "exchange", "compiled code limits goals and exchanges bytes with the servos in every cycle"
+    )
     if not machine.compiled:
         return check.good("compiled")
     what, _, how = machine.compiled.rpartition(": ")
