@@ -18,6 +18,8 @@ _FEW_INVALID = 2
 _MOST_NAMED = 3
 SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
 """Codes of what spoils replies."""
+_OF_A_SERVO = ("lossy_servo", "slow_servo", "broken_replies", "loose_cable")
+"""Codes that accuse a servo of replies that are missing."""
 
 
 def severe_of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
@@ -205,18 +207,22 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
         joints = counted(len(waited), "joint", "joints")
         sentence = (
             f"States of {joints} on bus {_joined(buses)} were invalid, in up to {most:.1%} of the cycles, as "
-            f"whole chains of replies were missing: either {_head(totals, buses)} is silent, or the "
-            "instruction is lost on the line"
+            f"whole chains of replies were missing{_why_missing(totals, buses)}"
         )
     yield Finding(
         "invalid_states", subject, f"{sentence}; {INVALID_SHARE:.0%} tolerated.", rank=Rank.SHARE, share=most
     )
 
 
-def _head(totals: RunTotals, buses: Sequence[str]) -> str:
-    """Return the first servo of the chains of some buses, with its name where it is always the same."""
+def _why_missing(totals: RunTotals, buses: Sequence[str]) -> str:
+    """Return what whole chains wait for: their first servo, or the line where no finding accuses that."""
     heads = [one for one in totals.servos if one.bus in buses and one.losses and one.losses.broken_off]
-    return "the first servo of the chain" + (f", {_name(heads[0])}," if len(heads) == 1 else "")
+    name = _name(heads[0]) if len(heads) == 1 else ""
+    accused = {one.subject for one in totals.findings if one.code in _OF_A_SERVO}
+    if name and subject_of(heads[0]) in accused:
+        return f" behind {name}"
+    first = f"the first servo of the chain{f', {name},' if name else ''}"
+    return f": either {first} is silent, or the instruction is lost on the line"
 
 
 def _invalid(totals: RunTotals) -> dict[str, int]:

@@ -192,6 +192,17 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
     assert blamed == ({"elbow"} if subject == "elbow" else set())
 
 
+def test_states_of_chains_are_no_open_question_where_their_first_servo_is_accused() -> None:
+    servos = [LoggedServo(joint, at, row=at) for at, joint in enumerate(("elbow", "wrist"))]
+    plan = LoggedPlan(buses=[LoggedBus(name="main", servos=servos)])
+    replies = (answered("elbow", 0, 1000, 50, 1), answered("wrist", 1, 1000, 50, 0))
+    for code, is_open in (("lossy_servo", False), ("hot_joint", True)):
+        run = totals(plan=plan, invalid=(50, 50), servos=replies, findings=(accusing(code, "elbow"),))
+        (found,) = (one for one in judge(run).findings if one.code == "invalid_states")
+        assert ("lost on the line" in found.sentence) is is_open
+        assert ("missing behind servo 0 (elbow);" in found.sentence) is not is_open
+
+
 @pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])
 def test_positions_that_the_loop_did_not_believe_are_named_where_replies_are_intact(spoilt: str) -> None:
     plan = LoggedPlan(buses=[LoggedBus(name="main", servos=[LoggedServo("elbow", 1, row=0)])])
