@@ -227,6 +227,19 @@ def test_a_gateway_that_hangs_is_an_error(robot: Any, way: str, monkeypatch: pyt
         list(listening) if way == "for" else asyncio.run(collect(listening))
 
 
+def test_a_connection_that_is_reset_while_an_async_program_waits_is_an_error(robot: Any) -> None:
+    link = Link(OPENED)
+    listening = robot(link).listen("/arm/state")
+    listening._end.send(b"unread")  # so Linux resets it
+
+    async def collect() -> None:
+        asyncio.get_running_loop().call_later(0.02, link.gateway.close)
+        assert [message.number async for message in listening] == []
+
+    with pytest.raises(dxlrun.DxlrunError, match="publisher no longer answers: the connection was closed"):
+        asyncio.run(collect())
+
+
 def test_a_refusal_is_that_of_each_request(robot: Any) -> None:
     answer = b'{"refused": "there is no topic /arm", "code": "unknown_topic", "fields": {}}'
     with pytest.raises(dxlrun.Refused, match="there is no topic /arm") as refused:

@@ -103,8 +103,9 @@ class Listening:
                 for message in self._arrived():
                     yield message
                 if not self._ended:
-                    async with asyncio.timeout(TIMEOUT_S):
-                        self._bytes += await receive(self._end, _CHUNK)
+                    with suppress(ConnectionError):  # then nothing more comes, which is seen there
+                        async with asyncio.timeout(TIMEOUT_S):
+                            self._bytes += await receive(self._end, _CHUNK)
         except TimeoutError:
             raise self._gone(f"nothing came for {TIMEOUT_S:g} s") from None
         finally:
