@@ -413,3 +413,15 @@ def test_a_live_parameter_that_follows_from_another_changes_with_it(arm, monkeyp
     monkeypatch.setattr(Arm, "Parameters", Derived)
     assert arm.ask("POST", PARAMETERS, {"values": {"steps": 8}})[0] == 200
     assert json.loads(arm.taken[-1].data)["values"] == {"steps": 8, "half": 4.0}
+
+
+class Labelled(Derived):
+    label: Annotated[str, dxlrun.LIVE] = "left"
+
+
+def test_a_live_parameter_that_is_no_number_is_named_and_keeps_no_other_from_changing(arm, monkeypatch):
+    monkeypatch.setattr(Arm, "Parameters", Labelled)
+    assert arm.ask("POST", PARAMETERS, {"values": {"steps": 8}})[0] == 200
+    status, answer = arm.ask("POST", PARAMETERS, {"values": {"label": "right"}})
+    assert status == 422
+    assert "label = 'right' is neither a number nor a bool, so it cannot change in a run" in answer["refused"]

@@ -75,13 +75,12 @@ def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Wri
                 f"{name}: {known[name].range}" for name in values if name in wrong and known[name].range
             ]
             raise invalid(problem + (f" ({'; '.join(ranges)})" if ranges else "")) from error
-    flat = {name: _number(value_of(new, name)) for name in live_names(new)}
     before = {parameter.name: parameter.value for parameter in known.values()}
     after = {parameter.name: parameter.value for parameter in parameters_of(new)}
     # one that a validator of the model derives from another changes with it
-    differing = [name for name in flat if name in values or before[name] != after[name]]
+    differing = [name for name in live_names(new) if name in values or before[name] != after[name]]
     return Change(
-        Parameters(plan.name, {name: flat[name] for name in differing}),
+        Parameters(plan.name, {name: _number(name, value_of(new, name)) for name in differing}),
         replace(plan, parameters=json.dumps(written)),
         tuple(NewValue(name, before[name], after[name]) for name in differing),
     )
@@ -111,7 +110,7 @@ def _put(written: dict[str, object], path: list[str], value: Written, now: objec
     written[path[-1]] = value
 
 
-def _number(value: object) -> bool | int | float:
-    if not isinstance(value, bool | int | float):  # LIVE is checked when the plug-in is loaded
-        raise invalid(f"{value!r} is neither a number nor a bool")
+def _number(name: str, value: object) -> bool | int | float:
+    if not isinstance(value, bool | int | float):  # its plug-in may have marked anything
+        raise invalid(f"{name} = {value!r} is neither a number nor a bool, so it cannot change in a run")
     return value
