@@ -177,6 +177,11 @@ class RemoteRobot:
             self._frames = FrameTree(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
         return self._frames
 
+    def urdf(self) -> str:
+        """Return the text of the robot's URDF; empty: it has none."""
+        found = self._ask("GET", "/frames", dict[str, object])
+        return str(found.get("urdf") or "")
+
     def pose(self, of: str, relative_to: str = "") -> Transform:
         """Return where a frame lies now in another one, by default in the root: m, and a unit quaternion.
 

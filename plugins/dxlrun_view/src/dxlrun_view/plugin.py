@@ -1,0 +1,20 @@
+"""The door: what dxlrun finds by the entry point in pyproject.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun import Command, hookimpl
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for."""
+    return 4
+
+
+@hookimpl
+def dxlrun_commands() -> Sequence[Command]:
+    """Return the verb."""
+    help_line = "Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers."
+    return (Command("view", "dxlrun_view.view:view", help_line),)

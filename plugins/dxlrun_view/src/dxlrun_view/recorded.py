@@ -1,0 +1,274 @@
+"""A log for the page: every column of its cycles in memory, of a long log every second, third ... cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun import LogError, open_log
+from dxlrun.channels.events import Event
+from dxlrun.errors import DxlrunError
+from dxlrun.log.schemas import (
+    ACTIVATION_TOPIC,
+    BUS_PREFIX,
+    COMMANDS_TOPIC,
+    CYCLE_TOPIC,
+    EVENT_TOPIC,
+    JOINT_COMMANDS_TOPIC,
+    JOINT_STATES_TOPIC,
+)
+from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun_view.curves import (
+    CYCLE,
+    JOINT_COLUMNS,
+    LATE,
+    Curve,
+    History,
+    Moment,
+    columns_of,
+    numbers_in,
+    thinned,
+)
+from dxlrun_view.shown import Controller, Happening, Joint, Mark, Shown
+
+MOST_CYCLES = 100_000
+"""Shown of a log, in some 120 MB for 20 joints."""
+_IN_COLUMNS = (
+    CYCLE_TOPIC,
+    ACTIVATION_TOPIC,
+    COMMANDS_TOPIC,
+    EVENT_TOPIC,
+    JOINT_STATES_TOPIC,
+    JOINT_COMMANDS_TOPIC,
+)
+"""Topics whose numbers are columns of the cycles, or nothing to draw."""
+_NONE = np.zeros(0, [("cycle", "i8")])
+WORST = 8
+"""Cycles that woke up latest and are offered as jumps."""
+
+
+class RecordedRobot:
+    """A log that was read."""
+
+    def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
+        """Read it; `progress` gets the share that is done. Raises LogError."""
+        reader = open_log(path)
+        if reader.header is None:
+            raise LogError(f"{path}: an MCAP file of another program; `dxlrun view` shows logs of dxlrun")
+        self._reader = reader
+        self._header = reader.header
+        read = _Read()
+        for part in reader.slices():
+            read.take(part.cycles)
+            read.events += part.events
+            progress(reader.share)
+        cycles = read.cycles
+        if not len(cycles):
+            raise LogError(f"{path}: a log without a cycle; there is nothing to show")
+        self._begin_ns = int(cycles["woken_ns"][0])
+        self._every, self._skipped = read.every, read.skipped
+        self._marks = self._worst(read.worst)
+        self._times, self._active = self._seconds(cycles["woken_ns"]), cycles["active"].copy()
+        self._history = self._columns(cycles)
+        self._happenings = tuple(
+            Happening(number, float(self._seconds(event.t_ns)), int(event.severity), event.source, event.text)
+            for number, event in enumerate(sorted(read.events, key=lambda each: each.t_ns), 1)
+        )
+        self._plan = self._planned()
+        self._folder = Path(reader.metadata.get("run", {}).get("robot_file", "")).parent
+        self._fields = tuple(sorted(self._drawable()))
+        self._topics: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    @property
+    def folder(self) -> Path | None:
+        """Where its robot file was, as far as it is still there."""
+        return self._folder if self._folder.is_dir() else None
+
+    def shown(self) -> Shown:
+        """Return what the page has around the curves."""
+        header = self._header
+        frames = self._plan.frames if self._plan is not None else None
+        return Shown(
+            robot=header.robot,
+            live=False,
+            rate=1e9 / header.period_ns,
+            columns=self._history.columns,
+            joints=self._joints(),
+            controllers=self._controllers(),
+            span=self._history.span,
+            skipped=self._skipped,
+            every=self._every,
+            fields=self._fields,
+            marks=self._marks,
+            imu=frames.imu if frames is not None else "",
+            imu_link=frames.imu_link if frames is not None else "",
+        )
+
+    def at(self, time_s: float | None) -> Moment:
+        """Return all columns at a time, by default at the end."""
+        return self._history.at(time_s)
+
+    def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
+        """Return a part of a column, or of a topic's field, `/arm/state:error[0]`. Raises KeyError."""
+        if name in self._history:
+            return self._history.curve(name, begin, end, points)
+        times, values = self._field(name)
+        inside = (times >= begin) & (times <= end)
+        return thinned(name, times[inside], values[inside], points)
+
+    def active(self, time_s: float) -> int:
+        """Return the mask of the controllers that were active at a time."""
+        return int(self._active[max(int(np.searchsorted(self._times, time_s, "right")) - 1, 0)])
+
+    def events(self, after: int) -> tuple[Happening, ...]:
+        """Return the events behind this number."""
+        return self._happenings[after:]
+
+    def urdf(self) -> str:
+        """Return the robot's URDF; empty: the log has none."""
+        return self._plan.urdf or "" if self._plan is not None else ""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _field(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return times and values of a field of a topic. Raises KeyError."""
+        if name not in self._topics:
+            topic, _, field = name.partition(":")
+            field, _, index = field.partition("[")
+            try:
+                found = self._reader.columns(topic, field)
+                values = found[field]
+                if index:
+                    place = int(index.rstrip("]"))
+                    values = np.array([row[place] if place < len(row) else np.nan for row in values])
+                self._topics[name] = self._seconds(found["t_ns"].astype(np.int64)), values.astype(np.float64)
+            except (LogError, ValueError, TypeError, IndexError) as error:
+                raise KeyError(name) from error
+        return self._topics[name]
+
+    def _drawable(self) -> Iterator[str]:
+        """Yield the numbers in messages of topics, by the first message of each."""
+        for topic in self._reader.topics:
+            if topic in _IN_COLUMNS or topic.startswith(BUS_PREFIX):
+                continue
+            with suppress(LogError):
+                for batch in self._reader.batches(topic):
+                    first = {field: values[0] for field, values in batch.items() if field != "t_ns"}
+                    yield from numbers_in(first, f"{topic}:")
+                    break
+
+    def _seconds(self, t_ns: NDArray[np.int64] | int) -> NDArray[np.float64]:
+        """Return times since the first cycle, s."""
+        return np.asarray(t_ns - self._begin_ns, np.float64) * 1e-9
+
+    def _columns(self, cycles: NDArray[np.void]) -> History:
+        header = self._header
+        layout, times = header.layout, self._times
+        columns = columns_of(header.joints, layout.source_states, header.references)
+        history = History(columns, len(cycles))
+        history.fill(times, CYCLE, cycles["cycle"].astype(np.float64))
+        history.fill(times, LATE, (cycles["woken_ns"] - cycles["scheduled_ns"]) * 1e-9)
+        for column in JOINT_COLUMNS:
+            for row, joint in enumerate(header.joints):
+                history.fill(times, f"{joint}/{column}", cycles[column][:, row])
+        for row, state in enumerate(layout.source_states):
+            history.fill(times, state, cycles["source_state"][:, row])
+        for row, reference in enumerate(header.references):
+            history.fill(times, reference, cycles["reference"][:, row])
+        return history
+
+    def _worst(self, cycles: NDArray[np.void]) -> tuple[Mark, ...]:
+        late = _late_s(cycles)
+        times = self._seconds(cycles["woken_ns"])
+        return tuple(
+            Mark(float(time_s), f"cycle {int(number)}, {late_s * 1e3:.2f} ms late")
+            for time_s, number, late_s in zip(times, cycles["cycle"], late, strict=True)
+            if late_s > 0.0
+        )
+
+    def _planned(self) -> Plan | None:
+        """Return the plan of the run; None: of an older version, or damaged."""
+        try:
+            return from_json(self._reader.attachments["plan.json"])
+        except (KeyError, DxlrunError, msgspec.MsgspecError, ValueError):
+            return None
+
+    def _joints(self) -> tuple[Joint, ...]:
+        if self._plan is None:
+            return tuple(Joint(name, "rad", "") for name in self._header.joints)
+        return tuple(
+            Joint(
+                joint.name,
+                "m" if joint.linear else "rad",
+                joint.servo_model.effort_unit.replace("1", "") if joint.servo_model else "",
+                joint.lower if joint.bounded else None,
+                joint.upper if joint.bounded else None,
+                f"{joint.servo_model.model}, {joint.servo}" if joint.servo_model else joint.servo,
+            )
+            for joint in self._plan.loop.joints
+        )
+
+    def _controllers(self) -> tuple[Controller, ...]:
+        plans = {one.name: one for one in self._plan.loop.controllers} if self._plan is not None else {}
+        found: list[Controller] = []
+        for one in self._header.controllers:
+            plan = plans.get(one.name)
+            if plan is None:
+                found.append(Controller(one.name, "", active=False, joints=one.joints))
+            else:
+                found.append(
+                    Controller(
+                        one.name,
+                        plan.type,
+                        active=plan.active,
+                        joints=plan.joints,
+                        command=plan.command,
+                        into=plan.into,
+                        fallback=plan.fallback,
+                    )
+                )
+        return tuple(found)
+
+
+class _Read:
+    """Cycles of a log as they are read: where they become too many, every second one leaves."""
+
+    def __init__(self) -> None:
+        self.every = 1
+        self.skipped = 0
+        self.events: list[Event] = []
+        self.worst = _NONE
+        """The cycles that woke up latest."""
+        self._parts: list[NDArray[np.void]] = []
+        self._seen = self._kept = 0
+
+    def take(self, cycles: NDArray[np.void]) -> None:
+        """Take the cycles of a slice."""
+        if not len(cycles):
+            return
+        self.skipped += int(cycles["skipped"].sum())
+        both = np.concatenate([self.worst, cycles]) if len(self.worst) else cycles
+        self.worst = both[np.argsort(_late_s(both))[::-1][:WORST]]
+        self._parts.append(cycles[-self._seen % self.every :: self.every].copy())
+        self._seen += len(cycles)
+        self._kept += len(self._parts[-1])
+        if self._kept > 2 * MOST_CYCLES:
+            self._parts = [self.cycles[::2].copy()]
+            self._kept = len(self._parts[0])
+            self.every *= 2
+
+    @property
+    def cycles(self) -> NDArray[np.void]:
+        """Those that are kept."""
+        return np.concatenate(self._parts) if self._parts else _NONE
+
+
+def _late_s(cycles: NDArray[np.void]) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = (cycles["woken_ns"] - cycles["scheduled_ns"]) * 1e-9
+    return found

@@ -1,0 +1,279 @@
+"""Server of the page: one process of its own on 127.0.0.1, for one person's browser, and for no web site.
+
+Each request must name this server as its host (no foreign name that points to 127.0.0.1 gets through), come
+from this page if it says from where, and show the token of the page's address. Whoever may not steer by
+`--control` can still stop.
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import msgspec
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from dxlrun import DxlrunError, InputError
+from dxlrun_view.actions import Action, act
+from dxlrun_view.curves import Curve, Moment
+from dxlrun_view.shown import Happening, Shown, Source
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PORT = 8765
+ANY = "0.0.0.0"  # noqa: S104  compared; it is listened on if the user says so
+TOKEN = "X-Dxlrun-Token"  # noqa: S105  the name of a header
+MOST_POINTS = 4000
+MOST_CURVES = 64
+MOST_BYTES = 1 << 16
+"""Of a request."""
+_TYPES = {"page.html": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+_SECURITY = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+_MESHES = (".stl", ".dae", ".obj")
+
+
+class Span(msgspec.Struct, frozen=True):
+    """Curves that one plot of the page needs."""
+
+    names: tuple[str, ...]
+    begin: float
+    end: float
+    points: int = 600
+
+
+class Look(msgspec.Struct, frozen=True):
+    """What the page asks for, some 25 times a second."""
+
+    time: float | None = None
+    """Of a log, where its time line is; None: the newest."""
+    after: int = 0
+    """Number of the last event that it has."""
+    shown: bool = False
+    """It needs what changes seldom, too."""
+    spans: tuple[Span, ...] = ()
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """The answer."""
+
+    moment: Moment
+    events: tuple[Happening, ...]
+    curves: tuple[tuple[Curve, ...], ...]
+    shown: Shown | None = None
+
+
+Asked = TypeVar("Asked")
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+class Page:
+    """The page of a robot or a log."""
+
+    def __init__(self, source: Source, *, hosts: tuple[str, ...], control: bool = False) -> None:
+        """`hosts`: names of this server with its port, as browsers send them."""
+        self.source, self.control = source, control
+        self.token = secrets.token_urlsafe(16)
+        self._hosts = frozenset(hosts)
+
+    def app(self) -> Starlette:
+        """Return the application."""
+        return Starlette(
+            routes=[
+                Route("/", self._guarded(self.page)),
+                Route("/page.js", self._guarded(self.page)),
+                Route("/page.css", self._guarded(self.page)),
+                Route("/look", self._guarded(self.look, token=True), methods=["POST"]),
+                Route("/act", self._guarded(self.act, token=True), methods=["POST"]),
+                Route("/urdf", self._guarded(self.urdf, token=True)),
+                Route("/mesh", self._guarded(self.mesh, token=True)),
+            ]
+        )
+
+    def _guarded(self, handler: Handler, *, token: bool = False) -> Handler:
+        async def answer(request: Request) -> Response:
+            host = request.headers.get("host", "")
+            origin = request.headers.get("origin")
+            if host not in self._hosts or origin not in (None, *(f"http://{one}" for one in self._hosts)):
+                return _refused(403, "this page answers itself alone, and no other web site")
+            given = request.headers.get(TOKEN, "")
+            if token and not secrets.compare_digest(given.encode(), self.token.encode()):
+                return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")
+            try:
+                response = await handler(request)
+            except DxlrunError as error:
+                response = _refused(409, str(error))
+            response.headers.update(_SECURITY)
+            return response
+
+        return answer
+
+    async def page(self, request: Request) -> Response:
+        """Return a file of the page; the address of the first has the token, which its script sends."""
+        name = request.url.path.strip("/") or "page.html"
+        text = files("dxlrun_view").joinpath("page", name).read_bytes()
+        return Response(text, media_type=_TYPES[name])
+
+    async def look(self, request: Request) -> Response:
+        """Return what the page draws."""
+        asked = await _body(request, Look)
+        return _json(await run_in_threadpool(self._seen, asked))
+
+    def _seen(self, asked: Look) -> Seen:
+        shown = None
+        if asked.shown:
+            shown = msgspec.structs.replace(self.source.shown(), control=self.control)
+        return Seen(
+            self.source.at(asked.time),
+            self.source.events(asked.after),
+            tuple(self._curves(span) for span in asked.spans),
+            shown,
+        )
+
+    def _curves(self, span: Span) -> tuple[Curve, ...]:
+        found: list[Curve] = []
+        for name in span.names[:MOST_CURVES]:
+            try:
+                found.append(self.source.curve(name, span.begin, span.end, min(span.points, MOST_POINTS)))
+            except KeyError:
+                found.append(Curve(name, [], []))
+        return tuple(found)
+
+    async def urdf(self, request: Request) -> Response:
+        """Return the robot's URDF; nothing where it has none."""
+        return Response(await run_in_threadpool(self.source.urdf), media_type="application/xml")
+
+    async def mesh(self, request: Request) -> Response:
+        """Return a mesh that the URDF names, from the folder of the robot file."""
+        name = request.query_params.get("name", "")
+        path = await run_in_threadpool(self._mesh, name)
+        if path is None:
+            return _refused(404, f"there is no mesh {name} beside the robot file")
+        return Response(path.read_bytes(), media_type="application/octet-stream")
+
+    def _mesh(self, name: str) -> Path | None:
+        """Return a file that the URDF names; never another one."""
+        if self.source.folder is None or f'"{name}"' not in self.source.urdf():
+            return None
+        found = mesh_file(self.source.folder, name)
+        return found if found is not None and found.suffix.lower() in _MESHES else None
+
+    async def act(self, request: Request) -> Response:
+        """Do what a button asks; without `--control` only STOP."""
+        action = await _body(request, Action)
+        if not action.always and not self.control:
+            return _refused(403, "this page only shows the robot: start `dxlrun view --control` to steer it")
+        return _json(await run_in_threadpool(act, self.source, action))
+
+
+def mesh_file(folder: Path, name: str) -> Path | None:
+    """Return where a mesh is: from the robot file's folder, `package://NAME/...` in a folder NAME above it.
+
+    None: nowhere.
+    """
+    if name.startswith("package://"):
+        relative = Path(name.removeprefix("package://"))
+        places = [above / relative for above in (folder, *folder.parents)]
+        places += [above.joinpath(*relative.parts[1:]) for above in (folder, *folder.parents[:2])]
+    else:
+        places = [folder / name.removeprefix("file://"), folder / "urdf" / name]
+    return next((place for place in places if place.is_file()), None)
+
+
+def hosts_of(address: str, port: int) -> tuple[str, ...]:
+    """Return the names under which a browser may reach a server."""
+    names: list[str] = []
+    if address in ("127.0.0.1", "localhost", ANY):
+        names += ["localhost", "127.0.0.1"]
+    if address == ANY:
+        names.append(socket.gethostname())
+        names += [str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    return tuple(f"{name}:{port}" for name in dict.fromkeys([*names, address]))
+
+
+def listening(address: str, port: int | None) -> socket.socket:
+    """Return a listening socket; without a port the usual one, or if that is taken any. Raises InputError."""
+    tried = (PORT, 0) if port is None else (port,)
+    for one in tried:
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((address, one))
+            listener.listen(64)
+        except OSError as error:
+            listener.close()
+            if one == tried[-1]:
+                why = error.strerror or error
+                raise InputError(
+                    f"{address}:{one} cannot be listened on: {why}; give another --port"
+                ) from error
+        else:
+            return listener
+    raise AssertionError(tried)
+
+
+class Server(uvicorn.Server):
+    """Leaves signals to the command."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+
+def server_of(page: Page) -> Server:
+    """Return the server of a page; `run(sockets=[...])` serves it."""
+    config = uvicorn.Config(
+        page.app(),
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        log_level="critical",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        limit_concurrency=64,
+    )
+    return Server(config)
+
+
+async def _body(request: Request, kind: type[Asked]) -> Asked:
+    """Return a request's body. Raises InputError."""
+    data = b""
+    async for piece in request.stream():
+        data += piece
+        if len(data) > MOST_BYTES:
+            raise InputError(f"a request has at most {MOST_BYTES} bytes")
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.MsgspecError as error:
+        raise InputError(f"no request of this page: {error}") from error
+
+
+def _json(content: object) -> Response:
+    return Response(msgspec.json.encode(content), media_type="application/json")
+
+
+def _refused(status: int, why: str) -> Response:
+    content: Mapping[str, str] = {"refused": why}
+    return Response(msgspec.json.encode(content), status, _SECURITY, "application/json")

@@ -1,0 +1,116 @@
+"""What a page shows around the curves: joints, controllers, events, marks on the time line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from dxlrun_view.curves import Curve, Moment
+
+
+class Joint(msgspec.Struct, frozen=True):
+    """One joint, as the page's table has it."""
+
+    name: str
+    unit: str
+    """Of its position: rad or m."""
+    effort_unit: str
+    """Empty: the fraction of the servo's maximum."""
+    lower: float | None = None
+    upper: float | None = None
+    servo: str = ""
+    """Model, ID and bus."""
+
+
+class Controller(msgspec.Struct, frozen=True):
+    """One controller of the graph."""
+
+    name: str
+    type: str
+    active: bool
+    joints: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()
+    into: tuple[str, ...] = ()
+    """Controllers whose references it commands."""
+    fallback: str = ""
+    takes: tuple[str, ...] = ()
+    """Kinds of commands."""
+
+
+class Happening(msgspec.Struct, frozen=True):
+    """One event."""
+
+    number: int
+    time: float
+    """s, as the curves'."""
+    severity: int
+    """As in Python's logging: 20 is information, 30 a warning, 40 an error."""
+    source: str
+    text: str
+
+
+class Mark(msgspec.Struct, frozen=True):
+    """A place in a log that is worth a jump."""
+
+    time: float
+    what: str
+
+
+class Shown(msgspec.Struct, frozen=True):
+    """A robot or a log, as far as it changes seldom."""
+
+    robot: str
+    live: bool
+    rate: float
+    """Hz, nominal."""
+    columns: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    controllers: tuple[Controller, ...]
+    span: tuple[float, float]
+    """s, of the oldest and the newest moment."""
+    skipped: int = 0
+    """Periods."""
+    paused: bool = False
+    problem: str = ""
+    """Why there is nothing new: the robot does not run, or has ended."""
+    every: int = 1
+    """Of a long log every so manieth cycle is shown."""
+    fields: tuple[str, ...] = ()
+    """Numbers in messages of topics, which can be drawn: `/arm/state:error[0]`."""
+    marks: tuple[Mark, ...] = ()
+    """Of a log: its worst cycles."""
+    control: bool = False
+    """The page may steer."""
+    motions: tuple[str, ...] = ()
+    """Motion files of the robot's folder that a page may play."""
+    imu: str = ""
+    """The source whose orientation turns the body."""
+    imu_link: str = ""
+
+
+class Source(Protocol):
+    """A running robot or a log."""
+
+    @property
+    def folder(self) -> Path | None:
+        """Where the robot file is; None: not known."""
+
+    def shown(self) -> Shown:
+        """Return what changes seldom."""
+
+    def at(self, time_s: float | None) -> Moment:
+        """Return all columns at a time, by default the newest."""
+
+    def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
+        """Return a part of a curve; raises KeyError for one that there is not."""
+
+    def events(self, after: int) -> tuple[Happening, ...]:
+        """Return the events behind this number."""
+
+    def urdf(self) -> str:
+        """Return the robot's URDF; empty: it has none."""
+
+    def close(self) -> None:
+        """Leave it alone."""

@@ -1,0 +1,114 @@
+"""`dxlrun view`: a running robot, or a log, on a page in the browser."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun import DxlrunError, InputError, running
+from dxlrun.cli.inputs import leave_real_time
+from dxlrun.errors import suggestion
+from dxlrun.output.terminal import print_warning, progress_bar, show
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from dxlrun_view.shown import Source
+
+
+def view(
+    what: Annotated[str | None, Parameter(name="robot")] = None,
+    *,
+    control: Annotated[bool, Parameter(negative="")] = False,
+    browser: bool = True,
+    port: int | None = None,
+    listen: str = "127.0.0.1",
+) -> int:
+    """Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers.
+
+    Parameters
+    ----------
+    what
+        Name of a running robot, its robot file, or a log (.mcap, or a directory of parts). Without one: the
+        only robot that runs.
+    control
+        The page may steer: a slider for each joint, and buttons. STOP is there always.
+    browser
+        Open the page in a browser.
+    port
+        Serve the page on this port; without it on 8765, or if that is taken on a free one.
+    listen
+        Serve it on this address. On another one than 127.0.0.1 whoever has the page's address, with its
+        token, sees the robot from the network.
+    """
+    leave_real_time()
+    from dxlrun_view.server import ANY, Page, hosts_of, listening, server_of
+
+    source = _source(what)
+    try:
+        with listening(listen, port) as listener:
+            address, taken = listener.getsockname()
+            page = Page(source, hosts=hosts_of(listen, taken), control=control)
+            url = f"http://{'127.0.0.1' if address == ANY else address}:{taken}/?token={page.token}"
+            server = server_of(page)
+
+            def end(number: int, frame: FrameType | None) -> None:
+                server.should_exit = True
+
+            signal.signal(signal.SIGINT, end)
+            signal.signal(signal.SIGTERM, end)
+            if listen != "127.0.0.1":
+                print_warning(f"{listen}: whoever has this address sees the robot from the network")
+            show(f"{source.shown().robot}: {url}", "Ctrl-C ends the page, not the robot.")
+            sys.stdout.flush()
+            if browser:
+                threading.Thread(target=_open, args=(url,), daemon=True).start()
+            server.run(sockets=[listener])
+    finally:
+        source.close()
+    return 0
+
+
+def _source(what: str | None) -> Source:
+    """Return the robot or the log that is meant. Raises DxlrunError."""
+    from dxlrun_view.live import LiveRobot
+
+    if what is None:
+        names = running()
+        if not names:
+            raise DxlrunError("no robot runs; start one (`dxlrun ROBOT.yaml`), or name a log")
+        if len(names) > 1:
+            raise InputError(f"several robots run; name one: {', '.join(names)}")
+        return LiveRobot(names[0])
+    path = Path(what)
+    if path.suffix == ".mcap" or path.is_dir():
+        from dxlrun_view.recorded import RecordedRobot
+
+        if not path.exists():
+            raise InputError(f"there is no log {path}; a run prints at its end where its log is")
+        with progress_bar(hidden=False) as draw:
+            return RecordedRobot(path, lambda share: draw(f"reading {path.name}", share))
+    if path.suffix in (".yaml", ".yml"):
+        from dxlrun.description.reading import read_robot
+
+        name = read_robot(path, {}).robot.name
+        if name not in running():
+            raise DxlrunError(f"{name} of {path} does not run; start it in another terminal: dxlrun {path}")
+        return LiveRobot(name)
+    if what not in running():
+        raise InputError(f"no robot {what} runs; {suggestion(what, running())}")
+    return LiveRobot(what)
+
+
+def _open(url: str) -> None:
+    """Open a browser; one that does not start says so."""
+    # a browser in the terminal would take it over
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not webbrowser.open(url):
+        print_warning("no browser could be opened; open the address yourself")

@@ -1,0 +1,54 @@
+"""A log, and pages that are served."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from tests.view.served import Served
+
+from dxlrun_view.recorded import RecordedRobot
+from dxlrun_view.shown import Source
+
+ROBOTS = Path(__file__).resolve().parents[2] / "robots"
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of 12 s of the torso with an IMU, whose arms and head move."""
+    place = tmp_path_factory.mktemp("run")
+    words = [ROBOTS / "bioloid_torso_imu.yaml", "--play", ROBOTS / "motions/three_parts.yaml"]
+    command = [
+        sys.executable,
+        "-c",
+        "from dxlrun.cli import main; main()",
+        *map(str, words),
+        "--virtual",
+        "--duration",
+        "12",
+    ]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    (found,) = (place / "logs").glob("*.mcap")
+    return found
+
+
+@pytest.fixture(scope="session")
+def recorded(log: Path) -> RecordedRobot:
+    return RecordedRobot(log)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Served]]:
+    served: list[Served] = []
+
+    def make(source: Source, *, control: bool = False) -> Served:
+        served.append(Served(source, control=control))
+        return served[-1]
+
+    yield make
+    for one in served:
+        one.close()

@@ -1,0 +1,49 @@
+"""A page that is served, and what a browser would ask of it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from typing import Any
+
+from dxlrun_view.server import TOKEN, Page, hosts_of, listening, server_of
+from dxlrun_view.shown import Source
+
+
+class Served:
+    """A page that is served, and what a browser would ask of it."""
+
+    def __init__(self, source: Source, *, control: bool = False) -> None:
+        self.listener = listening("127.0.0.1", 0)
+        self.port = self.listener.getsockname()[1]
+        self.page = Page(source, hosts=hosts_of("127.0.0.1", self.port), control=control)
+        self.server = server_of(self.page)
+        self._thread = threading.Thread(target=self.server.run, kwargs={"sockets": [self.listener]})
+        self._thread.start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}/?token={self.page.token}"
+
+    def ask(self, path: str, content: object = None, **headers: str) -> tuple[int, bytes]:
+        """Return status and answer; `headers` replace those of the page."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        body = None if content is None else json.dumps(content)
+        given = {TOKEN: self.page.token} | {name.replace("_", "-"): text for name, text in headers.items()}
+        connection.request("GET" if body is None else "POST", path, body, given)
+        answer = connection.getresponse()
+        found = answer.status, answer.read()
+        connection.close()
+        return found
+
+    def look(self, **asked: object) -> Any:
+        status, answer = self.ask("/look", asked)
+        assert status == 200, answer
+        return json.loads(answer)
+
+    def close(self) -> None:
+        """End it; once more does nothing."""
+        self.server.should_exit = True
+        self._thread.join()
+        self.listener.close()

@@ -1,0 +1,117 @@
+"""The page of a log: what it shows is what the log has; what is wrong is refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.view.served import Served
+
+import dxlrun_view.recorded as module
+from dxlrun import LogError, open_log
+from dxlrun_view.recorded import RecordedRobot
+from dxlrun_view.server import mesh_file
+
+Serve = Callable[..., Served]
+JOINT = "right_elbow_joint"
+
+
+def test_columns_are_those_of_the_cycles(log: Path, recorded: RecordedRobot, serve: Serve) -> None:
+    served = serve(recorded)
+    seen = served.look(
+        shown=True, spans=[{"names": [f"{JOINT}/position"], "begin": 0, "end": 99, "points": 4000}]
+    )
+    shown = seen["shown"]
+    assert not shown["live"]
+    assert JOINT in [joint["name"] for joint in shown["joints"]]
+    cycles = np.concatenate([part.cycles for part in open_log(log).slices()])
+    (curve,) = seen["curves"][0]
+    row = [joint["name"] for joint in shown["joints"]].index(JOINT)
+    assert np.allclose(curve["value"], cycles["position"][:, row], atol=1e-6)
+    assert np.allclose(curve["time"], (cycles["woken_ns"] - cycles["woken_ns"][0]) * 1e-9, atol=1e-6)
+    middle = served.look(time=5.0)["moment"]
+    place = shown["columns"].index(f"{JOINT}/goal_position")
+    at = int(np.searchsorted(curve["time"], middle["time"]))
+    assert middle["values"][place] == pytest.approx(cycles["goal_position"][at, row], abs=1e-6)
+    assert seen["events"]
+    assert served.ask("/urdf")[1].startswith(b"<?xml")
+
+
+def test_fields_of_topics_are_drawn(recorded: RecordedRobot, serve: Serve) -> None:
+    served = serve(recorded)
+    fields = served.look(shown=True)["shown"]["fields"]
+    assert "/imu/imu:orientation.w" in fields
+    spans = [{"names": ["/imu/imu:orientation.w", "/imu/imu:nothing", "nonsense"], "begin": 0, "end": 9}]
+    first, *others = served.look(spans=spans)["curves"][0]
+    assert len(first["value"]) > 100
+    assert [one["value"] for one in others] == [[], []]
+
+
+def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = RecordedRobot(log).shown()
+    monkeypatch.setattr(module, "MOST_CYCLES", 100)
+    thin = RecordedRobot(log)
+    shown = thin.shown()
+    assert shown.every in (4, 8)
+    assert shown.span == pytest.approx(whole.span, abs=0.2)
+    assert shown.marks == whole.marks
+    kept = thin.curve("loop/cycle", 0.0, 99.0, 4000).value
+    assert set(np.diff(np.array(kept, float))) == {float(shown.every)}
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
+    strange = tmp_path / "strange.mcap"
+    strange.write_bytes(b"no log")
+    with pytest.raises(LogError, match="strange"):
+        RecordedRobot(strange)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Host": "evil.example:80"}, 403),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"X_Dxlrun_Token": "wrong"}, 401),
+        ({"X_Dxlrun_Token": ""}, 401),
+        ({}, 200),
+    ],
+)
+def test_the_page_answers_itself_alone(
+    recorded: RecordedRobot, serve: Serve, headers: dict[str, str], status: int
+) -> None:
+    served = serve(recorded, control=True)
+    assert served.ask("/look", {}, **headers)[0] == status
+    assert served.ask("/urdf", None, **headers)[0] == status
+    answer = served.ask("/act", {"verb": "halt"}, **headers)
+    assert answer[0] == (409 if status == 200 else status)
+    own = served.ask("/look", {}, Origin=f"http://127.0.0.1:{served.port}", Host=f"localhost:{served.port}")
+    assert own[0] == 200
+
+
+@pytest.mark.parametrize("body", ["[]", '{"time": "x"}', '{"verb": 3}', "{" * 40, "x" * 100_000])
+def test_nonsense_is_refused_in_a_sentence(recorded: RecordedRobot, serve: Serve, body: str) -> None:
+    served = serve(recorded)
+    for path in ("/look", "/act"):
+        status, answer = served.ask(path, body)
+        assert status == 409
+        assert json.loads(answer)["refused"]
+
+
+def test_only_meshes_of_the_urdf_are_given_away(
+    recorded: RecordedRobot, serve: Serve, tmp_path: Path
+) -> None:
+    served = serve(recorded)
+    for name in ("/etc/passwd", "../../etc/passwd", "robot.yaml", "", "bioloid_torso.urdf"):
+        assert served.ask(f"/mesh?name={name}")[0] == 404
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/a.stl").write_bytes(b"solid")
+    (tmp_path / "robot").mkdir()
+    assert mesh_file(tmp_path, "meshes/a.stl") == tmp_path / "meshes/a.stl"
+    assert (
+        mesh_file(tmp_path / "robot", f"package://{tmp_path.name}/meshes/a.stl") == tmp_path / "meshes/a.stl"
+    )
+    assert mesh_file(tmp_path, "package://other/meshes/b.stl") is None
