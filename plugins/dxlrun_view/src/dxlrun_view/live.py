@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import cast
@@ -15,7 +15,9 @@ import numpy as np
 from dxlrun import DxlrunError, RemoteRobot, connect, running
 from dxlrun.channels.cycle import Torque
 from dxlrun.description.modes import Mode
-from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, columns_of
+from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
+from dxlrun.remote.live.states import RobotStates
+from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, Values, columns_of, numbers_in
 from dxlrun_view.shown import Controller, Happening, Joint, Shown
 
 PERIOD_S = 0.04
@@ -27,6 +29,8 @@ KEPT_S = 300.0
 AWAKE_S = 3.0
 """After so long without a question of a page the robot is left alone."""
 _MOST_EVENTS = 400
+NOT_DRAWN = (EVENT_TOPIC, JOINT_STATES_TOPIC, "/goals")
+"""Topics whose numbers are columns already, or none."""
 Row = Mapping[str, object]
 
 
@@ -39,7 +43,8 @@ class LiveRobot:
         self._name = name
         self._robot: RemoteRobot | None = None
         self._history = History((), 1)
-        self._topics: dict[str, tuple[float, History]] = {}
+        self._drawn: dict[str, DrawnTopic] = {}
+        self._fields: dict[str, tuple[str, ...]] = {}
         self._info: Row = {}
         self._imu = ("", "")
         self._events: deque[Happening] = deque(maxlen=_MOST_EVENTS)
@@ -84,6 +89,7 @@ class LiveRobot:
             ),
             controllers=tuple(map(controller_of, cast("list[Row]", info.get("controllers", [])))),
             span=self._history.span,
+            fields=tuple(name for names in self._fields.values() for name in names),
             imu=self._imu[0],
             imu_link=self._imu[1],
         )
@@ -96,8 +102,16 @@ class LiveRobot:
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
         """Return a part of a curve; raises KeyError for one that there is not."""
-        with self._lock:
-            return self._history.curve(name, begin, end, points)
+        topic, of_topic, _ = name.partition(":")
+        if not of_topic:
+            with self._lock:
+                return self._history.curve(name, begin, end, points)
+        if name not in self._fields.get(topic, ()):
+            raise KeyError(name)
+        drawn = self._drawn.get(topic)
+        if drawn is None or not drawn.alive:
+            drawn = self._drawn[topic] = DrawnTopic(topic, self.asking())
+        return drawn.curve(name, begin, end, points)
 
     def events(self, after: int) -> tuple[Happening, ...]:
         """Return the events behind this number."""
@@ -140,14 +154,14 @@ class LiveRobot:
             robot = self._robot
             info = robot.info()
             self._note_events(robot)
+            self._note_fields(robot)
         except DxlrunError as error:
             self._gone(str(error))
             return
         if not self._info or info.get("sources") != self._info.get("sources"):
-            joints = cast("list[str]", info["joints"])
             states = robot.states()
-            sources, references = (list(cast("Row", states[name])) for name in ("sources", "references"))
-            self._history = History(columns_of(joints, sources, references), round(KEPT_S / PERIOD_S))
+            columns = columns_of(states.joints, states.source_states, states.references)
+            self._history = History(columns, round(KEPT_S / PERIOD_S))
             tree = robot.frames() if robot.urdf() else None
             self._imu = (tree.imu, tree.imu_link) if tree is not None else ("", "")
         self._info, self._problem = info, ""
@@ -166,29 +180,20 @@ class LiveRobot:
             if getattr(error, "code", "") != "no_cycle":
                 self._gone(str(error))
             return
-        cycle = int(cast("int", states["cycle"]))
+        cycle = states.cycle
         if cycle == self._cycle:
             return
         if cycle < self._cycle:  # another run of the robot
             self._history = History(self._history.columns, round(KEPT_S / PERIOD_S))
         self._cycle = cycle
         with self._lock:
-            self._history.append(float(cast("float", states["time"])), self._row(states))
+            self._history.append(states.time_ns * 1e-9, self._row(states))
 
-    def _row(self, states: Row) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        values = np.full(len(self._history.columns), np.nan)
-        joints = cast("Mapping[str, Mapping[str, object]]", states["joints"])
-        values[0], values[1] = cast("float", states["cycle"]), cast("float", states["late"])
-        place = 2
-        for column in JOINT_COLUMNS:
-            for joint in joints.values():
-                values[place] = _number(column, joint.get(column))
-                place += 1
-        for kind in ("sources", "references"):
-            for value in cast("Mapping[str, float | None]", states[kind]).values():
-                values[place] = np.nan if value is None else value
-                place += 1
-        return values
+    def _row(self, states: RobotStates) -> Values:
+        """Return a cycle as a row of the columns."""
+        of_joints = [_numbers(column, getattr(states, column)) for column in JOINT_COLUMNS]
+        head = (float(states.cycle), states.late_ns * 1e-9)
+        return np.concatenate([head, *of_joints, states.source_state, states.reference])
 
     def _note_events(self, robot: RemoteRobot) -> None:
         found = robot.events(self._last_event)
@@ -203,6 +208,15 @@ class LiveRobot:
                     str(event["text"]),
                 )
             )
+
+    def _note_fields(self, robot: RemoteRobot) -> None:
+        """Note what can be drawn of the topics' messages, by the first message that each has."""
+        for topic in robot.topics():
+            if topic.name in self._fields or topic.name in NOT_DRAWN or not topic.count:
+                continue
+            message = robot.newest(topic.name)
+            if message is not None:
+                self._fields[topic.name] = tuple(numbers_in(message.message, f"{topic.name}:"))
 
     def _gone(self, why: str) -> None:
         self._problem = why
@@ -228,12 +242,43 @@ def controller_of(row: Row) -> Controller:
     )
 
 
-def _number(column: str, value: object) -> float:
-    """Return a value of a joint as the log's cycles have it."""
-    if value is None:
-        return np.nan
-    if column == "torque":
-        return float(Torque[str(value).upper()])
-    if column == "mode":
-        return float(Mode[str(value).upper()])
-    return float(cast("float", value))
+def _numbers(column: str, values: object) -> Values:
+    """Return the values of a column of the joints as the log's cycles have them."""
+    names = {"torque": Torque, "mode": Mode}.get(column)
+    if names is not None:
+        values = [names[str(name).upper()] for name in cast("Sequence[str]", values)]
+    return np.asarray(values, np.float64)
+
+
+class DrawnTopic:
+    """Numbers in the messages of one topic, listened to while a page draws one of them."""
+
+    def __init__(self, name: str, robot: RemoteRobot) -> None:
+        self.asked_s = time.monotonic()
+        self.history = History((), 1)
+        self._name, self._robot = name, robot
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """True while messages may come."""
+        return self._thread.is_alive()
+
+    def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
+        """Return a part of a curve; raises KeyError for one that there is not."""
+        self.asked_s = time.monotonic()
+        with self._lock:
+            return self.history.curve(name, begin, end, points)
+
+    def _listen(self) -> None:
+        with suppress(DxlrunError), self._robot as robot:
+            for message in robot.listen(self._name, rate=1 / PERIOD_S):
+                numbers = numbers_in(message.message, f"{self._name}:")
+                with self._lock:
+                    if tuple(numbers) != self.history.columns:
+                        self.history = History(tuple(numbers), round(KEPT_S / PERIOD_S))
+                    self.history.append(message.time_ns * 1e-9, np.array([*numbers.values()]))
+                if time.monotonic() - self.asked_s > AWAKE_S:
+                    return
