@@ -80,6 +80,7 @@ def test_all_of_the_page_fits_the_window(
     browser.open(serve(recorded).address, width, height, dark=dark)
     browser.until("window.looked > 3")
     assert browser.value("document.documentElement.scrollWidth") <= width
+    assert browser.value("(tab => tab.scrollWidth - tab.clientWidth)(document.querySelector('#joints'))") == 0
     assert browser.value("document.querySelector('footer').getBoundingClientRect().bottom") <= height
     ground = browser.value("getComputedStyle(document.documentElement).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) < 384) is dark

@@ -133,7 +133,7 @@ function buildButtons() {
   };
   if (motions.length) {
     const list = document.createElement("select");
-    list.append(new Option("play …", ""), ...motions.map((name) => new Option(name, name)));
+    list.append(new Option("play …", ""), ...motions.map((file) => new Option(file.replace(/^.*\/|\.ya?ml$/g, ""), file)));
     list.onchange = () => { if (list.value) act({ verb: "play", names: [list.value] }); list.value = ""; };
     $("buttons").append(list);
   }
@@ -156,8 +156,8 @@ function buildJoints() {
     const cells = heads.map(() => document.createElement("td"));
     const [name, reach, position, goal, load, heat, volts, torque] = cells;
     [load, heat, volts].forEach((cell) => { cell.className = "wide"; });
-    name.textContent = joint.name; name.className = "joint"; name.tabIndex = 0;
-    name.title = [joint.servo, "click: curve of position and goal"].filter(Boolean).join("; ");
+    name.textContent = joint.name.replace(/_joint$/, ""); name.className = "joint"; name.tabIndex = 0;
+    name.title = [joint.name, joint.servo, "click: curve of position and goal"].filter(Boolean).join("; ");
     name.onclick = () => { charts.toggle(`${joint.name}/position`); charts.toggle(`${joint.name}/goal_position`); };
     name.onkeydown = (event) => { if (event.key === "Enter") name.onclick(); };
     const lower = joint.lower ?? (joint.unit === "m" ? -0.1 : -Math.PI), upper = joint.upper ?? (joint.unit === "m" ? 0.1 : Math.PI);

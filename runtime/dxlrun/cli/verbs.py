@@ -58,6 +58,7 @@ _PACKAGES = {
         *("replay", "convert", "bench", "latency", "characterize", "experiment"),
         *("sweep", "identify"),
     ),
+    "dxlrun_view": ("view",),
 }
 """Verbs of this repository's packages, to name the package where it is not installed."""
 
@@ -99,3 +100,8 @@ def names() -> list[str]:
 def package_of(verb: str) -> str:
     """Return which package of this repository has a verb; empty: none has."""
     return next((package for package, verbs in _PACKAGES.items() if verb in verbs), "")
+
+
+def source_of(package: str) -> str:
+    """Return the folder that pip installs a package of this repository from: with the core, or its own."""
+    return "./plugins/dxlrun_view" if package == "dxlrun_view" else "."

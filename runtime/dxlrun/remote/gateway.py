@@ -232,6 +232,7 @@ class GatewayApp:
             "joints": [joint.name for joint in link.plan.loop.joints],
             "groups": link.plan.groups,
             "units": {joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints},
+            "limits": {one.name: (one.lower, one.upper) for one in link.plan.loop.joints if one.bounded},
             "effort_units": effort_units(link.plan),
             "controllers": [self._shown(one) for one in link.controllers.values()],
             "sources": link.plan.loop.sources,

@@ -48,6 +48,8 @@ def act(source: Source, action: Action) -> Done:
     """Do what a button asks. Raises DxlrunError with the reason when it cannot be done."""
     if not isinstance(source, LiveRobot):
         raise InputError("this is a log: nothing can be steered in it")
+    if action.verb == "play" and not set(action.names) <= {*source.shown().motions}:
+        raise InputError("only a motion beside the robot file is played from here")
     with source.asking() as robot:
         return _done(robot, action)
 

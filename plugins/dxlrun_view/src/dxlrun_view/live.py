@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import cast
@@ -15,6 +15,7 @@ import numpy as np
 from dxlrun import DxlrunError, RemoteRobot, connect, running
 from dxlrun.channels.cycle import Torque
 from dxlrun.description.modes import Mode
+from dxlrun.description.motion import read_motion
 from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
 from dxlrun.remote.live.states import RobotStates
 from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, Values, columns_of, numbers_in
@@ -47,6 +48,7 @@ class LiveRobot:
         self._fields: dict[str, tuple[str, ...]] = {}
         self._info: Row = {}
         self._imu = ("", "")
+        self._motions: tuple[str, ...] = ()
         self._events: deque[Happening] = deque(maxlen=_MOST_EVENTS)
         self._last_event = 0
         self._cycle = -1
@@ -62,6 +64,10 @@ class LiveRobot:
         """Leave the robot alone for good."""
         self._ended.set()
         self._thread.join()
+        if self._robot is not None:
+            self._robot.close()
+        for drawn in self._drawn.values():
+            drawn.close()
 
     # What the page asks for
 
@@ -90,6 +96,7 @@ class LiveRobot:
             controllers=tuple(map(controller_of, cast("list[Row]", info.get("controllers", [])))),
             span=self._history.span,
             fields=tuple(name for names in self._fields.values() for name in names),
+            motions=self._motions,
             imu=self._imu[0],
             imu_link=self._imu[1],
         )
@@ -162,6 +169,7 @@ class LiveRobot:
             states = robot.states()
             columns = columns_of(states.joints, states.source_states, states.references)
             self._history = History(columns, round(KEPT_S / PERIOD_S))
+            self._motions = tuple(_motions(info))
             tree = robot.frames() if robot.urdf() else None
             self._imu = (tree.imu, tree.imu_link) if tree is not None else ("", "")
         self._info, self._problem = info, ""
@@ -228,6 +236,17 @@ class LiveRobot:
         self._last_event = 0
 
 
+def _motions(info: Row) -> Iterator[str]:
+    """Yield the motion files beside the robot file that have no other controllers than this robot's."""
+    file, controllers = info.get("file"), cast("list[Row]", info["controllers"])
+    names = {str(row["name"]) for row in controllers}
+    for path in sorted(Path(str(file)).parent.glob("motions/*.yaml")) if file else ():
+        with suppress(DxlrunError, OSError):
+            read = read_motion(path, cast("Mapping[str, tuple[str, ...]]", info.get("groups", {})))
+            if {part.controller for part in read.motion.motions} <= names:
+                yield str(path)
+
+
 def controller_of(row: Row) -> Controller:
     """Return a controller as the page has it, from what a robot says of it."""
     return Controller(
@@ -265,6 +284,11 @@ class DrawnTopic:
     def alive(self) -> bool:
         """True while messages may come."""
         return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Listen no more; a topic that is silent lets go at its next message."""
+        self.asked_s = -AWAKE_S
+        self._thread.join(1.0)
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
         """Return a part of a curve; raises KeyError for one that there is not."""

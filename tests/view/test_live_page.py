@@ -1,0 +1,178 @@
+"""The page of a running robot: it follows, steers where it may, and stops; judged by the bus' ledger."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.view.served import Served
+
+from dxlrun import running
+from dxlrun.simulation.bus.ledger import read_ledger
+from dxlrun_view.live import LiveRobot
+
+Serve = Callable[..., Served]
+ROBOT = Path(__file__).resolve().parents[2] / "robots/bioloid_torso_imu.yaml"
+DEADLINE_S = 60.0
+JOINT, SERVO = "right_elbow_joint", 4
+SERVOS = {1, 2, 3, 4, 5, 6, 20, 21}
+TORQUE_ENABLE, GOAL_POSITION = 24, 30
+
+
+class Run:
+    """A torso in a process of its own."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self.ledger = place / "ledger.jsonl"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        code = "from dxlrun.cli import main; main()"
+        words = [str(ROBOT), "--no-record", "--ledger", str(self.ledger), "--duration", "300"]
+        with (self.place / "said").open("wb") as said:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", code, *words], cwd=self.place, stdout=said, stderr=said
+            )
+        until(lambda: bool(running()) or self.process is None or self.process.poll() is not None)
+        assert self.process.poll() is None, (self.place / "said").read_text()
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.terminate()
+            self.process.wait(DEADLINE_S)
+            self.process = None
+            self.ledger.unlink()
+
+    def written(self, address: int) -> dict[int, int]:
+        """Return what was last written at an address of each servo (Protocol 1.0: WRITE and SYNC WRITE)."""
+        found: dict[int, int] = {}
+        for entry in read_ledger(self.ledger):
+            data = entry.data
+            if entry.direction != "in" or len(data) < 7:
+                continue
+            if data[4] == 0x03 and data[5] == address:
+                found[data[2]] = int.from_bytes(data[6:-1], "little")
+            elif data[4] == 0x83 and data[5] <= address < data[5] + data[6]:
+                size, offset = data[6] + 1, address - data[5] + 1
+                rows = [data[at : at + size] for at in range(7, len(data) - 1, size)]
+                width = 2 if address == GOAL_POSITION else 1
+                found |= {row[0]: int.from_bytes(row[offset : offset + width], "little") for row in rows}
+        return found
+
+
+def until(condition: Callable[[], Any]) -> Any:
+    give_up = time.monotonic() + DEADLINE_S
+    while not (found := condition()):
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
+    return found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    one = Run(tmp_path_factory.mktemp("live"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(one.place))
+        one.start()
+        yield one
+        one.end()
+
+
+@pytest.fixture
+def live(run: Run) -> Iterator[LiveRobot]:
+    robot = LiveRobot("bioloid_torso_imu")
+    yield robot
+    robot.close()
+
+
+def column(served: Served, name: str) -> Any:
+    seen = served.look(shown=True)
+    values = seen["moment"]["values"]
+    return values[seen["shown"]["columns"].index(name)] if values else None
+
+
+def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:
+    served = serve(live)
+    first = until(lambda: column(served, "loop/cycle"))
+    assert until(lambda: (column(served, "loop/cycle") or 0) > first + 20)
+    shown = served.look(shown=True)["shown"]
+    assert shown["live"]
+    assert not shown["control"]
+    assert len(shown["joints"]) == 8
+    assert all(joint["lower"] < joint["upper"] for joint in shown["joints"])
+    assert any(path.endswith("three_parts.yaml") for path in shown["motions"])
+    assert not any(path.endswith("effort_arm_lift.yaml") for path in shown["motions"])
+    assert until(lambda: served.look(after=0)["events"])
+    begin, end = shown["span"]
+    field = "/imu/imu:orientation.w"
+    assert field in until(lambda: served.look(shown=True)["shown"]["fields"])
+    span = {"names": [field, "loop/cycle"], "begin": begin, "end": end + 60}
+    assert until(lambda: served.look(spans=[span])["curves"][0][0]["value"])
+
+
+def test_a_page_that_may_not_steer_only_stops(live: LiveRobot, serve: Serve, run: Run) -> None:
+    served = serve(live)
+    for verb in ("halt", "torque", "switch", "goal", "play", "pause", "resume", "set_parameter"):
+        status, answer = served.ask("/act", {"verb": verb, "names": [JOINT], "value": 0.2})
+        assert (status, b"--control" in answer) == (403, True)
+    assert served.ask("/act", {"verb": "parameters", "names": ["left_arm"]})[0] == 200
+    status, answer = served.ask("/act", {"verb": "stop"})
+    assert (status, b"limp" in answer) == (200, True)
+    until(lambda: {servo: run.written(TORQUE_ENABLE)[servo] for servo in SERVOS} == dict.fromkeys(SERVOS, 0))
+
+
+def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run: Run) -> None:
+    served = serve(live, control=True)
+    assert served.ask("/act", {"verb": "torque", "names": ["all"], "on": True})[0] == 200
+    arms = ["left_arm", "right_arm", "head"]
+    for name in arms:
+        served.ask("/act", {"verb": "switch", "names": [name], "on": True})
+    until(lambda: run.written(TORQUE_ENABLE)[SERVO] == 1)
+    before = run.written(GOAL_POSITION)[SERVO]
+    status, answer = served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 0.4})
+    assert (status, b"right_arm" in answer) == (200, True)
+    # 0.4 rad are 78 ticks of 1023 in 300 deg
+    until(lambda: abs(abs(run.written(GOAL_POSITION)[SERVO] - before) - 78) <= 2)
+    assert until(lambda: abs((column(served, f"{JOINT}/position") or 0.0) - 0.4) < 0.03)
+    status, answer = served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 9.0})
+    assert status == 409
+    assert served.ask("/act", {"verb": "play", "names": ["/etc/passwd"]})[0] == 409
+    assert served.ask("/act", {"verb": "switch", "names": ["right_arm"], "on": False})[0] == 200
+    rows = {row["name"]: row["active"] for row in until(lambda: fresh(served))["controllers"]}
+    assert rows["left_arm"]
+    assert not rows["right_arm"]
+    assert served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 0.0})[0] == 409
+    assert served.ask("/act", {"verb": "halt"})[0] == 200
+
+
+def fresh(served: Served) -> Any:
+    """Return what the page shows once the switch is seen."""
+    shown = served.look(shown=True)["shown"]
+    row = next(row for row in shown["controllers"] if row["name"] == "right_arm")
+    return None if row["active"] else shown
+
+
+def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Run) -> None:
+    served = serve(live)
+    until(lambda: column(served, "loop/cycle"))
+    run.end()
+    assert "bioloid_torso_imu" in until(lambda: served.look(shown=True)["shown"]["problem"])
+    assert served.ask("/act", {"verb": "stop"})[0] == 409
+    run.start()
+    until(lambda: not served.look(shown=True)["shown"]["problem"])
+    first = until(lambda: column(served, "loop/cycle"))
+    assert until(lambda: (column(served, "loop/cycle") or 0) > first)
+
+
+def test_a_robot_that_does_not_run_is_waited_for(run: Run) -> None:
+    robot = LiveRobot("nowhere")
+    shown = robot.shown()
+    robot.close()
+    assert "nowhere" in shown.problem
+    assert shown.columns == ()
