@@ -169,8 +169,8 @@ def known_file(robot: Path) -> None:
     if package := verbs.package_of(word):
         raise InputError(
             f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
-            f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` where dxlrun came from "
-            "installs it"
+            f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` "
+            "where dxlrun came from installs it"
         )
     known = verbs.names()
     hint = suggestion(
