@@ -61,8 +61,8 @@ def _done(robot: RemoteRobot, action: Action) -> Done:
         case "stop":
             return Done(stopped(robot))
         case "halt":
-            halted = robot.halt()
-            said = f"halted in {halted.seconds:.2f} s"
+            halted = robot.halt().halted
+            said = "halted" if halted is None else f"halted in {halted.seconds:.2f} s"
         case "torque":
             robot.torque(action.names, action.on, release=not action.on)
             said = f"torque {'on' if action.on else 'off'}: {', '.join(action.names)}"
