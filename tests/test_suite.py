@@ -85,7 +85,7 @@ def test_the_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
     with tarfile.open(archive) as tar:
         packed = {name.partition("/")[2] for name in tar.getnames()}
     found = (path for folder in SHIPPED for path in (ROOT / folder).rglob("*") if path.is_file())
-    made = {"__pycache__", "logs"}
+    made = {"__pycache__", "build", "logs"}
     # the kernel is compiled where the package is installed
     files = {path.relative_to(ROOT) for path in found if path.suffix != ".so" and not made & set(path.parts)}
     assert {str(path) for path in files} - packed == set()

@@ -11,12 +11,12 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-PAGE = "src/dxlrun_view/page"
+BUNDLE = "src/dxlrun_view/page/build"
 ESBUILD = "node_modules/esbuild/bin/esbuild"
 
 
 class Bundle(BuildHookInterface[Any]):
-    """Writes src/dxlrun_view/page/page.js and page.css."""
+    """Writes src/dxlrun_view/page/build/page.js and page.css."""
 
     PLUGIN_NAME = "custom"
 
@@ -25,12 +25,12 @@ class Bundle(BuildHookInterface[Any]):
         if self.target_name != "wheel":
             return
         root = Path(self.root)
-        made = [root / PAGE / name for name in ("page.js", "page.css")]
+        made = [root / BUNDLE / name for name in ("page.js", "page.css")]
         newest = max(path.stat().st_mtime for path in (root / "page").glob("*.*"))
         if all(path.exists() and path.stat().st_mtime > newest for path in made):
             return
         with tempfile.TemporaryDirectory() as place:
-            bundle(root / "page", Path(place), root / PAGE)
+            bundle(root / "page", Path(place), root / BUNDLE)
 
 
 def bundle(source: Path, place: Path, target: Path) -> None:
@@ -46,7 +46,7 @@ def bundle(source: Path, place: Path, target: Path) -> None:
             raise RuntimeError(
                 "npm could not fetch the libraries of page/package-lock.json; is there a network?"
             )
-        options = ["--bundle", "--minify", "--format=esm", "--target=es2020", "--legal-comments=none"]
+        options = ["--bundle", "--minify", "--format=esm", "--target=es2020", "--legal-comments=eof"]
         # esbuild's script runs its own binary by node; without its install script it finds it by its package
         if node([ESBUILD, "page.js", *options, f"--outdir={target}", "--log-level=warning"]):
             raise RuntimeError("esbuild could not bundle the page")

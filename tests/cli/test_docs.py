@@ -75,6 +75,7 @@ TESTS = {
     "sensors.md": ("tests/sensors/test_page.py",),
     "steering.md": ("tests/cli/test_steer.py",),
     "tools.md": ("tests/cli/test_docs.py",),
+    "view.md": ("tests/view/test_command.py",),
 }
 """What runs the commands of a page."""
 Dxlrun = Callable[..., Any]

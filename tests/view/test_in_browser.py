@@ -13,7 +13,7 @@ from tests.view.served import Served
 from dxlrun_view.recorded import RecordedRobot
 
 Serve = Callable[..., Served]
-BUNDLE = files("dxlrun_view").joinpath("page", "page.js")
+BUNDLE = files("dxlrun_view").joinpath("page", "build", "page.js")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium"),
     pytest.mark.skipif(
@@ -72,7 +72,7 @@ def test_a_log_plays_and_jumps(recorded: RecordedRobot, serve: Serve, browser: B
     assert errors(browser) == []
 
 
-@pytest.mark.parametrize("window", [(1440, 900, False), (390, 844, True)])
+@pytest.mark.parametrize("window", [(1440, 900, False), (1024, 700, False), (390, 844, True)])
 def test_all_of_the_page_fits_the_window(
     recorded: RecordedRobot, serve: Serve, browser: Browser, window: tuple[int, int, bool]
 ) -> None:

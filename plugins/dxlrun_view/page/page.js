@@ -149,13 +149,13 @@ const rows = new Map();
 function buildJoints() {
   const table = document.createElement("table");
   const heads = ["joint", "", "position", "goal", "load", "°C", "V", ""];
-  table.createTHead().insertRow().append(...heads.map((text, at) => Object.assign(document.createElement("th"), { textContent: text, className: [4, 5, 6].includes(at) ? "wide" : "" })));
+  table.createTHead().insertRow().append(...heads.map((text, at) => Object.assign(document.createElement("th"), { textContent: text, className: at === 4 ? "load" : [5, 6].includes(at) ? "wide" : "" })));
   const tbody = table.createTBody();
   rows.clear();
   for (const joint of page.shown.joints) {
     const cells = heads.map(() => document.createElement("td"));
     const [name, reach, position, goal, load, heat, volts, torque] = cells;
-    [load, heat, volts].forEach((cell) => { cell.className = "wide"; });
+    load.className = "load"; heat.className = volts.className = "wide";
     name.textContent = joint.name.replace(/_joint$/, ""); name.className = "joint"; name.tabIndex = 0;
     name.title = [joint.name, joint.servo, "click: curve of position and goal"].filter(Boolean).join("; ");
     name.onclick = () => { charts.toggle(`${joint.name}/position`); charts.toggle(`${joint.name}/goal_position`); };

@@ -38,7 +38,7 @@ MOST_POINTS = 4000
 MOST_CURVES = 64
 MOST_BYTES = 1 << 16
 """Of a request."""
-_TYPES = {"page.html": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+_TYPES = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 _SECURITY = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -129,9 +129,13 @@ class Page:
 
     async def page(self, request: Request) -> Response:
         """Return a file of the page; the address of the first has the token, which its script sends."""
-        name = request.url.path.strip("/") or "page.html"
-        text = files("dxlrun_view").joinpath("page", name).read_bytes()
-        return Response(text, media_type=_TYPES[name])
+        name = request.url.path.strip("/")
+        where = files("dxlrun_view").joinpath("page", *(("build", name) if name else ("page.html",)))
+        if not where.is_file():
+            return _refused(
+                404, "the page has no bundle: install it again, pip install ./plugins/dxlrun_view"
+            )
+        return Response(where.read_bytes(), media_type=_TYPES[name])
 
     async def look(self, request: Request) -> Response:
         """Return what the page draws."""

@@ -48,6 +48,8 @@ def view(
         Serve it on this address. On another one than 127.0.0.1 whoever has the page's address, with its
         token, sees the robot from the network.
     """
+    if port is not None and not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: a port is a number up to 65535")
     leave_real_time()
     from dxlrun_view.server import ANY, Page, hosts_of, listening, server_of
 
