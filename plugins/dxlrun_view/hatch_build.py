@@ -14,8 +14,6 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 BUNDLE = "src/dxlrun_view/page/build"
 ESBUILD = "node_modules/esbuild/bin/esbuild"
 
-BUNDLED = ("three", "uplot", "urdf-loader")
-
 
 class Bundle(BuildHookInterface[Any]):
     """Writes src/dxlrun_view/page/build/page.js and page.css."""
@@ -52,10 +50,9 @@ def bundle(source: Path, place: Path, target: Path) -> None:
         # esbuild's script runs its own binary by node; without its install script it finds it by its package
         if node([ESBUILD, "page.js", *options, f"--outdir={target}", "--log-level=warning"]):
             raise RuntimeError("esbuild could not bundle the page")
-        licenses = [place.joinpath("node_modules", name, "LICENSE") for name in BUNDLED]
-        (target / "licenses.txt").write_text(
-            "\n\n".join(f"{one.parent.name}\n\n{one.read_text()}" for one in licenses)
-        )
+        licenses = sorted(place.glob("node_modules/*/LICENSE*"))
+        texts = [f"{one.parent.name}\n\n{one.read_text()}" for one in licenses]
+        (target / "licenses.txt").write_text("\n\n".join(texts))
     except subprocess.SubprocessError as error:
         raise RuntimeError(f"the page's bundle could not be made: {error}") from error
     finally:
