@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import os
 import re
 import shutil
 import signal
@@ -26,6 +27,13 @@ def view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[View]:
     """Starts the command where no robot runs."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)
+    # as if the package was installed, which would fetch what its page is made of
+    installed = tmp_path / "dxlrun_view-0.1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Name: dxlrun-view\nVersion: 0.1.0\n")
+    (installed / "entry_points.txt").write_text("[dxlrun]\nview = dxlrun_view.plugin\n")
+    package = str(ROOT / "plugins/dxlrun_view/src")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((package, str(tmp_path))))
     started: list[subprocess.Popen[str]] = []
 
     def start(*words: str) -> subprocess.Popen[str]:
