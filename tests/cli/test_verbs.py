@@ -102,13 +102,17 @@ def test_a_package_takes_no_verb_of_the_core(install: Install, dxlrun: Dxlrun) -
     assert dxlrun("check", "--help").out.startswith("Usage: dxlrun check")
 
 
+@pytest.mark.parametrize(
+    ("verb", "package", "place"),
+    [("analyze", "dxlrun_analysis", "."), ("view", "dxlrun_view", "./plugins/dxlrun_view")],
+)
 def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
-    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, verb: str, package: str, place: str
 ) -> None:
     monkeypatch.setattr(verbs, "packaged", dict)
-    said = dxlrun("analyze", "run.mcap")
+    said = dxlrun(verb, "run.mcap")
     assert said.code == 2
     assert said.errors == [
-        "dxlrun: `dxlrun analyze` is a command of the package dxlrun_analysis, which cannot be imported "
-        "here; `dxlrun plugins` may say why, and `pip install .` where dxlrun came from installs it"
+        f"dxlrun: `dxlrun {verb}` is a command of the package {package}, which cannot be imported "
+        f"here; `dxlrun plugins` may say why, and `pip install {place}` where dxlrun came from installs it"
     ]
