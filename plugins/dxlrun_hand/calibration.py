@@ -1,0 +1,226 @@
+"""Calibration: the joints are limp, a hand brings them to zero and to both ends, their servos are read.
+
+s = direction * (theta - reference) * ratio, where theta is the angle of the servo and s the position of its
+joint (`description/joints/mechanics.py`): the zero pose gives the reference, the end that a person calls
+positive the direction, and the two ends the limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+
+from dxlrun.compile.joints.limits import degrees, position_text
+from dxlrun.compile.joints.servos import servo_travel
+from dxlrun.description.document import KeyPath
+from dxlrun.description.reading import Replacement
+from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.dynamixel.tools.one_servo import OneServo
+from dxlrun.dynamixel.tools.scanning import Search, find
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.errors import ServoFault
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun_hand.dialogue import Dialogue
+from dxlrun_hand.robot_text import RobotText
+
+LEAST_WAY = math.radians(5.0)
+"""Of the servo between both ends: less may be a hand that slipped."""
+_STEP_RAD, _STEP_M = math.radians(0.1), 1e-4
+"""To which limits are rounded, towards the inside: beyond them the joint is at its stop."""
+_READINGS = 5
+"""Of a joint at rest, whose middle one counts."""
+_SHIFTING = {
+    "drive_mode": (0x01, 0),
+    "homing_offset": (-1, 0),
+    "multi_turn_offset": (-1, 0),
+    "resolution_divider": (-1, 1),
+}
+"""Items that change what a position means: which bits of them, and their only value."""
+
+
+class Measured(msgspec.Struct, frozen=True):
+    """What was measured of a joint."""
+
+    joint: str
+    reference: float
+    """rad of the servo, from its raw 0"""
+    direction: int
+    limits: tuple[float, float] | None
+    """rad, or m of a linear joint; None: it turns without end."""
+    linear: bool
+    tick: float
+    """rad of the servo"""
+    ratio: float
+    """What the joint moves while its servo turns by 1 rad."""
+
+
+class BeyondTurn(ServoFault):
+    """A hand has turned a servo further than its positions count."""
+
+
+class HandJoint:
+    """A limp joint with one servo, which is read while a hand moves it."""
+
+    def __init__(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> None:
+        """Raises ServoFault where its servo does not answer, is another model, or counts otherwise."""
+        self.name, self.servo = servo.joint, servo
+        self._label = plan.label(servo)
+        search = Search((plan.protocol,), (plan.baud_rate,), (servo.servo_id,))
+        found = find(tool, servo.servo_id, search)
+        if not found:
+            raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s: check cable and power")
+        self._one = OneServo(tool, found[0])
+        self.table: ControlTable = self._one.table
+        if self.table.model_number != servo.model_number:
+            raise ServoFault(
+                f"{self._label} is an {self.table.model}, not an {servo.model}: correct the robot file, or set "
+                "the servos up with `dxlrun setup`"
+            )
+        names = [name for name in _SHIFTING if name in self.table.items]
+        for name, value in self._one.read(names).items():
+            bits, only = _SHIFTING[name]
+            if value & bits != only:
+                title = self.table.items[name].title
+                raise ServoFault(f"{self._label} has {title} = {value}, which shifts its angles: write {only}")
+        self._turn = round(math.tau / self.table.rad_per_tick)
+        self._raw = self._travelled = 0
+        self.limp = False
+        """True when its torque was switched off here."""
+
+    def let_go(self) -> None:
+        """Switch its torque off."""
+        self.limp = True
+        self._one.torque(False)
+
+    def begin(self) -> float:
+        """Count from here; return the angle of the servo, rad, within the turn that its goals are in."""
+        readings = sorted(self._read() for _ in range(_READINGS))
+        self._raw = readings[_READINGS // 2]
+        # one that counted turns, as a wheel, is in its first one when it is switched on again
+        self._travelled = self.table.min_tick + (self._raw - self.table.min_tick) % self._turn
+        return self._angle
+
+    def follow(self) -> float:
+        """Return the angle now, rad, counted on from the one before; raises ServoFault."""
+        raw = self._read()
+        step = raw - self._raw
+        if 2 * abs(step) > self._turn:  # its count begins again at the end of a turn
+            step -= round(step / self._turn) * self._turn
+        self._raw = raw
+        self._travelled += step
+        return self._angle
+
+    def check_turn(self, lowest: float, highest: float) -> None:
+        """Raise BeyondTurn where the servo left the angles that its goals reach; `lowest`, `highest`: rad."""
+        reach, tick = servo_travel(self.table), self.table.rad_per_tick
+        if not self.servo.continuous and (lowest < reach.lower - tick or highest > reach.upper + tick):
+            raise BeyondTurn(
+                f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
+                f"{degrees(reach.lower)} to {degrees(reach.upper)} deg: its servo was at {degrees(lowest)} to "
+                f"{degrees(highest)} deg. Bring it back; if the joint must go there, turn the servo's horn first."
+            )
+
+    @property
+    def _angle(self) -> float:
+        return self._travelled * self.table.rad_per_tick
+
+    def _read(self) -> int:
+        try:
+            return self._one.read(["present_position"])["present_position"]
+        except ServoFault:
+            raise ServoFault(f"{self._label} does not answer any more: check cable and power") from None
+
+
+def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
+    """Lead a person through the measurement of joints; their torque is off afterwards. Raises ServoFault."""
+    dialogue.ask("The torque goes off now: hold what could fall, and press Enter ")
+    for joint in joints:
+        joint.let_go()
+    names = ", ".join(joint.name for joint in joints)
+    dialogue.ask(f"Bring to the zero pose: {names}. Then press Enter ")
+    zeros = [joint.begin() for joint in joints]
+    return [_measure(joint, zero, dialogue) for joint, zero in zip(joints, zeros, strict=True)]
+
+
+def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
+    servo = joint.servo
+    while True:
+        try:
+            found = _ends(joint, dialogue)
+        except BeyondTurn as error:
+            dialogue.say(*error.sentences)
+            continue
+        positive, negative, lowest, highest = found
+        way = positive - (zero if servo.continuous else negative)
+        if abs(way) >= LEAST_WAY:
+            break
+        dialogue.say(f"{joint.name} moved by {degrees(abs(way))} deg only: move it further.")
+    direction = 1 if way > 0 else -1
+    limits = None
+    if not servo.continuous:
+        ends = [direction * (angle - zero) * servo.ratio for angle in (min(lowest, zero), max(highest, zero))]
+        limits = _inside(min(ends), max(ends), servo.linear)
+    return Measured(joint.name, zero, direction, limits, servo.linear, joint.table.rad_per_tick, servo.ratio)
+
+
+def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
+    """Return the servo's angle at the positive end, at the other one, the lowest and the highest, rad."""
+    begin = joint.begin()
+    seen = [begin, begin]
+    now = begin
+
+    def look() -> str:
+        nonlocal now
+        now = joint.follow()
+        seen[:] = min(seen[0], now), max(seen[1], now)
+        return f"  its servo is at {degrees(now)} deg, was at {degrees(seen[0])} to {degrees(seen[1])} deg"
+
+    way = "on in its positive direction" if joint.servo.continuous else "in its positive direction to the end"
+    dialogue.ask_while(f"Move {joint.name} {way}, and press Enter", look)
+    look()
+    joint.check_turn(*seen)
+    positive = now
+    if not joint.servo.continuous:
+        dialogue.ask_while(f"Move {joint.name} to its other end, and press Enter", look)
+        look()
+        joint.check_turn(*seen)
+    return positive, now, seen[0], seen[1]
+
+
+def _inside(lower: float, upper: float, linear: bool) -> tuple[float, float]:
+    step = _STEP_M if linear else _STEP_RAD
+    return math.ceil(lower / step - 1e-6) * step, math.floor(upper / step + 1e-6) * step
+
+
+# Into the robot file
+
+
+def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
+    """Return the keys that a calibration may change."""
+    place: KeyPath = ("joints", joint)
+    return [(*place, "reference"), (*place, "direction"), *([] if continuous else [(*place, "limits", "position")])]
+
+
+def replacements(text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured) -> list[Replacement]:
+    """Return what of a joint differs from the file by more than a tick; `limits`: those that it has."""
+    reference, direction, *position = keys_of(found.joint, continuous=servo.continuous)
+    changes: list[Replacement] = []
+    if abs(servo.reference - found.reference) > found.tick:
+        changes.append(Replacement(reference, _written(found.reference, False, text.unit(reference))))
+    if servo.direction != found.direction:
+        changes.append(Replacement(direction, found.direction))
+    if found.limits is not None:
+        step = found.tick * found.ratio + (_STEP_M if found.linear else _STEP_RAD)
+        if limits is None or any(abs(old - new) > step for old, new in zip(limits, found.limits, strict=True)):
+            unit = text.unit(position[0])
+            ends = [_written(end, found.linear, unit) for end in found.limits]
+            changes.append(Replacement(position[0], ends))
+    return changes
+
+
+def _written(value: float, linear: bool, unit: str) -> str:
+    if unit == "rad":
+        return f"{value + 0.0:.4f} rad"
+    return position_text(value, linear).removeprefix("+")

@@ -1,0 +1,116 @@
+"""`dxlrun calibrate`: reference, direction and limits of joints, measured by hand, into the robot file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Assignment, Flag, compiled, parse_assignments, read_models
+from dxlrun.errors import InputError
+
+if TYPE_CHECKING:
+    from dxlrun.compile.joints.joints import CompiledJoint
+    from dxlrun.compile.robot import Compiled
+    from dxlrun_hand.calibration import HandJoint
+    from dxlrun_hand.dialogue import Dialogue
+    from dxlrun_hand.lines import Opened
+
+Joints = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
+"""Names of joints or groups, one or several behind the option."""
+
+
+def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debug: Flag = False) -> int:
+    """Measure reference, direction and limits of joints by hand, and write them into the robot file.
+
+    A dialogue: the joints become limp, are brought to their zero pose, and each to both of its ends. What
+    changes in the file is shown first; all else in it stays as it is, comments too.
+
+    Parameters
+    ----------
+    robot
+        The robot file.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    joint
+        Only these joints, or the joints of these groups.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.dynamixel.tools.tool_line import TunablePort
+    from dxlrun_hand.dialogue import Terminal
+
+    result = compiled(robot, assignments, (), None, read_models)
+    return calibrated(robot, assignments, joint, result, Terminal("calibrate"), TunablePort)
+
+
+def calibrated(  # noqa: PLR0917  what the command was given, and its two ends to the world
+    robot: Path,
+    assignments: Sequence[str],
+    words: Sequence[str],
+    result: Compiled,
+    dialogue: Dialogue,
+    opened: Opened,
+) -> int:
+    """Do it; return the exit code. Raises InputError, PortError and ServoFault; the file is as it was then."""
+    from dxlrun.compile.robot import compile_files
+    from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
+    from dxlrun_hand.dialogue import yes
+    from dxlrun_hand.lines import ending_with, opened_lines
+    from dxlrun_hand.robot_text import RobotText
+
+    plan = result.plan
+    joints = _joints(result, words, dialogue)
+    text = RobotText(robot)
+    for name, one in joints.items():
+        for path in keys_of(name, continuous=one.plan.continuous):
+            text.check(path)
+    servos = {name: plan.servos_by_joint[name][0] for name in joints}
+    ports = {bus.name: bus.port for bus, _ in servos.values()}
+    with ending_with(lambda: f"{robot} is as it was"), opened_lines(ports, opened) as lines:
+        hands = [HandJoint(lines[bus.name], bus, servo) for bus, servo in servos.values()]
+        with ending_with(lambda: _limp(hands)):
+            found = measure(hands, dialogue)
+        changes = []
+        for each in found:
+            written = joints[each.joint].described.limits.position
+            limits = None if written is None else (float(written[0]), float(written[1]))
+            changes += replacements(text, servos[each.joint][1], limits, each)
+        if not changes:
+            dialogue.say(f"All is as {robot} has it; nothing is to be written.")
+            return 0
+        for change in changes:
+            text.put(change.path, change.value if isinstance(change.value, list) else str(change.value))
+        dialogue.say(*text.diff())
+        try:
+            compile_files(robot, parse_assignments(assignments), [], replacements=changes)
+        except InputError as error:
+            dialogue.say("With this the robot file is to be corrected by hand:", *error.sentences)
+        if not yes(dialogue, f"Write this into {robot}?"):
+            dialogue.say(f"{robot} is as it was.")
+            return 1
+        text.write()
+    dialogue.say(f"{robot} is written; the joints are limp. `dxlrun check {robot}` looks at all of it.")
+    return 0
+
+
+def _limp(hands: Sequence[HandJoint]) -> str:
+    names = ", ".join(hand.name for hand in hands if hand.limp)
+    return names and f"without torque now: {names}"
+
+
+def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:
+    """Return the chosen joints that have one servo each; raises InputError where none is left."""
+    from dxlrun_hand.lines import chosen_names
+
+    every = {one.plan.name: one for one in result.joints}
+    names = chosen_names(words, tuple(every), result.plan.groups)
+    left = {name: every[name] for name in names if every[name].coupling is None}
+    if others := [name for name in names if name not in left]:
+        verb = "is moved by several servos and is" if len(others) == 1 else "are moved by several servos and are"
+        dialogue.say(f"{', '.join(others)} {verb} left out: their references are yours to measure.")
+    if not left:
+        raise InputError("no joint is left to be calibrated; choose one with a servo of its own")
+    return left

@@ -1,0 +1,123 @@
+"""`dxlrun setup`: new servos get the IDs, rates and registers of a robot file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.cli.inputs import Assignment, Flag, known_file, parse_assignments
+from dxlrun.cli.tools.scan import load_models
+from dxlrun.errors import InputError
+from dxlrun_hand.commands.calibrate import Joints
+
+if TYPE_CHECKING:
+    from dxlrun.description.reading import Description
+    from dxlrun.plan.bus_plan import BusPlan
+    from dxlrun_hand.dialogue import Dialogue
+    from dxlrun_hand.lines import Opened
+    from dxlrun_hand.port_search import Devices
+    from dxlrun_hand.servo_setup import SetUp
+
+
+def setup(
+    robot: Path,
+    /,
+    *assignments: Assignment,
+    joint: Joints = (),
+    find_port: Flag = False,
+    debug: Flag = False,
+) -> int:
+    """Give new servos, one after the other, the ID, rate and registers of a robot file.
+
+    A dialogue: each servo is connected alone, and written to as the file has it; at the end all are connected,
+    read back and compared. A port that is not there is found by its adapter that is unplugged and plugged in.
+
+    Parameters
+    ----------
+    robot
+        The robot file.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    joint
+        Only the servos of these joints, or of the joints of these groups.
+    find_port
+        Find the port of each bus by unplugging its adapter, also where the file's is there.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.description.reading import read_robot
+    from dxlrun.dynamixel.port.serial_open import serial_devices
+    from dxlrun.dynamixel.tools.tool_line import TunablePort
+    from dxlrun_hand.dialogue import Terminal
+
+    known_file(robot)
+    load_models()
+    description = read_robot(robot, parse_assignments(assignments))
+    return set_up(description, joint, find_port, Terminal("setup"), TunablePort, serial_devices)
+
+
+def set_up(  # noqa: PLR0917  what the command was given, and its three ends to the world
+    description: Description,
+    words: Sequence[str],
+    search: bool,
+    dialogue: Dialogue,
+    opened: Opened,
+    devices: Devices,
+) -> int:
+    """Do it; return the exit code. Raises InputError, PortError."""
+    from dxlrun_hand.lines import chosen_names, ending_with, opened_lines
+    from dxlrun_hand.servo_setup import SetUp
+
+    task = SetUp(description, dialogue)
+    servos = {servo.own_name: servo for plan in task.plans for servo in plan.servos}
+    groups = {
+        **{
+            name: tuple(own for own in servos if own.partition("/")[0] in joints)
+            for name, joints in description.groups.items()
+        },
+        **{name: tuple(own for own in servos if own.startswith(f"{name}/")) for name in description.robot.joints},
+    }
+    chosen = chosen_names(words, tuple(servos), {name: found for name, found in groups.items() if found})
+    ports = {}
+    with ending_with(lambda: _left(task)):
+        for plan in task.plans:
+            if any(servo.own_name in chosen for servo in plan.servos):
+                ports[plan.name] = _port(plan, description.path, search, dialogue, devices)
+        with opened_lines(ports, opened) as lines:
+            task.connect_each(lines, chosen)
+            equal = task.compare_all(lines, chosen)
+    return 0 if equal else 1
+
+
+def _left(task: SetUp) -> str:
+    """Return how the servos are when the dialogue ends early."""
+    done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
+    if not task.changing:
+        return f"{done}; all others are as they were"
+    return f"{done}; the one for {task.changing} may have its new ID or rate already: set it up again"
+
+
+def _port(plan: BusPlan, robot: Path, search: bool, dialogue: Dialogue, devices: Devices) -> str:
+    """Return the port of a bus: that of the file where it is there, else the one that is plugged in."""
+    from dxlrun.description.bus import SIMULATED
+    from dxlrun_hand.dialogue import yes
+    from dxlrun_hand.port_search import find_port
+    from dxlrun_hand.robot_text import RobotText
+
+    if not search and (plan.port == SIMULATED or os.path.exists(plan.port)):
+        return plan.port
+    if not search:
+        dialogue.say(f"Bus {plan.name}: there is no {plan.port} now.")
+    found = find_port(plan.name, dialogue, devices)
+    text = RobotText(robot)
+    try:
+        text.put(("buses", plan.name, "port"), found)
+    except InputError:  # it comes from an argument
+        dialogue.say(f"Give it to other commands, as argument of the robot file: {found}")
+        return found
+    dialogue.say(*text.diff())
+    if yes(dialogue, f"Write this into {robot}?"):
+        text.write()
+    return found

@@ -1,0 +1,90 @@
+"""Dialogue: sentences and questions at the terminal, and what is measured until a person presses Enter."""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import sys
+import termios
+from collections.abc import Callable
+from typing import Protocol
+
+from dxlrun.errors import InputError
+
+LOOK_S = 0.02
+"""Between two looks while Enter is awaited."""
+
+
+class Dialogue(Protocol):
+    """What a task says and asks; the terminal, or a script in tests. Raises KeyboardInterrupt at Ctrl-C."""
+
+    def say(self, *lines: str) -> None:
+        """Print lines."""
+        ...
+
+    def ask(self, question: str) -> str:
+        """Return the line that a person types, without spaces around it; empty: Enter alone."""
+        ...
+
+    def ask_while(self, question: str, look: Callable[[], str]) -> str:
+        """Ask, and call `look` again and again until the answer comes; what it returns is shown live."""
+        ...
+
+
+def yes(dialogue: Dialogue, question: str) -> bool:
+    """Ask a question that only a clear yes agrees to."""
+    return dialogue.ask(f"{question} [y/N] ").lower() in ("y", "yes")
+
+
+class Terminal:
+    """The dialogue with a person; raises InputError where there is none."""
+
+    def __init__(self, verb: str) -> None:
+        self._input = sys.stdin.fileno() if sys.stdin.isatty() else -1
+        if self._input < 0 or not sys.stdout.isatty():
+            raise InputError(
+                f"`dxlrun {verb}` is a dialogue, and this is not a terminal; nothing was done: start it in one"
+            )
+        self._typed = b""
+
+    def say(self, *lines: str) -> None:
+        """Print lines."""
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
+        sys.stdout.flush()
+
+    def ask(self, question: str) -> str:
+        """Return the line that a person types; what was typed before the question does not count."""
+        self._begin(question)
+        while (line := self._line()) is None:
+            pass
+        return line
+
+    def ask_while(self, question: str, look: Callable[[], str]) -> str:
+        """Ask, and call `look` until the answer comes; its text is one line that changes."""
+        self._begin(f"{question}\n")
+        while (line := self._line(LOOK_S)) is None:
+            self._write(f"\r\x1b[K{look()[: shutil.get_terminal_size().columns - 1]}")
+        return line
+
+    def _begin(self, question: str) -> None:
+        self._typed = b""
+        termios.tcflush(self._input, termios.TCIFLUSH)
+        self._write(question)
+
+    def _write(self, text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+    def _line(self, timeout_s: float | None = None) -> str | None:
+        """Return the line that is complete, None where none is yet; the end of the input is as Ctrl-C."""
+        if select.select([self._input], [], [], timeout_s)[0]:
+            data = os.read(self._input, 4096)
+            if not data:
+                raise KeyboardInterrupt
+            self._typed += data
+        line, end, rest = self._typed.partition(b"\n")
+        if not end:
+            return None
+        self._typed = rest
+        return line.decode(errors="replace").strip()

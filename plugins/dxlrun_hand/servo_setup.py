@@ -1,0 +1,182 @@
+"""New servos, connected one after the other, get what a robot file has for them; at the end all is compared."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+from dxlrun.compile.joints.described_servos import described_servos
+from dxlrun.compile.joints.servos import AUTO
+from dxlrun.compile.robot import compile_robot
+from dxlrun.description.reading import Description
+from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
+from dxlrun.dynamixel.servo.checks import BusSurvey, inspect
+from dxlrun.dynamixel.servo.registers import compare
+from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
+from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.errors import ServoFault
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program
+from dxlrun_hand.dialogue import Dialogue, yes
+
+SKIP = ("s", "skip")
+Lines = Mapping[str, ToolLine]
+"""By bus."""
+
+
+class SetUp:
+    """Leads through the servos of a robot file; `done` has those that are as the file has them."""
+
+    def __init__(self, description: Description, dialogue: Dialogue) -> None:
+        self._description = description
+        self._dialogue = dialogue
+        self._unknown = {one.name for one in described_servos(description) if one.model == AUTO}
+        self._models: dict[str, str] = {}
+        self.plans: Sequence[BusPlan] = compile_robot(description, []).plan.buses
+        self.done: list[str] = []
+        self.changing = ""
+        """The servo that is being written to; empty: none is."""
+
+    def connect_each(self, lines: Lines, chosen: Collection[str]) -> None:
+        """Set up the chosen servos, each connected alone."""
+        for index, plan in enumerate(self.plans):
+            for servo in plan.servos:
+                if servo.own_name in chosen and self._set_up(lines[plan.name], index, servo.own_name):
+                    self.done.append(servo.own_name)
+
+    def compare_all(self, lines: Lines, chosen: Collection[str]) -> bool:
+        """Read the chosen servos of each bus back, all connected; return whether all are as in the file."""
+        for plan in self.plans:
+            servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
+            while servos:
+                self._dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
+                tool = lines[plan.name]
+                tool.speak(plan.protocol, plan.baud_rate)
+                problems = tool.run(extend_timeouts(_read_back(plan, servos)))
+                if not problems:
+                    count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
+                    self._dialogue.say(f"Bus {plan.name}: {count} as in the robot file.")
+                    break
+                self._dialogue.say(*problems)
+                if not yes(self._dialogue, "Look again?"):
+                    return False
+        return True
+
+    def _set_up(self, tool: ToolLine, index: int, name: str) -> bool:
+        """Set one servo up; False: the person skipped it."""
+        while True:
+            plan = self.plans[index]
+            servo = _named(plan, name)
+            model = "any model" if name in self._unknown else servo.model
+            typed = self._dialogue.ask(
+                f"Connect the servo for {name} ({model}) alone to bus {plan.name}, and press Enter (s: skip it) "
+            )
+            if typed.lower() in SKIP:
+                return False
+            try:
+                found = self._alone(tool, plan, servo)
+                if name in self._unknown:
+                    self._models[name] = found.model
+                    self.plans = compile_robot(self._description, [], models=self._models).plan.buses
+                    plan = self.plans[index]
+                self.changing = name
+                for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
+                    self._dialogue.say(f"  {name}: {sentence}")
+            except ServoFault as error:
+                self._dialogue.say(*error.sentences)
+                continue
+            self.changing = ""
+            return True
+
+    def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
+        """Return the only servo that answers; raises ServoFault where none does, several do, or another one."""
+        table = control_table(servo.model, plan.protocol)
+        rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
+        found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
+        if not found:
+            self._dialogue.say("  not at its usual rates; every other one is tried, which takes half a minute")
+            found = scan(tool).servos
+        if not found:
+            raise ServoFault(f"No servo answers at {tool.port.name}: check its power and its cable.")
+        one = found[0]
+        if len(found) > 1 or one.garbled:
+            shown = [f"ID {each.servo_id} at {each.baud_rate} bit/s" for each in found]
+            how = "garbled, as two servos of one ID do" if len(found) == 1 else "so nothing was changed"
+            what = "Several servos answer" if len(found) > 1 else "Not one servo answers"
+            raise ServoFault(f"{what} ({', '.join(shown)}), {how}: connect one alone.")
+        if one.protocol != plan.protocol:
+            raise ServoFault(
+                f"The servo speaks Protocol {one.protocol}, bus {plan.name} Protocol {plan.protocol}: connect "
+                "another one, or change its firmware by the maker's tool."
+            )
+        same = {each.model for each in models_by_number(one.model_number, plan.protocol, one.firmware)}
+        if one.device or not one.model or (servo.own_name not in self._unknown and servo.model not in same):
+            called = one.model or f"model number {one.model_number}"
+            wanted = "a servo" if servo.own_name in self._unknown else f"the {servo.model}"
+            raise ServoFault(
+                f"What answers is {called} (ID {one.servo_id}), not {wanted} that the robot file has for "
+                f"{servo.own_name}: connect that, or correct the file."
+            )
+        return one
+
+
+def factory_rate(table: ControlTable) -> int:
+    """Return the rate at which a model is shipped, bit/s."""
+    item = table.items.get("baud_rate") or table.items["baud_rate_bus"]
+    return table.baud_rates.get(item.initial or 0, next(iter(table.baud_rates.values())))
+
+
+def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
+    """Give a servo rate, ID and what its EEPROM shall hold; return what was done. Raises ServoFault."""
+    done: list[str] = []
+    if one.holds_torque():
+        done += one.torque(False)
+    if one.baud_rate != plan.baud_rate:
+        try:
+            done.append(change_rate(one, plan.baud_rate))
+        except LookupError as error:
+            raise ServoFault(f"{error}; correct the robot file") from None
+    if one.servo_id != servo.servo_id:
+        done.append(change_id(one, servo.servo_id))
+    done += one.write(stored(one.table, plan, servo))
+    return done or ["was as the robot file has it"]
+
+
+def stored(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
+    """Return what the EEPROM of a servo shall hold: its registers, and the return delay time of its bus.
+
+    Registers in the RAM are written by each run.
+    """
+    declared = [one for one in servo.registers if one.eeprom]
+    item = table.items.get("return_delay_time")
+    if item is not None and all(one.name != item.name for one in declared):
+        raw = round(plan.return_delay_ns / 2_000)
+        if item.minimum <= raw <= item.maximum:
+            declared.append(RegisterValue(item.address, item.size, raw, item.name, True))
+    return tuple(declared)
+
+
+def _named(plan: BusPlan, name: str) -> ServoPlan:
+    return next(servo for servo in plan.servos if servo.own_name == name)
+
+
+def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[list[str]]:
+    """Compare servos with the robot file as a start does, and all that setup has written."""
+    line, survey = setup_line(plan), BusSurvey()
+    for servo in servos:
+        reply = yield from retry(line.ping(servo.servo_id))
+        if not reply.answered:
+            how = "does not answer" if reply.outcome is Outcome.TIMEOUT else "answers garbled"
+            survey.problems.append(f"{plan.label(servo)} {how} at {plan.baud_rate} bit/s")
+            continue
+        if not (yield from inspect(plan, servo, line, survey, take_over=True)):
+            continue
+        table = control_table(servo.model, plan.protocol)
+        for one in (yield from compare(plan, servo, stored(table, plan, servo), line)):
+            if one.found != one.register.value:
+                title = table.items[one.register.name].title
+                survey.problems.append(
+                    f"{plan.label(servo)} has {title} = {one.found}, not {one.register.value}"
+                )
+    return survey.problems
