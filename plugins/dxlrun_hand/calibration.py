@@ -70,20 +70,24 @@ class HandJoint:
         search = Search((plan.protocol,), (plan.baud_rate,), (servo.servo_id,))
         found = find(tool, servo.servo_id, search)
         if not found:
-            raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s: check cable and power")
+            raise ServoFault(
+                f"{self._label} does not answer at {plan.baud_rate} bit/s: check cable and power"
+            )
         self._one = OneServo(tool, found[0])
         self.table: ControlTable = self._one.table
         if self.table.model_number != servo.model_number:
             raise ServoFault(
-                f"{self._label} is an {self.table.model}, not an {servo.model}: correct the robot file, or set "
-                "the servos up with `dxlrun setup`"
+                f"{self._label} is an {self.table.model}, not an {servo.model}: correct the robot "
+                "file, or set the servos up with `dxlrun setup`"
             )
         names = [name for name in _SHIFTING if name in self.table.items]
         for name, value in self._one.read(names).items():
             bits, only = _SHIFTING[name]
             if value & bits != only:
                 title = self.table.items[name].title
-                raise ServoFault(f"{self._label} has {title} = {value}, which shifts its angles: write {only}")
+                raise ServoFault(
+                    f"{self._label} has {title} = {value}, which shifts its angles: write {only}"
+                )
         self._turn = round(math.tau / self.table.rad_per_tick)
         self._raw = self._travelled = 0
         self.limp = False
@@ -118,8 +122,9 @@ class HandJoint:
         if not self.servo.continuous and (lowest < reach.lower - tick or highest > reach.upper + tick):
             raise BeyondTurn(
                 f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
-                f"{degrees(reach.lower)} to {degrees(reach.upper)} deg: its servo was at {degrees(lowest)} to "
-                f"{degrees(highest)} deg. Bring it back; if the joint must go there, turn the servo's horn first."
+                f"{degrees(reach.lower)} to {degrees(reach.upper)} deg: its servo was at {degrees(lowest)} "
+                f"to {degrees(highest)} deg. Bring it back; if the joint must go there, turn the servo's "
+                "horn first."
             )
 
     @property
@@ -200,10 +205,16 @@ def _inside(lower: float, upper: float, linear: bool) -> tuple[float, float]:
 def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
     """Return the keys that a calibration may change."""
     place: KeyPath = ("joints", joint)
-    return [(*place, "reference"), (*place, "direction"), *([] if continuous else [(*place, "limits", "position")])]
+    return [
+        (*place, "reference"),
+        (*place, "direction"),
+        *([] if continuous else [(*place, "limits", "position")]),
+    ]
 
 
-def replacements(text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured) -> list[Replacement]:
+def replacements(
+    text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured
+) -> list[Replacement]:
     """Return what of a joint differs from the file by more than a tick; `limits`: those that it has."""
     reference, direction, *position = keys_of(found.joint, continuous=servo.continuous)
     changes: list[Replacement] = []
@@ -213,7 +224,9 @@ def replacements(text: RobotText, servo: ServoPlan, limits: tuple[float, float] 
         changes.append(Replacement(direction, found.direction))
     if found.limits is not None:
         step = found.tick * found.ratio + (_STEP_M if found.linear else _STEP_RAD)
-        if limits is None or any(abs(old - new) > step for old, new in zip(limits, found.limits, strict=True)):
+        if limits is None or any(
+            abs(old - new) > step for old, new in zip(limits, found.limits, strict=True)
+        ):
             unit = text.unit(position[0])
             ends = [_written(end, found.linear, unit) for end in found.limits]
             changes.append(Replacement(position[0], ends))

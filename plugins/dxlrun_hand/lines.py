@@ -21,13 +21,15 @@ def opened_lines(ports: Mapping[str, str], opened: Opened = TunablePort) -> Iter
         if port == SIMULATED:
             raise InputError(
                 f"bus {bus} is simulated, and has no port where servos could be: give one, such as "
-                "port:=/dev/ttyUSB0; `dxlrun sim ROBOT.yaml --link /tmp/line` has simulated servos at /tmp/line"
+                "port:=/dev/ttyUSB0; `dxlrun sim ROBOT.yaml --link /tmp/line` has simulated ones at /tmp/line"
             )
     with ExitStack() as stack:
         yield {bus: ToolLine(stack.enter_context(opened(port))) for bus, port in ports.items()}
 
 
-def chosen_names(words: Sequence[str], known: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
+def chosen_names(
+    words: Sequence[str], known: Sequence[str], groups: Mapping[str, Sequence[str]]
+) -> list[str]:
     """Return the names that are meant by words, groups among them; all without a word. Raises InputError."""
     wrong = [word for word in words if word not in known and word not in groups]
     if wrong:

@@ -33,7 +33,9 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices = serial_devices) -
             if adapters
             else "No adapter appeared: was it unplugged before the first Enter, and is it plugged in now?"
         )
-    raise PortError(f"the adapter of bus {bus} was not found; `dxlrun doctor` lists those that are plugged in")
+    raise PortError(
+        f"the adapter of bus {bus} was not found; `dxlrun doctor` lists those that are plugged in"
+    )
 
 
 def _new(others: set[str], devices: Devices) -> list[str]:

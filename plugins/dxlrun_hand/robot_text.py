@@ -62,7 +62,7 @@ class RobotText:
         self.check(path)
         source, at, node = self._own(path)
         edits = self._edits[source.path]
-        if at != path:
+        if at != path and isinstance(node, yaml.MappingNode):
             edits.append(_inserted(source.text, node, path[len(at) :], _flow(value)))
         elif not isinstance(value, str) and isinstance(node, yaml.SequenceNode):
             edits += [_replaced(item, text) for item, text in zip(node.value, value, strict=True)]
@@ -78,21 +78,15 @@ class RobotText:
 
     def diff(self) -> list[str]:
         """Return the lines that change, as `diff -u` shows them."""
-        return [
-            line
-            for path, edits in self._edits.items()
-            if edits
-            for line in difflib.unified_diff(
-                *(self._text(data).splitlines() for data in (self._before[path], self._after(path))),
-                f"{path} as it is",
-                f"{path} as it will be",
-                lineterm="",
-                n=1,
-            )
-        ]
+        lines: list[str] = []
+        for path in [path for path, edits in self._edits.items() if edits]:
+            old, new = (data.decode().splitlines() for data in (self._before[path], self._after(path)))
+            names = f"{path} as it is", f"{path} as it will be"
+            lines += difflib.unified_diff(old, new, *names, lineterm="", n=1)
+        return lines
 
     def write(self) -> None:
-        """Write what was planned; each file appears whole. Raises InputError where one was changed meanwhile."""
+        """Write what was planned; each file appears whole. Raises InputError where one was changed."""
         changed = {path.resolve(): path for path, edits in self._edits.items() if edits}
         for place, path in changed.items():
             if place.read_bytes() != self._before[path]:
@@ -112,15 +106,11 @@ class RobotText:
 
     def _after(self, path: Path) -> bytes:
         data = self._before[path]
-        text, mark = self._text(data), codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
+        text, mark = data.decode("utf-8-sig"), codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
         # from the end, so that places stay; of two at one place the later is written first
         for edit in sorted(self._edits[path], key=lambda one: one.start)[::-1]:
             text = text[: edit.start] + edit.text + text[edit.end :]
         return mark + text.encode()
-
-    @staticmethod
-    def _text(data: bytes) -> str:
-        return data.decode("utf-8-sig")
 
     def _own(self, path: KeyPath) -> tuple[Source, KeyPath, yaml.Node]:
         """Return the file that has a value, or else the most of the way to it, with the node there."""
@@ -159,7 +149,7 @@ def _replaced(node: yaml.Node, text: str) -> _Edit:
     return _Edit(node.start_mark.index, node.end_mark.index, text)
 
 
-def _inserted(text: str, node: yaml.Node, keys: KeyPath, value: str) -> _Edit:
+def _inserted(text: str, node: yaml.CollectionNode, keys: KeyPath, value: str) -> _Edit:
     """Return the edit that gives a mapping another key, behind those that it has."""
     entry = f"{keys[0]}: " + "".join(f"{{{key}: " for key in keys[1:]) + value + "}" * (len(keys) - 1)
     here = [child for name, child in node.value if child.start_mark.index > name.start_mark.index]  # no alias

@@ -1,4 +1,4 @@
-"""New servos, connected one after the other, get what a robot file has for them; at the end all is compared."""
+"""New servos, connected one after the other, get what a robot file has for them; then all is compared."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ class SetUp:
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
-                self._dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
+                self._dialogue.ask(
+                    f"Connect all servos of bus {plan.name} with their power, and press Enter "
+                )
                 tool = lines[plan.name]
                 tool.speak(plan.protocol, plan.baud_rate)
                 problems = tool.run(extend_timeouts(_read_back(plan, servos)))
@@ -70,7 +72,8 @@ class SetUp:
             servo = _named(plan, name)
             model = "any model" if name in self._unknown else servo.model
             typed = self._dialogue.ask(
-                f"Connect the servo for {name} ({model}) alone to bus {plan.name}, and press Enter (s: skip it) "
+                f"Connect the servo for {name} ({model}) alone to bus {plan.name}, and press Enter "
+                "(s: skip it) "
             )
             if typed.lower() in SKIP:
                 return False
@@ -90,12 +93,14 @@ class SetUp:
             return True
 
     def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
-        """Return the only servo that answers; raises ServoFault where none does, several do, or another one."""
+        """Return the only servo that answers; raises ServoFault where none or several do, or another."""
         table = control_table(servo.model, plan.protocol)
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
         if not found:
-            self._dialogue.say("  not at its usual rates; every other one is tried, which takes half a minute")
+            self._dialogue.say(
+                "  not at its usual rates; every other one is tried, which takes half a minute"
+            )
             found = scan(tool).servos
         if not found:
             raise ServoFault(f"No servo answers at {tool.port.name}: check its power and its cable.")
@@ -107,8 +112,8 @@ class SetUp:
             raise ServoFault(f"{what} ({', '.join(shown)}), {how}: connect one alone.")
         if one.protocol != plan.protocol:
             raise ServoFault(
-                f"The servo speaks Protocol {one.protocol}, bus {plan.name} Protocol {plan.protocol}: connect "
-                "another one, or change its firmware by the maker's tool."
+                f"The servo speaks Protocol {one.protocol}, bus {plan.name} Protocol {plan.protocol}: "
+                "connect another one, or change its firmware by the maker's tool."
             )
         same = {each.model for each in models_by_number(one.model_number, plan.protocol, one.firmware)}
         if one.device or not one.model or (servo.own_name not in self._unknown and servo.model not in same):

@@ -1,4 +1,4 @@
-"""Hands: a scripted person who answers dialogues, and servos on virtual time that are connected and turned."""
+"""Hands: a scripted person who answers dialogues, and servos on virtual time that it connects and turns."""
 
 from __future__ import annotations
 

@@ -45,17 +45,22 @@ class _Part(msgspec.Struct, frozen=True):
     """It takes a speed beside each single position."""
 
 
-def motion_file(
-    motion: RecordedMotion, allowed: Floats, target: Path, controller: str | None, origin: str
+def motion_file(  # noqa: PLR0917  a motion, and all that is to be said of its file
+    motion: RecordedMotion,
+    allowed: Floats,
+    target: Path,
+    controller: str | None,
+    origin: str,
+    plans: Sequence[ControllerPlan] | None = None,
 ) -> MotionFile:
     """Return the file for a recorded motion, within `allowed` of it, rad, shape (joints,).
 
     `origin` is the comment at its beginning.
 
     Its parts are for the controllers that moved the joints in the log, or for `controller`, which has to take
-    trajectories. Raises InputError where no controller is known.
+    trajectories, or for those among `plans` that are active. Raises InputError where no controller is known.
     """
-    parts = [_Part(controller, motion.joints, True)] if controller else _parts(motion)
+    parts = [_Part(controller, motion.joints, True)] if controller else _parts(motion, plans)
     name = re.sub(r"\W", "_", target.stem, flags=re.ASCII).strip("_") or "motion"
     name = name if name[0].isalpha() else f"motion_{name}"
     lines = [f"# {line}" for line in origin.split("\n")]
@@ -110,17 +115,28 @@ def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, l
     )
 
 
-def _parts(motion: RecordedMotion) -> list[_Part]:
-    """Return a part for each controller that moved some of the joints, by the plan of the log."""
+def player_of(joint: str, plans: Sequence[ControllerPlan]) -> str | None:
+    """Return the controller that a motion of a joint is for: an active one, of several one that takes
+    trajectories."""
+    part = _part_of(joint, plans)
+    return None if part is None else part.controller
+
+
+def _plans_of(motion: RecordedMotion) -> Sequence[ControllerPlan]:
     if motion.plan is None:
         raise InputError(
             f"{motion.path}: a foreign recording does not say which controllers are to play it; name one "
             "that takes trajectories by --controller"
         )
     try:
-        plans = from_json(motion.plan).loop.controllers
+        return from_json(motion.plan).loop.controllers
     except ValueError as error:
         raise LogError(f"{motion.path}: its plan cannot be read: {error}") from error
+
+
+def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> list[_Part]:
+    """Return a part for each controller that moved some of the joints, by the plan of the log."""
+    plans = _plans_of(motion) if plans is None else plans
     parts: dict[str, _Part] = {}
     missing = []
     for joint in motion.joints:

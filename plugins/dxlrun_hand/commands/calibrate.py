@@ -54,7 +54,7 @@ def calibrated(  # noqa: PLR0917  what the command was given, and its two ends t
     dialogue: Dialogue,
     opened: Opened,
 ) -> int:
-    """Do it; return the exit code. Raises InputError, PortError and ServoFault; the file is as it was then."""
+    """Do it; return the exit code. Where it raises an error, the file is as it was."""
     from dxlrun.compile.robot import compile_files
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import yes
@@ -109,7 +109,9 @@ def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[
     names = chosen_names(words, tuple(every), result.plan.groups)
     left = {name: every[name] for name in names if every[name].coupling is None}
     if others := [name for name in names if name not in left]:
-        verb = "is moved by several servos and is" if len(others) == 1 else "are moved by several servos and are"
+        verb = (
+            "is moved by several servos and is" if len(others) == 1 else "are moved by several servos and are"
+        )
         dialogue.say(f"{', '.join(others)} {verb} left out: their references are yours to measure.")
     if not left:
         raise InputError("no joint is left to be calibrated; choose one with a servo of its own")

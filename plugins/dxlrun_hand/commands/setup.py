@@ -31,8 +31,9 @@ def setup(
 ) -> int:
     """Give new servos, one after the other, the ID, rate and registers of a robot file.
 
-    A dialogue: each servo is connected alone, and written to as the file has it; at the end all are connected,
-    read back and compared. A port that is not there is found by its adapter that is unplugged and plugged in.
+    A dialogue: each servo is connected alone, and written to as the file has it; at the end all are
+    connected, read back and compared. A port that is not there is found by its adapter that is unplugged and
+    plugged in.
 
     Parameters
     ----------
@@ -77,7 +78,10 @@ def set_up(  # noqa: PLR0917  what the command was given, and its three ends to 
             name: tuple(own for own in servos if own.partition("/")[0] in joints)
             for name, joints in description.groups.items()
         },
-        **{name: tuple(own for own in servos if own.startswith(f"{name}/")) for name in description.robot.joints},
+        **{
+            name: tuple(own for own in servos if own.startswith(f"{name}/"))
+            for name in description.robot.joints
+        },
     }
     chosen = chosen_names(words, tuple(servos), {name: found for name, found in groups.items() if found})
     ports = {}

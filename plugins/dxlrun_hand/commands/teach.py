@@ -1,0 +1,55 @@
+"""`dxlrun teach`: a motion that is shown to a running robot by hand, as a motion file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
+from dxlrun.errors import InputError
+
+Joints = Annotated[str, Parameter(name="joint", show_default=False)]
+"""Names of joints, groups or controllers."""
+
+
+def teach(
+    motion: Annotated[Path, Parameter(name="motion")],
+    /,
+    *joints: Joints,
+    speed: str = "30 deg/s",
+    chosen: Chosen = ONLY_ONE,
+) -> int:
+    """Show a running robot a motion by hand, and save it as a motion file.
+
+    A dialogue: joints become limp, Enter takes each pose, or a motion is recorded as it is shown; standstill
+    at its ends is cut off, trembling is smoothed. It is played back with a soft start, now or by
+    `dxlrun play MOTION.yaml`.
+
+    Parameters
+    ----------
+    motion
+        The new motion file, whose name ends in .yaml.
+    joints
+        Joints that become limp; the name of a group or controller means its joints. Without any: all that an
+        active controller plays motions for.
+    speed
+        How fast joints go from one pose to the next.
+    """
+    from dxlrun.description.units import angular_velocity
+    from dxlrun.log.target import check_new
+    from dxlrun_hand.dialogue import Terminal
+    from dxlrun_hand.teaching import taught
+
+    if motion.suffix not in (".yaml", ".yml"):
+        raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
+    check_new(motion)
+    try:
+        way_speed = angular_velocity(speed)
+    except ValueError as error:
+        raise InputError(f"--speed: {error}") from None
+    if way_speed <= 0:
+        raise InputError(f"--speed {speed}: write a speed above 0, such as 30 deg/s")
+    with robot_of(chosen, "teach") as robot:
+        return taught(robot, Terminal("teach"), joints, motion, way_speed)

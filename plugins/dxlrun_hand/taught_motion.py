@@ -1,0 +1,122 @@
+"""What was shown by hand as one motion: without standstill and trembling, slow enough for the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun_analysis.playback.motion_file import motion_file
+from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion, What
+from dxlrun_analysis.playback.spline_path import PINION_M, fit, tolerances
+
+MOVED_RAD = np.radians(1.0)
+"""A joint that is nearer to where it was stands still; a linear one by what a pinion of `PINION_M` moves."""
+REST_S = 0.2
+"""Of standstill that is left at both ends, so that a motion begins and ends at rest."""
+WINDOW_S = 0.2
+"""Over which positions are averaged: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
+tremor", Neurology 36, 1986)."""
+LEAST_WAY_S = 0.5
+_STEP_S = 0.01
+_SPARE = 0.9
+"""Part of a joint's highest speed that a motion uses."""
+
+
+class Shown(msgspec.Struct, frozen=True, eq=False):
+    """What was shown at once: a pose, or a motion."""
+
+    time_s: Floats
+    """Shape (moments,), from 0; one moment is a pose."""
+    position: Floats
+    """Shape (moments, joints), rad or m."""
+
+
+class Taught(msgspec.Struct, frozen=True):
+    """The joints that were shown, and how they may move."""
+
+    joints: tuple[str, ...]
+    linear: tuple[bool, ...]
+    lower: Floats
+    """rad or m, of each joint; infinite without a limit, as `upper` and `speed`"""
+    upper: Floats
+    speed: Floats
+    way_speed: float
+    """rad/s from one pose to the next"""
+
+    @property
+    def size(self) -> Floats:
+        """How much of each joint is as much as 1 rad of one that turns."""
+        return np.where(self.linear, PINION_M, 1.0)
+
+    def trimmed(self, shown: Shown) -> Shown:
+        """Return a motion without the standstill at both ends; one that stands still throughout is a pose."""
+        time, position = shown.time_s, shown.position
+        still = MOVED_RAD * self.size
+        begun = np.flatnonzero((np.abs(position - position[0]) > still).any(axis=1))
+        if not len(begun):
+            return Shown(np.zeros(1), position[-1:])
+        left = np.flatnonzero((np.abs(position - position[-1]) > still).any(axis=1))
+        kept = (time >= time[begun[0]] - REST_S) & (time <= time[left[-1]] + REST_S)
+        return Shown(time[kept] - time[kept][0], position[kept])
+
+    def smoothed(self, shown: Shown) -> Shown:
+        """Return a motion at equal steps, averaged over a window that is highest in its middle (Hann)."""
+        count = round(float(shown.time_s[-1]) / _STEP_S) + 1
+        if count < 3:
+            return Shown(np.zeros(1), shown.position[-1:])
+        time = np.arange(count, dtype=np.float64) * _STEP_S
+        half = round(WINDOW_S / _STEP_S / 2)
+        weights = np.hanning(2 * half + 3)[1:-1]
+        weights /= weights.sum()
+        columns = [
+            np.convolve(
+                np.pad(np.interp(time, shown.time_s, column), half, mode="edge"), weights, mode="valid"
+            )
+            for column in shown.position.T
+        ]
+        return Shown(time, np.array(columns, np.float64).T)
+
+    def joined(self, parts: Sequence[Shown], path: Path) -> RecordedMotion:
+        """Return all that was shown as one motion within the limits, with a way between two parts."""
+        times, positions = [0.0], [self._within(parts[0].position[0])]
+        for part in parts:
+            begin = times[-1] + (
+                self._way_s(positions[-1], part.position[0]) if part is not parts[0] else REST_S
+            )
+            times += (begin + part.time_s).tolist()
+            positions += list(self._within(part.position))
+        times.append(times[-1] + REST_S)
+        positions.append(positions[-1])
+        states: list[What] = ["states" for _ in self.joints]
+        return RecordedMotion(
+            path, self.joints, tuple(states), np.array(times), np.array(positions), 0.0, self.linear
+        )
+
+    def slowed(self, motion: RecordedMotion) -> tuple[RecordedMotion, float]:
+        """Return a motion that no joint is too slow for, and how many times longer it takes."""
+        fastest = np.abs(fit(motion, tolerances(motion, None)).velocity).max(axis=0)
+        longer = max(1.0, float((fastest / (_SPARE * self.speed)).max()))
+        return replace(motion, time_s=motion.time_s * longer), longer
+
+    def beyond(self, parts: Sequence[Shown]) -> list[str]:
+        """Return the joints that were shown where they may not be."""
+        positions, slack = np.concatenate([part.position for part in parts]), MOVED_RAD * self.size
+        out = ((positions < self.lower - slack) | (positions > self.upper + slack)).any(axis=0)
+        return [joint for joint, is_out in zip(self.joints, out, strict=True) if is_out]
+
+    def _within(self, position: Floats) -> Floats:
+        return np.clip(position, self.lower, self.upper)
+
+    def _way_s(self, begin: Floats, end: Floats) -> float:
+        speed = np.minimum(self.way_speed * self.size, _SPARE * self.speed)
+        return max(LEAST_WAY_S, float((np.abs(end - begin) / speed).max()))
+
+
+def text_of(motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
+    """Return the motion file for the controllers among `plans` that are active."""
+    return motion_file(motion, tolerances(motion, None), motion.path, None, origin, plans).text

@@ -1,0 +1,241 @@
+"""Teaching: joints of a running robot are limp, a hand shows poses and motions, the robot plays them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from dxlrun import GoalState, RemoteRobot
+from dxlrun.cli.steering.goals import cancelled, sentence
+from dxlrun.errors import InputError, Refused, ServoFault, suggestion
+from dxlrun.log.target import new_target
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun_analysis.playback.motion_file import player_of
+from dxlrun_hand.dialogue import Dialogue, yes
+from dxlrun_hand.taught_motion import Shown, Taught, text_of
+
+LONGEST_AGE_S = 1.0
+"""A joint whose newest position is older does not answer."""
+HELP = "Enter: take this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
+
+
+class Teaching:
+    """One motion that is taught to a robot."""
+
+    def __init__(
+        self, robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], way_speed: float
+    ) -> None:
+        """`words`: joints, groups and controllers that become limp; all without. Raises InputError."""
+        self._robot, self._dialogue = robot, dialogue
+        info = cast("Mapping[str, Any]", robot.info())
+        self._groups = _groups(info)
+        wrong = [word for word in words if word not in self._groups]
+        if wrong:
+            names = [f"{robot.name} has no joint {word}; {suggestion(word, self._groups)}" for word in wrong]
+            raise InputError("\n".join(names))
+        asked = {joint for word in words or ("all",) for joint in self._groups[word]}
+        self._plans = tuple(map(_plan, info["controllers"]))
+        players = {joint: player_of(joint, self._plans) for joint in info["joints"] if joint in asked}
+        if lacking := [joint for joint, player in players.items() if player is None]:
+            if words:
+                raise InputError(
+                    f"no active controller of {robot.name} takes motions for {', '.join(lacking)}; activate "
+                    "one by `dxlrun switch`, or name other joints"
+                )
+            asked.difference_update(lacking)
+        if not asked:
+            raise InputError(f"no active controller of {robot.name} takes motions; `dxlrun list` shows them")
+        moved = {joint for plan in self._plans if plan.name in players.values() for joint in plan.joints}
+        joints = tuple(joint for joint in info["joints"] if joint in moved)
+        ends = [info["limits"][joint] for joint in joints]
+        self._asked = [joint for joint in joints if joint in asked]
+        self._taught = Taught(
+            joints,
+            tuple(info["units"][joint] == "m" for joint in joints),
+            np.array([-math.inf if lower is None else lower for lower, _ in ends]),
+            np.array([math.inf if upper is None else upper for _, upper in ends]),
+            np.array([info["speeds"][joint] or math.inf for joint in joints]),
+            way_speed,
+        )
+        self.limp: list[str] = []
+        """Joints that were made limp here, and have no torque yet."""
+        self.released: list[str] = []
+        """Controllers that were deactivated here."""
+
+    def teach(self) -> list[Shown]:
+        """Let the joints be shown poses and motions; return them, none where the person gave up."""
+        self._dialogue.ask(f"Limp become: {', '.join(self._asked)}. Hold them, and press Enter ")
+        self._let_go(self._asked)
+        shown: list[Shown] = []
+        while True:
+            typed = self._dialogue.ask_while(f"{len(shown)} shown. {HELP}", self._positions)
+            verb, *names = typed.split() or [""]
+            if verb in ("limp", "hold"):
+                self._switch(verb, names)
+            elif verb == "u" and shown:
+                shown.pop()
+            elif verb == "":
+                shown.append(Shown(np.zeros(1), self._now()[1][None, :]))
+            elif verb == "r":
+                shown.append(self._recorded())
+            elif verb == "s" and shown:
+                return shown
+            elif verb == "q":
+                return []
+            else:
+                self._dialogue.say(f"  {typed!r} does nothing here" if shown else "  nothing was shown yet")
+
+    def save(self, shown: Sequence[Shown], target: Path) -> None:
+        """Write what was shown into a new motion file; raises InputError."""
+        taught = self._taught
+        for joint in taught.beyond(shown):
+            self._dialogue.say(f"  {joint} was shown beyond its limits: the motion keeps it at them.")
+        motion, longer = taught.slowed(taught.joined(shown, target))
+        if longer > 1.0:
+            self._dialogue.say(
+                f"  It was shown faster than the joints may move, and takes {longer:.2g} times as long."
+            )
+        origin = f"Shown by hand to {self._robot.name}.\nWritten by `dxlrun teach`."
+        text = text_of(motion, self._plans, origin)
+        with new_target(target) as beside:
+            beside.write_text(text, encoding="utf-8")
+        self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
+
+    def hold(self) -> None:
+        """Give the joints torque where they are, and their controllers back."""
+        while self.limp:
+            self._dialogue.ask("The torque comes back where the joints are: hold them there, and press Enter ")
+            self._try(self._hold, list(self.limp))
+        self._robot.switch(activate=self.released)
+        self.released = []
+
+    def play(self, motion: Path) -> bool:
+        """Play the motion, begun slowly from where the joints are; return whether all goals were reached."""
+        done = self._robot.play(motion)
+        numbers = [goal.number for goal in done.goals]
+        try:
+            states: Sequence[GoalState] = [self._robot.wait(number) for number in numbers]
+        except KeyboardInterrupt:
+            cancelled(self._robot, numbers)
+            raise
+        self._dialogue.say(*(f"  {sentence(state)}" for state in states))
+        return all(state.reached for state in states)
+
+    def left(self) -> str:
+        """Return how the robot is when teaching ends early; empty: as it was."""
+        parts = [f"{', '.join(self.limp)} limp still: `dxlrun torque on {' '.join(self.limp)}`"] * bool(
+            self.limp
+        )
+        if self.released:
+            names = " ".join(self.released)
+            parts.append(f"deactivated: {', '.join(self.released)}: `dxlrun switch --activate {names}`")
+        return "; ".join(parts)
+
+    # Joints
+
+    def _let_go(self, names: Sequence[str]) -> None:
+        joints = [joint for name in names for joint in self._groups[name] if joint not in self.limp]
+        if joints:
+            self.limp += joints  # before, as an answer may get lost
+            done = self._robot.torque(joints, False, release=True)
+            self.released += done.deactivated
+
+    def _hold(self, names: Sequence[str]) -> None:
+        joints = [joint for name in names for joint in self._groups[name] if joint in self.limp]
+        if joints:
+            self._robot.torque(joints, True)
+            self.limp = [joint for joint in self.limp if joint not in joints]
+
+    def _switch(self, verb: str, names: Sequence[str]) -> None:
+        wrong = [name for name in names if name not in self._groups]
+        if wrong or not names:
+            what = f"no joint {', '.join(wrong)}" if wrong else "name joints or groups"
+            self._dialogue.say(f"  {what}: {', '.join(self._groups)}")
+            return
+        self._try(self._let_go if verb == "limp" else self._hold, names)
+
+    def _try(self, switch: Callable[[Sequence[str]], None], names: Sequence[str]) -> None:
+        """Switch the torque of joints, and tell why where the robot refuses: one stands beyond its limits."""
+        try:
+            switch(names)
+        except Refused as error:
+            self._dialogue.say(*(f"  {line}" for line in error.sentences))
+
+    # Positions
+
+    def _now(self) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
+        """Return the time of the newest cycle, s, and where the joints are; raises ServoFault."""
+        found = cast("Mapping[str, Any]", self._robot.states())
+        rows = [found["joints"][joint] for joint in self._taught.joints]
+        for joint, row in zip(self._taught.joints, rows, strict=True):
+            if row["position"] is None or row["age"] > LONGEST_AGE_S:
+                raise ServoFault(
+                    f"{joint} does not answer any more: check cable and power; nothing was saved"
+                )
+        return float(found["time"]), np.array([row["position"] for row in rows], np.float64)
+
+    def _positions(self) -> str:
+        written = (
+            f"{value * 1e3:.1f} mm" if linear else f"{math.degrees(value):.1f}"
+            for value, linear in zip(self._now()[1].tolist(), self._taught.linear, strict=True)
+        )
+        return "  " + "  ".join(written)
+
+    def _recorded(self) -> Shown:
+        """Record until Enter; return the motion, trimmed and smoothed."""
+        times: list[float] = []
+        positions: list[np.ndarray[Any, np.dtype[np.float64]]] = []
+
+        def look() -> str:
+            time, position = self._now()
+            if not times or time > times[-1]:
+                times.append(time)
+                positions.append(position)
+            return f"  {times[-1] - times[0]:.1f} s"
+
+        look()
+        self._dialogue.ask_while("Recording: show the motion, and press Enter at its end", look)
+        look()
+        shown = Shown(np.array(times) - times[0], np.array(positions))
+        shown = self._taught.smoothed(self._taught.trimmed(shown))
+        self._dialogue.say(f"  {shown.time_s[-1]:.1f} s without the standstill at both ends")
+        return shown
+
+
+def taught(
+    robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], target: Path, way_speed: float
+) -> int:
+    """Teach a motion, save it, and play it where the person says so; return the exit code."""
+    from dxlrun_hand.lines import ending_with
+
+    task = Teaching(robot, dialogue, words, way_speed)
+    with ending_with(task.left):
+        shown = task.teach()
+        if shown:
+            task.save(shown, target)
+        task.hold()
+        if not shown:
+            dialogue.say("Nothing was saved.")
+            return 1
+        if not yes(dialogue, f"Play it on {robot.name}? It begins slowly."):
+            return 0
+        return 0 if task.play(target) else 1
+
+
+def _groups(info: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the joints of everything that has a name: joints, groups, controllers, `all`."""
+    controllers = {one["name"]: tuple(one["joints"]) for one in info["controllers"] if one["command"]}
+    groups = {name: tuple(joints) for name, joints in info["groups"].items()}
+    return {"all": tuple(info["joints"]), **controllers, **groups, **{one: (one,) for one in info["joints"]}}
+
+
+def _plan(one: Mapping[str, Any]) -> ControllerPlan:
+    """Return what a motion needs to know of a controller that runs."""
+    joints, command = tuple(one["joints"]), tuple(one["command"])
+    return ControllerPlan(
+        one["name"], one["type"], "", "{}", joints, command, (), active=one["active"], every=1
+    )
