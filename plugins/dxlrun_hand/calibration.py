@@ -123,8 +123,8 @@ class HandJoint:
             raise BeyondTurn(
                 f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
                 f"{degrees(reach.lower)} to {degrees(reach.upper)} deg: its servo was at {degrees(lowest)} "
-                f"to {degrees(highest)} deg. Bring it back; if the joint must go there, turn the servo's "
-                "horn first."
+                f"to {degrees(highest)} deg. If the joint must go there, turn the servo's horn "
+                "first. Bring it back."
             )
 
     @property
@@ -155,7 +155,7 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
         try:
             found = _ends(joint, dialogue)
         except BeyondTurn as error:
-            dialogue.say(*error.sentences)
+            dialogue.ask(f"{error} Then press Enter ")
             continue
         positive, negative, lowest, highest = found
         way = positive - (zero if servo.continuous else negative)

@@ -55,28 +55,30 @@ class Terminal:
 
     def ask(self, question: str) -> str:
         """Return the line that a person types; what was typed before the question does not count."""
-        self._begin(question)
-        while (line := self._line()) is None:
-            pass
-        return line
+        return self._answer(question, None)
 
     def ask_while(self, question: str, look: Callable[[], str]) -> str:
         """Ask, and call `look` until the answer comes; its text is one line that changes."""
-        self._begin(f"{question}\n")
-        while (line := self._line(LOOK_S)) is None:
-            self._write(f"\r\x1b[K{look()[: shutil.get_terminal_size().columns - 1]}")
-        return line
+        return self._answer(f"{question}\n", look)
 
-    def _begin(self, question: str) -> None:
+    def _answer(self, question: str, look: Callable[[], str] | None) -> str:
         self._typed = b""
         termios.tcflush(self._input, termios.TCIFLUSH)
         self._write(question)
+        try:
+            while (line := self._line(LOOK_S if look else None)) is None:
+                if look:
+                    self._write(f"\r\x1b[K{look()[: shutil.get_terminal_size().columns - 1]}")
+        except BaseException:  # what is said next begins a line
+            self._write("\n")
+            raise
+        return line
 
     def _write(self, text: str) -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
 
-    def _line(self, timeout_s: float | None = None) -> str | None:
+    def _line(self, timeout_s: float | None) -> str | None:
         """Return the line that is complete, None where none is yet; the end of the input is as Ctrl-C."""
         if select.select([self._input], [], [], timeout_s)[0]:
             data = os.read(self._input, 4096)

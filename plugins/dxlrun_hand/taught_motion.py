@@ -85,11 +85,10 @@ class Taught(msgspec.Struct, frozen=True):
         """Return all that was shown as one motion within the limits, with a way between two parts."""
         times, positions = [0.0], [self._within(parts[0].position[0])]
         for part in parts:
-            begin = times[-1] + (
-                self._way_s(positions[-1], part.position[0]) if part is not parts[0] else REST_S
-            )
+            inside = self._within(part.position)
+            begin = times[-1] + (REST_S if part is parts[0] else self._way_s(positions[-1], inside[0]))
             times += (begin + part.time_s).tolist()
-            positions += list(self._within(part.position))
+            positions += list(inside)
         times.append(times[-1] + REST_S)
         positions.append(positions[-1])
         states: list[What] = ["states" for _ in self.joints]

@@ -108,7 +108,7 @@ class Teaching:
     def hold(self) -> None:
         """Give the joints torque where they are, and their controllers back."""
         while self.limp:
-            self._dialogue.ask("The torque comes back where the joints are: hold them there, and press Enter ")
+            self._dialogue.ask("The torque comes back where the joints are: hold them, and press Enter ")
             self._try(self._hold, list(self.limp))
         self._robot.switch(activate=self.released)
         self.released = []

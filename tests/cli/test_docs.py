@@ -61,6 +61,7 @@ TESTS = {
         "tests/lab/sweep/test_command.py",
         "tests/lab/tracking/test_command.py",
     ),
+    "by_hand.md": ("tests/hand/test_terminal.py",),
     "frames.md": ("tests/cli/test_frames.py",),
     "logs.md": (
         "tests/analysis/season/test_logs.py",

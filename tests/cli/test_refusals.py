@@ -18,7 +18,20 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
-WITHOUT_JSON = ("robots/", "echo", "examples", "missing", "swich", "chekc", "juggle", ".", "--")
+WITHOUT_JSON = (
+    "robots/",
+    "setup",
+    "calibrate",
+    "teach",
+    "echo",
+    "examples",
+    "missing",
+    "swich",
+    "chekc",
+    "juggle",
+    ".",
+    "--",
+)
 
 
 def _cases() -> Iterator[Any]:

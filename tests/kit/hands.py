@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Self, cast
 
 from tests.kit.rigs import VirtualLine
 
+from dxlrun import running
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.simulation import ServoConfig
 from dxlrun.simulation.faults.fault import parse_fault
@@ -105,6 +110,65 @@ def written(directory: Path, text: str, name: str = "arm.yaml") -> Path:
     return path
 
 
-def steps_of(*steps: Sequence[tuple[str, str | Callable[..., str | None]]]) -> list[tuple[str, object]]:
-    """Return several parts of a script as one."""
-    return [one for part in steps for one in part]
+CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
+DEADLINE_S = 60.0
+
+
+class LiveRobot:
+    """A robot that runs on simulated servos in real time, which a hand turns; a context manager."""
+
+    def __init__(self, directory: Path, robot: Path, *, runs: bool = True) -> None:
+        self.link, self._said = directory / "line", directory / "said"
+        self._directory, self._robot = directory, robot
+        command = [sys.executable, "-P", "-c", CODE, "sim", str(robot), "--link", str(self.link)]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True, "cwd": directory}
+        self._servos = subprocess.Popen(command, **pipes)
+        self._run: subprocess.Popen[bytes] | None = None
+        try:
+            self._until(self.link.exists)
+            if runs:
+                self.start()
+        except BaseException:
+            self.__exit__()
+            raise
+
+    def start(self) -> None:
+        """Run the robot."""
+        words = [sys.executable, "-P", "-c", CODE, str(self._robot), f"port:={self.link}", "--no-record"]
+        with self._said.open("wb") as said:
+            self._run = subprocess.Popen(words, cwd=self._directory, stdout=said, stderr=said)
+        self._until(lambda: bool(running()))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in filter(None, (self._run, self._servos)):
+            process.terminate()
+            process.communicate(timeout=DEADLINE_S)
+
+    def turn(self, look: Callable[[], object], seconds: float, **turns: float) -> None:
+        """Turn servos by degrees, by ID (`id5=20`), and look until they are there."""
+        for name, degrees in turns.items():
+            if not degrees:
+                continue
+            self.inject(f"turn servo={name[2:]} by={degrees:.3f}deg for={seconds:g}s")
+        tick, end = threading.Event(), time.monotonic() + seconds + 0.3
+        while time.monotonic() < end:
+            look()
+            tick.wait(0.02)
+
+    def inject(self, fault: str) -> None:
+        """Let a fault happen."""
+        assert self._servos.stdin is not None
+        self._servos.stdin.write(f"{fault}\n")
+        self._servos.stdin.flush()
+
+    def _until(self, done: Callable[[], bool]) -> None:
+        tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+        while not done():
+            said = self._said.read_text() if self._said.exists() else ""
+            assert self._servos.poll() is None, said
+            assert self._run is None or self._run.poll() is None, said
+            assert time.monotonic() < give_up, said
+            tick.wait(0.05)

@@ -72,18 +72,10 @@ def set_up(  # noqa: PLR0917  what the command was given, and its three ends to 
     from dxlrun_hand.servo_setup import SetUp
 
     task = SetUp(description, dialogue)
-    servos = {servo.own_name: servo for plan in task.plans for servo in plan.servos}
-    groups = {
-        **{
-            name: tuple(own for own in servos if own.partition("/")[0] in joints)
-            for name, joints in description.groups.items()
-        },
-        **{
-            name: tuple(own for own in servos if own.startswith(f"{name}/"))
-            for name in description.robot.joints
-        },
-    }
-    chosen = chosen_names(words, tuple(servos), {name: found for name, found in groups.items() if found})
+    servos = [servo.own_name for plan in task.plans for servo in plan.servos]
+    moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))  # joints and transmissions
+    names = chosen_names(words, moved, description.groups)
+    chosen = [name for name in servos if name.partition("/")[0] in names]
     ports = {}
     with ending_with(lambda: _left(task)):
         for plan in task.plans:

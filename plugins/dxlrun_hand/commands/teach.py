@@ -7,7 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
+from dxlrun.cli.inputs import Flag
+from dxlrun.cli.steering.steer import Chosen, robot_of
 from dxlrun.errors import InputError
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
@@ -19,7 +20,8 @@ def teach(
     /,
     *joints: Joints,
     speed: str = "30 deg/s",
-    chosen: Chosen = ONLY_ONE,
+    robot: str | None = None,
+    debug: Flag = False,
 ) -> int:
     """Show a running robot a motion by hand, and save it as a motion file.
 
@@ -36,6 +38,10 @@ def teach(
         active controller plays motions for.
     speed
         How fast joints go from one pose to the next.
+    robot
+        Name of the robot, where several run.
+    debug
+        Print the traceback of an error.
     """
     from dxlrun.description.units import angular_velocity
     from dxlrun.log.target import check_new
@@ -51,5 +57,5 @@ def teach(
         raise InputError(f"--speed: {error}") from None
     if way_speed <= 0:
         raise InputError(f"--speed {speed}: write a speed above 0, such as 30 deg/s")
-    with robot_of(chosen, "teach") as robot:
-        return taught(robot, Terminal("teach"), joints, motion, way_speed)
+    with robot_of(Chosen(robot), "teach") as running:
+        return taught(running, Terminal("teach"), joints, motion, way_speed)

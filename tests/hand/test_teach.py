@@ -1,0 +1,227 @@
+"""`dxlrun teach`: a scripted hand shows a motion to a robot that runs; and what becomes of recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.kit.hands import LiveRobot, Script, interrupt, written
+
+from dxlrun import RemoteRobot, connect
+from dxlrun.description.motion import Motion, read_motion
+from dxlrun.errors import InputError, ServoFault
+from dxlrun_hand.taught_motion import Shown, Taught
+from dxlrun_hand.teaching import Teaching, taught
+
+ROBOT = """\
+name: arm
+arguments: {port: {default: sim, help: port}}
+buses:
+  main: {port: "${port}", protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}
+loop: {rate: 50}
+groups: {hand: {joints: [wrist]}}
+joints:
+  elbow: {bus: main, id: 5, model: XL430-W250, reference: 180 deg, direction: 1, limits: {position: [-60 deg, 60 deg]}}
+  wrist: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: -1}
+controllers:
+  arm: {type: joint_trajectory_controller, command_interface: position, joints: [elbow]}
+  grip: {type: joint_group_position_controller, joints: [wrist]}
+"""
+POSE, RECORD, DONE = "", "r", "s"
+SPEED = math.radians(60)
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRobot]:
+    directory = tmp_path_factory.mktemp("live")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(directory))
+        with LiveRobot(directory, written(directory, ROBOT)) as live:
+            yield live
+
+
+@pytest.fixture
+def robot(live: LiveRobot) -> Iterator[RemoteRobot]:
+    """The robot as it is after its start."""
+    with connect() as robot:
+        yield robot
+        robot.torque("all", True)
+        robot.switch([one["name"] for one in robot.info()["controllers"] if not one["active"]])
+
+
+def after(live: LiveRobot, answer: str, **turns: float) -> Callable[..., str]:
+    """Return what turns servos, and types something then."""
+
+    def turn(look: Callable[[], object] = lambda: None) -> str:
+        live.turn(look, 0.4, **turns)
+        return answer
+
+    return turn
+
+
+def positions(robot: RemoteRobot) -> dict[str, float]:
+    """Return where the joints are, degrees."""
+    return {name: math.degrees(row["position"]) for name, row in robot.states()["joints"].items()}
+
+
+def points(motion: Motion) -> dict[str, list[tuple[float, float]]]:
+    """Return the points of each joint, s and degrees."""
+    return {
+        name: [(point.time * 1e-9, math.degrees(point.joints[name].position)) for point in part.points]
+        for part in motion.motions
+        for name in part.points[0].joints
+    }
+
+
+def test_poses_and_a_recorded_motion_are_saved_and_played(
+    live: LiveRobot, robot: RemoteRobot, tmp_path: Path
+) -> None:
+    before, target = positions(robot), tmp_path / "wave.yaml"
+    script = Script(
+        ("Limp become: elbow, wrist.", ""),
+        ("0 shown", after(live, POSE, id5=30, id2=-20)),
+        ("1 shown", after(live, "hold elbow")),
+        ("1 shown", after(live, "limp elbow hand")),
+        ("1 shown", POSE),
+        ("2 shown", "u"),
+        ("1 shown", RECORD),
+        ("Recording", after(live, "", id5=-50, id2=40)),
+        ("2 shown", DONE),
+        ("The torque comes back", after(live, "")),
+        ("Play it on arm? It begins slowly.", "y"),
+    )
+    assert taught(robot, script, (), target, SPEED) == 0
+    motion = read_motion(target).motion
+    assert [part.controller for part in motion.motions] == ["arm", "grip"]
+    ends = {"elbow": (30, -20), "wrist": (20, -20)}
+    for joint, path in points(motion).items():
+        begin, end = (before[joint] + way for way in ends[joint])
+        assert (path[0][1], path[-1][1]) == (pytest.approx(begin, abs=1.5), pytest.approx(end, abs=1.5))
+        assert 1.0 < path[-1][0] < 3.5
+        assert positions(robot)[joint] == pytest.approx(end, abs=2.0)
+    assert "goal 1 of arm reached" in script.text
+    assert {one["name"] for one in robot.info()["controllers"] if one["active"]} == {"arm", "grip"}
+
+
+def test_a_joint_beyond_its_limits_is_kept_at_them(
+    live: LiveRobot, robot: RemoteRobot, tmp_path: Path
+) -> None:
+    target, there = tmp_path / "far.yaml", positions(robot)["elbow"]
+    script = Script(
+        ("Limp become: elbow.", ""),
+        ("0 shown", after(live, POSE, id5=70 - there)),
+        ("1 shown", "hold elbow"),
+        ("1 shown", DONE),
+        ("The torque comes back", ""),
+        ("The torque comes back", after(live, "", id5=-50)),
+        ("Play", ""),
+    )
+    assert taught(robot, script, ("arm",), target, SPEED) == 0
+    assert points(read_motion(target).motion)["elbow"][-1][1] == pytest.approx(60.0, abs=0.1)
+    assert "elbow was shown beyond its limits: the motion keeps it at them" in script.text
+    assert script.text.count("outside its limits") == 2
+
+
+def test_giving_up_saves_nothing_and_gives_the_torque_back(robot: RemoteRobot, tmp_path: Path) -> None:
+    steps = (("Limp", ""), ("0 shown", DONE), ("0 shown", "limp x"), ("0 shown", "q"), ("comes back", ""))
+    script = Script(*steps)
+    assert taught(robot, script, ("hand",), tmp_path / "none.yaml", SPEED) == 1
+    assert script.said[-1] == "Nothing was saved."
+    assert "no joint x: all, arm, grip, hand, elbow, wrist" in script.text
+    assert "nothing was shown yet" in script.text
+    assert {row["torque"] for row in robot.states()["joints"].values()} == {"on"}
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("at", "limp"), [("Limp", False), ("0 shown", True), ("comes back", True), ("Play", False)]
+)
+def test_after_ctrl_c_it_is_said_what_is_limp(
+    robot: RemoteRobot, tmp_path: Path, at: str, limp: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    steps = [("Limp", ""), ("0 shown", ""), ("1 shown", "s"), ("comes back", ""), ("Play", "y")]
+    with pytest.raises(KeyboardInterrupt):
+        taught(
+            robot,
+            Script(*((s, interrupt if s == at else a) for s, a in steps)),
+            ("elbow",),
+            tmp_path / "a.yaml",
+            1,
+        )
+    left = "elbow limp still: `dxlrun torque on elbow`; deactivated: arm: `dxlrun switch --activate arm`\n"
+    assert capsys.readouterr().err == (left if limp else "")
+    assert (robot.states()["joints"]["elbow"]["torque"] != "on") is limp
+    assert (tmp_path / "a.yaml").exists() is (at in ("comes back", "Play"))
+
+
+def test_a_servo_that_falls_silent_ends_it(live: LiveRobot, robot: RemoteRobot, tmp_path: Path) -> None:
+    def silent(look: Callable[[], object]) -> None:
+        live.inject("silence servo=5 for=3s")
+        live.turn(look, 6.0)
+
+    script = Script(("Limp", ""), ("0 shown", silent))
+    with pytest.raises(
+        ServoFault, match="elbow does not answer any more: check cable and power; nothing was saved"
+    ):
+        taught(robot, script, ("elbow",), tmp_path / "a.yaml", SPEED)
+    assert list(tmp_path.iterdir()) == []
+    live.turn(lambda: None, 3.5)
+
+
+def test_what_cannot_be_taught_is_refused(robot: RemoteRobot) -> None:
+    with pytest.raises(InputError, match="arm has no joint elbo; did you mean elbow"):
+        Teaching(robot, Script(), ("elbo",), SPEED)
+    robot.switch(deactivate=["grip"])
+    with pytest.raises(InputError, match="no active controller of arm takes motions for wrist"):
+        Teaching(robot, Script(), ("wrist",), SPEED)
+    robot.switch(deactivate=["arm"])
+    with pytest.raises(InputError, match="no active controller of arm takes motions; `dxlrun list`"):
+        Teaching(robot, Script(), (), SPEED)
+
+
+# What was shown
+
+
+def motion_of(seconds: float, position: Callable[[np.ndarray], np.ndarray]) -> Shown:
+    """Return a recording of two joints, at 50 Hz."""
+    time = np.arange(0.0, seconds, 0.02)
+    return Shown(time, np.stack([position(time), np.zeros_like(time)], axis=1))
+
+
+def two(speed: float = math.inf, way_speed: float = 1.0) -> Taught:
+    ends = np.array([-1.0, -1.0])
+    return Taught(("a", "b"), (False, False), ends, -ends, np.array([speed, math.inf]), way_speed)
+
+
+def test_standstill_is_cut_off_at_both_ends() -> None:
+    kept = two().trimmed(motion_of(10.0, lambda t: np.clip(t - 4.0, 0.0, 1.0)))
+    assert kept.time_s[-1] == pytest.approx(1.4, abs=0.05)
+    assert (kept.position[0, 0], kept.position[-1, 0]) == (0.0, 1.0)
+    still = two().trimmed(motion_of(3.0, lambda t: 0.01 * np.sin(t)))
+    assert still.time_s.tolist() == [0.0]
+
+
+def test_trembling_is_taken_out_and_the_motion_stays() -> None:
+    shown = motion_of(4.0, lambda t: 0.5 * np.sin(t) + 0.02 * np.sin(2 * np.pi * 10 * t))
+    smooth = two().smoothed(shown)
+    off = np.abs(smooth.position[:, 0] - 0.5 * np.sin(smooth.time_s))
+    assert off[20:-20].max() < 0.004
+
+
+def test_a_motion_that_is_too_fast_takes_longer() -> None:
+    motion = two().joined([motion_of(1.0, lambda t: 0.9 * np.sin(6 * t))], Path("m.yaml"))
+    slowed, longer = two(speed=2.0).slowed(motion)
+    assert longer > 2.5
+    assert np.abs(np.diff(slowed.position[:, 0]) / np.diff(slowed.time_s)).max() < 2.0
+    assert two(speed=9.0).slowed(motion)[1] == 1.0
+
+
+def test_the_way_between_poses_is_as_fast_as_it_is_to_be() -> None:
+    poses = [Shown(np.zeros(1), np.array([[angle, 0.0]])) for angle in (0.0, 0.8, 1.4)]
+    motion = two(way_speed=0.4).joined(poses, Path("m.yaml"))
+    assert motion.time_s.tolist() == pytest.approx([0.0, 0.2, 2.2, 2.7, 2.9])
+    assert motion.position[:, 0].tolist() == [0.0, 0.0, 0.8, 1.0, 1.0]
+    assert two().beyond(poses) == ["a"]

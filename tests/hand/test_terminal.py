@@ -1,0 +1,185 @@
+"""The dialogues at a terminal: the commands of docs/by_hand.md, Ctrl-C, and what is no terminal."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Self
+
+import pytest
+from tests.kit.hands import CODE, DEADLINE_S, LiveRobot, written
+
+from dxlrun.description.motion import read_motion
+
+PAGE = (Path(__file__).parents[2] / "docs" / "by_hand.md").read_text()
+COMMANDS = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
+ROBOT = """\
+name: arm
+arguments: {port: {default: sim, help: port}}
+buses:
+  main: {port: "${port}", protocol: 2.0, baud_rate: 57600, adapter: {latency: 0 ms}}
+loop: {rate: 50}
+joints:
+  elbow: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}  # the only one
+controllers:
+  arm: {type: joint_trajectory_controller, command_interface: position, joints: [elbow]}
+"""
+
+
+class Screen:
+    """A command at a terminal; a context manager, which ends it."""
+
+    def __init__(self, directory: Path, *words: str) -> None:
+        self._master, slave = os.openpty()
+        command = [sys.executable, "-P", "-c", CODE, *words]
+        streams = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
+        # a session of its own, with this terminal: so Ctrl-C reaches it
+        take = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", take, *command], cwd=directory, start_new_session=True, **streams
+        )
+        os.close(slave)
+        self.text = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._master)
+
+    def sees(self, words: str) -> None:
+        """Wait until the terminal shows words behind those that were waited for before."""
+        give_up = time.monotonic() + DEADLINE_S
+        while words not in self.text:
+            assert time.monotonic() < give_up, self.text
+            assert self._read() or words in self.text, self.text
+        self.text = self.text.partition(words)[2]
+
+    def types(self, text: str) -> None:
+        os.write(self._master, text.encode())
+
+    def ended(self) -> int:
+        """Return the exit code; `text` has all that was shown until then."""
+        while self._read():
+            pass
+        return self._process.wait(DEADLINE_S)
+
+    def _read(self) -> bool:
+        if not select.select([self._master], [], [], DEADLINE_S)[0]:
+            return False
+        try:
+            data = os.read(self._master, 4096)
+        except OSError:  # its other end is closed
+            return False
+        self.text += data.decode(errors="replace")
+        return bool(data)
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return written(tmp_path, ROBOT)
+
+
+def words(line: str, link: Path) -> list[str]:
+    return shlex.split(line.replace("/tmp/line", str(link)))  # noqa: S108
+
+
+def test_the_commands_of_the_page_lead_from_a_new_servo_to_a_motion(robot: Path, tmp_path: Path) -> None:
+    simulate, setup, calibrate, teach = COMMANDS
+    link = tmp_path / "line"
+    assert words(simulate, link) == ["sim", "arm.yaml", "--link", str(link)]
+    with LiveRobot(tmp_path, robot, runs=False) as servos:
+        with Screen(tmp_path, *words(setup, link)) as screen:
+            screen.sees("Connect the servo for elbow (XL430-W250) alone to bus main")
+            screen.types("\n")
+            screen.sees("was as the robot file has it")
+            screen.sees("Connect all servos")
+            screen.types("\n")
+            screen.sees("1 servo is as in the robot file")
+            assert screen.ended() == 0
+        with Screen(tmp_path, *words(calibrate, link)) as screen:
+            for question, turn in (
+                ("hold what", 0),
+                ("zero pose", -20),
+                ("positive", -30),
+                ("other end", 70),
+            ):
+                screen.sees(question)
+                servos.turn(lambda: None, 0.3, id1=turn)
+                screen.types("\n")
+            screen.sees("Write this into arm.yaml?")
+            screen.types("y\n")
+            screen.sees("arm.yaml is written")
+            assert screen.ended() == 0
+        found = re.search(
+            r"reference: (.*) deg, direction: -1, limits: \{position: \[(.*) deg, (.*) deg]}}",
+            robot.read_text(),
+        )
+        assert found, robot.read_text()
+        assert [float(word) for word in found.groups()] == pytest.approx([160, -40, 30], abs=0.3)
+        assert robot.read_text().replace(found[0], "reference: 180 deg, direction: 1}") == ROBOT
+        servos.turn(lambda: None, 0.3, id1=-40)
+        servos.start()
+        with Screen(tmp_path, *words(teach, link)) as screen:
+            for question, answer in (
+                ("Hold them", ""),
+                ("0 shown", ""),
+                ("1 shown", "s"),
+                ("comes back", ""),
+                ("Play it", "y"),
+            ):
+                screen.sees(question)
+                screen.types(f"{answer}\n")
+            screen.sees("goal 1 of arm reached")
+            assert screen.ended() == 0
+    assert [part.controller for part in read_motion(tmp_path / "wave.yaml").motion.motions] == ["arm"]
+
+
+@pytest.mark.parametrize("key", ["\x03", "\x04"])
+def test_ctrl_c_and_the_end_of_input_leave_the_file_as_it_was(robot: Path, tmp_path: Path, key: str) -> None:
+    with (
+        LiveRobot(tmp_path, robot, runs=False),
+        Screen(tmp_path, *words(COMMANDS[2], tmp_path / "line")) as screen,
+    ):
+        for question in ("hold what", "zero pose"):
+            screen.sees(question)
+            screen.types("\n")
+        screen.sees("its servo is at 180 deg")  # the live line
+        screen.types(key)
+        assert screen.ended() == 130
+        said = re.sub(r"\x1b\[[\d;]*m|\r", "", screen.text).splitlines()
+        assert said[-3:] == ["without torque now: elbow", "arm.yaml is as it was", "interrupted"]
+    assert robot.read_text() == ROBOT
+
+
+def test_what_was_typed_before_a_question_does_not_answer_it(robot: Path, tmp_path: Path) -> None:
+    with (
+        LiveRobot(tmp_path, robot, runs=False),
+        Screen(tmp_path, *words(COMMANDS[1], tmp_path / "line")) as screen,
+    ):
+        screen.types("\n\n\n")
+        screen.sees("Connect the servo for elbow")
+        screen.types("\n\n\n")  # of three, two came too early
+        screen.sees("Connect all servos")
+        screen.types("\x03")
+        assert screen.ended() == 130
+        assert "set up: elbow; all others are as they were" in screen.text
+
+
+def test_a_port_that_another_program_has_is_refused(robot: Path, tmp_path: Path) -> None:
+    with (
+        LiveRobot(tmp_path, robot) as live,
+        Screen(tmp_path, "calibrate", "arm.yaml", f"port:={live.link}") as screen,
+    ):
+        assert screen.ended() == 1
+        assert "is in use by" in screen.text
+        assert "arm.yaml is as it was" in screen.text
