@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.compile.robot import compile_files
-from dxlrun.errors import DxlrunError, InputError, ServoFault
+from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlrun.dynamixel.tools.tool_line import TunablePort
+from dxlrun.errors import InputError, PortError, ServoFault
 from dxlrun.simulation import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
 
@@ -91,7 +94,7 @@ def test_reference_direction_and_limits_are_measured_and_nothing_else_changes(ar
     assert "reference: 169.98 deg" in found
     lower, upper = (float(word) for word in found.split("[")[1].split("]")[0].replace("deg", "").split(","))
     assert (lower, upper) == (pytest.approx(-40, abs=0.2), pytest.approx(60, abs=0.2))
-    assert -40 < lower
+    assert lower > -40
     assert upper < 60
     expected = ROBOT.replace("reference: 180 deg", "reference: 169.98 deg").replace(elbow, new_elbow)
     expected = expected.replace("[-40 deg, 60 deg]", f"[{lower:g} deg, {upper:g} deg]")
@@ -255,6 +258,21 @@ def test_wrong_input_is_refused_before_anything_is_done(
     assert arm.line.heard == []
 
 
+def test_a_port_that_another_program_has_is_refused(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    arm = Arm(tmp_path, ROBOT.replace("/dev/null", os.ttyname(slave)))
+    held = open_serial(os.ttyname(slave), 57600)
+    try:
+        arm.line.open = TunablePort
+        with pytest.raises(PortError, match="is in use by"):
+            arm.do()
+    finally:
+        held.close()
+        os.close(master)
+        os.close(slave)
+    assert arm.path.read_bytes() == arm.before
+
+
 def test_joints_with_several_servos_are_left_out_and_named(tmp_path: Path) -> None:
     text = ROBOT.replace("id: 1,", "servos: [{id: 1}, {id: 4}],")
     arm = Arm(tmp_path, text)
@@ -270,4 +288,3 @@ def test_a_file_that_would_be_wrong_is_told_with_the_change(tmp_path: Path) -> N
     script = arm.do(("hold", ""), ("zero", ""), *moves, ("Write", "n"), joints=("elbow",))
     assert "With this the robot file is to be corrected by hand:" in script.text
     assert "home" in script.text
-    assert issubclass(ServoFault, DxlrunError)

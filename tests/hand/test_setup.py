@@ -20,12 +20,13 @@ ROBOT = """\
 name: arm
 arguments: {at: {default: /dev/null, help: port}}
 buses:
-  main: {port: "${at}", protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 20 us, adapter: {latency: 0 ms}}
+  main: {port: "${at}", protocol: 2.0, baud_rate: 1000000, return_delay_time: 20 us, adapter: {latency: 0 s}}
 loop: {rate: 20}
+joint_defaults: {bus: main, reference: 0 deg, direction: 1}
 groups: {hand: {joints: [wrist]}}
 joints:
-  elbow: {bus: main, id: 5, model: XL430-W250, reference: 0 deg, direction: 1, registers: {temperature_limit: 70}}
-  wrist: {bus: main, id: 1, model: XM430-W350, reference: 0 deg, direction: 1, registers: {position_p_gain: 700}}
+  elbow: {id: 5, model: XL430-W250, registers: {temperature_limit: 70}}
+  wrist: {id: 1, model: XM430-W350, registers: {position_p_gain: 700}}
 """
 NEW = (ServoConfig(1, "XL430-W250", math.radians(150)), ServoConfig(1, "XM430-W350", math.radians(200)))
 
@@ -214,7 +215,7 @@ def test_ctrl_c_while_a_servo_is_written_to_is_said_so(
 
 def test_a_port_that_goes_away_ends_it(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(PortError, match="gone"):
-        bench.do(("for elbow", lambda: bench.line.bus.unplug()))
+        bench.do(("for elbow", bench.line.bus.unplug))
     assert "no servo was set up" in capsys.readouterr().err
 
 

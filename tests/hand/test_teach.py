@@ -22,10 +22,11 @@ arguments: {port: {default: sim, help: port}}
 buses:
   main: {port: "${port}", protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}
 loop: {rate: 50}
+joint_defaults: {bus: main, reference: 180 deg}
 groups: {hand: {joints: [wrist]}}
 joints:
-  elbow: {bus: main, id: 5, model: XL430-W250, reference: 180 deg, direction: 1, limits: {position: [-60 deg, 60 deg]}}
-  wrist: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: -1}
+  elbow: {id: 5, model: XL430-W250, direction: 1, limits: {position: [-60 deg, 60 deg]}}
+  wrist: {id: 2, model: XM430-W350, direction: -1}
 controllers:
   arm: {type: joint_trajectory_controller, command_interface: position, joints: [elbow]}
   grip: {type: joint_group_position_controller, joints: [wrist]}

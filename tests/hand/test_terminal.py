@@ -40,7 +40,8 @@ class Screen:
         command = [sys.executable, "-P", "-c", CODE, *words]
         streams = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
         # a session of its own, with this terminal: so Ctrl-C reaches it
-        take = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+        take = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+        take += "os.execv(sys.argv[1], sys.argv[1:])"
         self._process = subprocess.Popen(
             [sys.executable, "-c", take, *command], cwd=directory, start_new_session=True, **streams
         )
@@ -173,13 +174,3 @@ def test_what_was_typed_before_a_question_does_not_answer_it(robot: Path, tmp_pa
         screen.types("\x03")
         assert screen.ended() == 130
         assert "set up: elbow; all others are as they were" in screen.text
-
-
-def test_a_port_that_another_program_has_is_refused(robot: Path, tmp_path: Path) -> None:
-    with (
-        LiveRobot(tmp_path, robot) as live,
-        Screen(tmp_path, "calibrate", "arm.yaml", f"port:={live.link}") as screen,
-    ):
-        assert screen.ended() == 1
-        assert "is in use by" in screen.text
-        assert "arm.yaml is as it was" in screen.text
