@@ -29,8 +29,8 @@ class SetUp:
     """Leads through the servos of a robot file; `done` has those that are as the file has them."""
 
     def __init__(self, description: Description, dialogue: Dialogue) -> None:
-        self._description = description
-        self._dialogue = dialogue
+        self.description = description
+        self.dialogue = dialogue
         self._unknown = {one.name for one in described_servos(description) if one.model == AUTO}
         self._models: dict[str, str] = {}
         self.plans: Sequence[BusPlan] = compile_robot(description, []).plan.buses
@@ -50,18 +50,16 @@ class SetUp:
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
-                self._dialogue.ask(
-                    f"Connect all servos of bus {plan.name} with their power, and press Enter "
-                )
+                self.dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
                 tool = lines[plan.name]
                 tool.speak(plan.protocol, plan.baud_rate)
                 problems = tool.run(extend_timeouts(_read_back(plan, servos)))
                 if not problems:
                     count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
-                    self._dialogue.say(f"Bus {plan.name}: {count} as in the robot file.")
+                    self.dialogue.say(f"Bus {plan.name}: {count} as in the robot file.")
                     break
-                self._dialogue.say(*problems)
-                if not yes(self._dialogue, "Look again?"):
+                self.dialogue.say(*problems)
+                if not yes(self.dialogue, "Look again?"):
                     return False
         return True
 
@@ -71,7 +69,7 @@ class SetUp:
             plan = self.plans[index]
             servo = _named(plan, name)
             model = "any model" if name in self._unknown else servo.model
-            typed = self._dialogue.ask(
+            typed = self.dialogue.ask(
                 f"Connect the servo for {name} ({model}) alone to bus {plan.name}, and press Enter "
                 "(s: skip it) "
             )
@@ -81,13 +79,13 @@ class SetUp:
                 found = self._alone(tool, plan, servo)
                 if name in self._unknown:
                     self._models[name] = found.model
-                    self.plans = compile_robot(self._description, [], models=self._models).plan.buses
+                    self.plans = compile_robot(self.description, [], models=self._models).plan.buses
                     plan = self.plans[index]
                 self.changing = name
                 for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
-                    self._dialogue.say(f"  {name}: {sentence}")
+                    self.dialogue.say(f"  {name}: {sentence}")
             except ServoFault as error:
-                self._dialogue.say(*error.sentences)
+                self.dialogue.say(*error.sentences)
                 continue
             self.changing = ""
             return True
@@ -98,9 +96,7 @@ class SetUp:
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
         if not found:
-            self._dialogue.say(
-                "  not at its usual rates; every other one is tried, which takes half a minute"
-            )
+            self.dialogue.say("  not at its usual rates; every other one is tried, which takes half a minute")
             found = scan(tool).servos
         if not found:
             raise ServoFault(f"No servo answers at {tool.port.name}: check its power and its cable.")

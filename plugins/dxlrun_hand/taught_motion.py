@@ -118,4 +118,4 @@ class Taught(msgspec.Struct, frozen=True):
 
 def text_of(motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
     """Return the motion file for the controllers among `plans` that are active."""
-    return motion_file(motion, tolerances(motion, None), motion.path, None, origin, plans).text
+    return motion_file(motion, tolerances(motion, None), motion.path, None, origin, plans=plans).text

@@ -60,7 +60,7 @@ class Arm:
         """Calibrate by a script, which is used up then."""
         self.script = Script(*steps)
         result = compile_files(self.path, {}, [])
-        self.code = calibrated(self.path, (), joints, result, self.script, self.line.open)
+        self.code = calibrated(result, self.script, self.line.open, joints, ())
         assert not self.script.steps, self.script.steps
         return self.script
 
@@ -278,7 +278,7 @@ def test_joints_with_several_servos_are_left_out_and_named(tmp_path: Path) -> No
     arm = Arm(tmp_path, text)
     with pytest.raises(InputError, match="no joint is left to be calibrated"):
         arm.do(joints=("elbow",))
-    assert "elbow is moved by several servos and is left out" in arm.script.text
+    assert "Left out, as several servos move them, is what is yours to measure: elbow" in arm.script.text
 
 
 def test_a_file_that_would_be_wrong_is_told_with_the_change(tmp_path: Path) -> None:
@@ -286,5 +286,5 @@ def test_a_file_that_would_be_wrong_is_told_with_the_change(tmp_path: Path) -> N
     arm = Arm(tmp_path, text)
     moves = [("positive", arm.move(1, 20)), ("other", arm.move(1, -50))]
     script = arm.do(("hold", ""), ("zero", ""), *moves, ("Write", "n"), joints=("elbow",))
-    assert "With this the robot file is to be corrected by hand:" in script.text
+    assert "With this something else in the robot file is wrong:" in script.text
     assert "home" in script.text

@@ -30,7 +30,7 @@ from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.simulation import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
 from dxlrun_hand.commands.setup import set_up
-from dxlrun_hand.servo_setup import factory_rate
+from dxlrun_hand.servo_setup import SetUp, factory_rate
 from dxlrun_hand.teaching import taught
 
 HANDS = int(os.environ.get("DXLRUN_HANDS", "3"))
@@ -168,7 +168,7 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
         ),
         ("Connect all", lambda: line.connect(*range(len(world.joints)))),
     )
-    assert set_up(read_robot(robot, {}), (), False, setting_up, line.open, tuple) == 0, setting_up.text
+    assert set_up(SetUp(read_robot(robot, {}), setting_up), line.open, tuple) == 0, setting_up.text
     for one, servo in zip(world.joints, line.bus.servos, strict=True):
         assert servo.servo_id == one.servo_id
         assert one.table.baud_rates[servo.registers["baud_rate"]] == world.rate
@@ -190,7 +190,7 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
 
             steps.append((question, move))
     script = Script(*steps, ("Write this", "y"))
-    assert calibrated(robot, (), (), compile_files(robot, {}, []), script, line.open) == 0, script.text
+    assert calibrated(compile_files(robot, {}, []), script, line.open, (), ()) == 0, script.text
     after = robot.read_bytes().decode()
     assert masked(after) == masked(world.text), script.text
     plan = compile_files(robot, {}, []).plan

@@ -15,6 +15,7 @@ from dxlrun.errors import InputError, PortError
 from dxlrun.simulation import ServoConfig
 from dxlrun_hand import port_search
 from dxlrun_hand.commands.setup import set_up
+from dxlrun_hand.servo_setup import SetUp
 
 ROBOT = """\
 name: arm
@@ -49,9 +50,9 @@ class Bench:
         search: bool = False,
     ) -> Script:
         self.script = Script(*steps)
-        description = read_robot(self.path, {})
+        task = SetUp(read_robot(self.path, {}), self.script)
         devices = self.devices if hasattr(self, "devices") else tuple
-        self.code = set_up(description, joints, search, self.script, self.line.open, devices)
+        self.code = set_up(task, self.line.open, devices, joints, search=search)
         assert not self.script.steps, self.script.steps
         return self.script
 

@@ -45,12 +45,13 @@ class _Part(msgspec.Struct, frozen=True):
     """It takes a speed beside each single position."""
 
 
-def motion_file(  # noqa: PLR0917  a motion, and all that is to be said of its file
+def motion_file(
     motion: RecordedMotion,
     allowed: Floats,
     target: Path,
     controller: str | None,
     origin: str,
+    *,
     plans: Sequence[ControllerPlan] | None = None,
 ) -> MotionFile:
     """Return the file for a recorded motion, within `allowed` of it, rad, shape (joints,).

@@ -43,25 +43,20 @@ def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debu
     from dxlrun_hand.dialogue import Terminal
 
     result = compiled(robot, assignments, (), None, read_models)
-    return calibrated(robot, assignments, joint, result, Terminal("calibrate"), TunablePort)
+    return calibrated(result, Terminal("calibrate"), TunablePort, joint, assignments)
 
 
-def calibrated(  # noqa: PLR0917  what the command was given, and its two ends to the world
-    robot: Path,
-    assignments: Sequence[str],
-    words: Sequence[str],
-    result: Compiled,
-    dialogue: Dialogue,
-    opened: Opened,
+def calibrated(
+    result: Compiled, dialogue: Dialogue, opened: Opened, words: Sequence[str], assignments: Sequence[str]
 ) -> int:
-    """Do it; return the exit code. Where it raises an error, the file is as it was."""
+    """Calibrate a robot; return the exit code. Where it raises an error, the file is as it was."""
     from dxlrun.compile.robot import compile_files
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.lines import ending_with, opened_lines
     from dxlrun_hand.robot_text import RobotText
 
-    plan = result.plan
+    plan, robot = result.plan, Path(result.plan.source_file)
     joints = _joints(result, words, dialogue)
     text = RobotText(robot)
     for name, one in joints.items():
@@ -87,7 +82,7 @@ def calibrated(  # noqa: PLR0917  what the command was given, and its two ends t
         try:
             compile_files(robot, parse_assignments(assignments), [], replacements=changes)
         except InputError as error:
-            dialogue.say("With this the robot file is to be corrected by hand:", *error.sentences)
+            dialogue.say("With this something else in the robot file is wrong:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):
             dialogue.say(f"{robot} is as it was.")
             return 1
@@ -108,11 +103,8 @@ def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[
     every = {one.plan.name: one for one in result.joints}
     names = chosen_names(words, tuple(every), result.plan.groups)
     left = {name: every[name] for name in names if every[name].coupling is None}
-    if others := [name for name in names if name not in left]:
-        verb = (
-            "is moved by several servos and is" if len(others) == 1 else "are moved by several servos and are"
-        )
-        dialogue.say(f"{', '.join(others)} {verb} left out: their references are yours to measure.")
+    if others := ", ".join(name for name in names if name not in left):
+        dialogue.say(f"Left out, as several servos move them, is what is yours to measure: {others}")
     if not left:
         raise InputError("no joint is left to be calibrated; choose one with a servo of its own")
     return left

@@ -13,9 +13,7 @@ from dxlrun.errors import InputError
 from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
-    from dxlrun.description.reading import Description
     from dxlrun.plan.bus_plan import BusPlan
-    from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.lines import Opened
     from dxlrun_hand.port_search import Devices
     from dxlrun_hand.servo_setup import SetUp
@@ -52,35 +50,29 @@ def setup(
     from dxlrun.dynamixel.port.serial_open import serial_devices
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Terminal
+    from dxlrun_hand.servo_setup import SetUp
 
     known_file(robot)
     load_models()
-    description = read_robot(robot, parse_assignments(assignments))
-    return set_up(description, joint, find_port, Terminal("setup"), TunablePort, serial_devices)
+    task = SetUp(read_robot(robot, parse_assignments(assignments)), Terminal("setup"))
+    return set_up(task, TunablePort, serial_devices, joint, search=find_port)
 
 
-def set_up(  # noqa: PLR0917  what the command was given, and its three ends to the world
-    description: Description,
-    words: Sequence[str],
-    search: bool,
-    dialogue: Dialogue,
-    opened: Opened,
-    devices: Devices,
+def set_up(
+    task: SetUp, opened: Opened, devices: Devices, words: Sequence[str] = (), *, search: bool = False
 ) -> int:
-    """Do it; return the exit code. Raises InputError, PortError."""
+    """Set the servos of a robot up; return the exit code. Raises InputError, PortError."""
     from dxlrun_hand.lines import chosen_names, ending_with, opened_lines
-    from dxlrun_hand.servo_setup import SetUp
 
-    task = SetUp(description, dialogue)
     servos = [servo.own_name for plan in task.plans for servo in plan.servos]
     moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))  # joints and transmissions
-    names = chosen_names(words, moved, description.groups)
+    names = chosen_names(words, moved, task.description.groups)
     chosen = [name for name in servos if name.partition("/")[0] in names]
     ports = {}
     with ending_with(lambda: _left(task)):
         for plan in task.plans:
             if any(servo.own_name in chosen for servo in plan.servos):
-                ports[plan.name] = _port(plan, description.path, search, dialogue, devices)
+                ports[plan.name] = _port(task, plan, devices, search=search)
         with opened_lines(ports, opened) as lines:
             task.connect_each(lines, chosen)
             equal = task.compare_all(lines, chosen)
@@ -95,16 +87,17 @@ def _left(task: SetUp) -> str:
     return f"{done}; the one for {task.changing} may have its new ID or rate already: set it up again"
 
 
-def _port(plan: BusPlan, robot: Path, search: bool, dialogue: Dialogue, devices: Devices) -> str:
+def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     """Return the port of a bus: that of the file where it is there, else the one that is plugged in."""
     from dxlrun.description.bus import SIMULATED
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.port_search import find_port
     from dxlrun_hand.robot_text import RobotText
 
-    if not search and (plan.port == SIMULATED or os.path.exists(plan.port)):
-        return plan.port
+    robot, dialogue = task.description.path, task.dialogue
     if not search:
+        if plan.port == SIMULATED or os.path.exists(plan.port):
+            return plan.port
         dialogue.say(f"Bus {plan.name}: there is no {plan.port} now.")
     found = find_port(plan.name, dialogue, devices)
     text = RobotText(robot)
