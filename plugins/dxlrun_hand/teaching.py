@@ -15,10 +15,11 @@ from dxlrun.errors import InputError, Refused, ServoFault, suggestion
 from dxlrun.log.target import new_target
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import player_of
+from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, yes
 from dxlrun_hand.taught_motion import Shown, Taught, text_of
 
-LONGEST_AGE_S = 1.0
+LONGEST_AGE_NS = 1_000_000_000
 """A joint whose newest position is older does not answer."""
 HELP = "Enter: take this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
 
@@ -51,13 +52,13 @@ class Teaching:
             raise InputError(f"no active controller of {robot.name} takes motions; `dxlrun list` shows them")
         moved = {joint for plan in self._plans if plan.name in players.values() for joint in plan.joints}
         joints = tuple(joint for joint in info["joints"] if joint in moved)
-        ends = [info["limits"][joint] for joint in joints]
+        ends = [info["limits"].get(joint, (-math.inf, math.inf)) for joint in joints]
         self._asked = [joint for joint in joints if joint in asked]
         self._taught = Taught(
             joints,
             tuple(info["units"][joint] == "m" for joint in joints),
-            np.array([-math.inf if lower is None else lower for lower, _ in ends]),
-            np.array([math.inf if upper is None else upper for _, upper in ends]),
+            np.array([lower for lower, _ in ends]),
+            np.array([upper for _, upper in ends]),
             np.array([info["speeds"][joint] or math.inf for joint in joints]),
             way_speed,
         )
@@ -167,16 +168,17 @@ class Teaching:
 
     # Positions
 
-    def _now(self) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
+    def _now(self) -> tuple[float, Floats]:
         """Return the time of the newest cycle, s, and where the joints are; raises ServoFault."""
-        found = cast("Mapping[str, Any]", self._robot.states())
-        rows = [found["joints"][joint] for joint in self._taught.joints]
-        for joint, row in zip(self._taught.joints, rows, strict=True):
-            if row["position"] is None or row["age"] > LONGEST_AGE_S:
+        states = self._robot.states()
+        rows = [states.joints.index(joint) for joint in self._taught.joints]
+        ages = states.age_ns[rows].tolist()
+        for joint, age_ns in zip(self._taught.joints, ages, strict=True):
+            if not 0 <= age_ns <= LONGEST_AGE_NS:
                 raise ServoFault(
                     f"{joint} does not answer any more: check cable and power; nothing was saved"
                 )
-        return float(found["time"]), np.array([row["position"] for row in rows], np.float64)
+        return states.time_ns * 1e-9, states.position[rows]
 
     def _positions(self) -> str:
         written = (
@@ -188,7 +190,7 @@ class Teaching:
     def _recorded(self) -> Shown:
         """Record until Enter; return the motion, trimmed and smoothed."""
         times: list[float] = []
-        positions: list[np.ndarray[Any, np.dtype[np.float64]]] = []
+        positions: list[Floats] = []
 
         def look() -> str:
             time, position = self._now()

@@ -14,7 +14,7 @@ from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import InputError, PortError, ServoFault
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
 
 ROBOT = """\

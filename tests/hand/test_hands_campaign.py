@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from tests.hand.test_teach import points
+from tests.hand.test_teach import points, positions
 from tests.kit.hands import HandLine, LiveRobot, Script, written
 
 from dxlrun import connect
@@ -27,7 +27,7 @@ from dxlrun.compile.robot import compile_files
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.control_table import ControlTable, control_table
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.servo_setup import SetUp, factory_rate
@@ -218,7 +218,7 @@ def test_random_robots_are_taught(number: int, tmp_path: Path, monkeypatch: pyte
         tmp_path / "m.yaml",
     )
     with LiveRobot(tmp_path, robot) as live, connect() as running:
-        begins = {name: math.degrees(row["position"]) for name, row in running.states()["joints"].items()}
+        begins = positions(running)
         plans = compile_files(robot, {}, []).plan.servos_by_joint
         servos = {name: servo for name, ((_, servo),) in plans.items()}
 
@@ -246,7 +246,7 @@ def test_random_robots_are_taught(number: int, tmp_path: Path, monkeypatch: pyte
         ]
         script = Script(*steps, ("comes back", ""), ("Play", "y"))
         assert taught(running, script, (), target, 1.0) == 0, script.text
-        for name, row in running.states()["joints"].items():
-            assert math.degrees(row["position"]) == pytest.approx(shown[name], abs=3.0)
+        for name, position in positions(running).items():
+            assert position == pytest.approx(shown[name], abs=3.0)
     for name, path in points(read_motion(target).motion).items():
         assert path[-1][1] == pytest.approx(shown[name], abs=1.5)

@@ -12,7 +12,7 @@ from tests.kit.hands import HandLine, Script, interrupt, written
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id
 from dxlrun.errors import InputError, PortError
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun_hand import port_search
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.servo_setup import SetUp

@@ -15,7 +15,7 @@ from tests.kit.rigs import VirtualLine
 
 from dxlrun import running
 from dxlrun.dynamixel.tools.tool_line import TunablePort
-from dxlrun.simulation import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 
