@@ -107,6 +107,15 @@ def test_reference_direction_and_limits_are_measured_and_nothing_else_changes(ar
     compile_files(arm.path, {}, [])
 
 
+def test_a_linear_joint_behind_a_pinion_has_lengths(tmp_path: Path) -> None:
+    linear = "direction: 1, travel_per_turn: 36 mm}  # 180"
+    arm = Arm(tmp_path, ROBOT.replace("direction: 1}  # 180", linear))
+    moves = [("positive", arm.move(1, -60)), ("other", arm.move(1, 100))]
+    arm.do(("hold", ""), ("zero", ""), *moves, ("Write", "y"), joints=("elbow",))
+    (found,) = [line for line in arm.path.read_text().splitlines() if "elbow:" in line]
+    assert "direction: -1, travel_per_turn: 36 mm, limits: {position: [-3.9 mm, 6 mm]}}  # 180" in found
+
+
 def test_what_is_as_measured_stays_as_it_is_written(arm: Arm, tmp_path: Path) -> None:
     text = ROBOT.replace("reference: 180 deg, direction: 1", "reference: 150.05 deg, direction: 1")
     arm = Arm(tmp_path, text.replace("1}  #", "1, limits: {position: [-30 deg, 20 deg]}}  #"))

@@ -232,9 +232,12 @@ def test_wrong_input_is_refused_before_anything_is_done(
     assert bench.line.heard == []
 
 
-def test_a_group_means_its_joints(bench: Bench) -> None:
+def test_a_group_means_its_joints_and_torque_goes_off(bench: Bench) -> None:
+    bench.line.bus.servos[1].poke("torque_enable", 1)
     bench.do(("for wrist", bench.connect(1)), ("all", ""), joints=("hand",))
     assert bench.code == 0
+    assert not bench.line.bus.servos[1].torque_on
+    assert "wrist: holds no torque" in bench.script.text
 
 
 # The port

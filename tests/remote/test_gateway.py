@@ -538,6 +538,8 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "units": {"pan": "rad", "tilt": "rad"},
         "limits": {"pan": [-1.0, 1.0], "tilt": [-1.0, 1.0]},
         "effort_units": {},
+        "limits": {"pan": [-1.0, 1.0], "tilt": [-1.0, 1.0]},
+        "speeds": {"pan": None, "tilt": None},
         "sources": [],
         "file": str(Path("pair.yaml").absolute()),
         "log": "/logs/pair.mcap",
