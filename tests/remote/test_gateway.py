@@ -536,7 +536,6 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "joints": ["pan", "tilt"],
         "groups": {"both": ["pan", "tilt"]},
         "units": {"pan": "rad", "tilt": "rad"},
-        "limits": {"pan": [-1.0, 1.0], "tilt": [-1.0, 1.0]},
         "effort_units": {},
         "limits": {"pan": [-1.0, 1.0], "tilt": [-1.0, 1.0]},
         "speeds": {"pan": None, "tilt": None},

@@ -232,7 +232,6 @@ class GatewayApp:
             "joints": [joint.name for joint in link.plan.loop.joints],
             "groups": link.plan.groups,
             "units": {joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints},
-            "limits": {one.name: (one.lower, one.upper) for one in link.plan.loop.joints if one.bounded},
             "effort_units": effort_units(link.plan),
             "limits": {one.name: (one.lower, one.upper) for one in link.plan.loop.joints if one.bounded},
             "speeds": {one.name: one.highest_speed for one in link.plan.loop.joints},  # null: without a limit
