@@ -153,31 +153,39 @@ def lost_devices(totals: RunTotals) -> Iterable[Finding]:
 
 
 def whole_buses(totals: RunTotals) -> Iterable[Finding]:
-    """Report what happened to all servos of a bus: they share supply and adapter."""
+    """Report what happened to all servos of a bus, which share supply and adapter, or of several at once."""
     gone = {group.source for group in severe_of(totals.events, EventCode.PORT_LOST)}
     servos = [servo for servo in totals.servos if servo.joint and not servo.device]
+    silent: dict[str, int] = {}
+    """When the first servo was lost, ns, of each bus that lost all."""
     for bus in sorted({servo.bus for servo in servos} - gone):
         joints = {servo.joint for servo in servos if servo.bus == bus}
-        times = {
-            code: {
-                group.source: group.t_ns for group in severe_of(totals.events, code) if group.source in joints
-            }
-            for code in (EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST)
-        }
-        for code, happened in times.items():
-            if len(joints) < _FEWEST_OF_BUS or set(happened) != joints:
-                continue
-            if max(happened.values()) - min(happened.values()) > _AT_ONCE_NS:
-                continue
-            if code == EventCode.SERVO_REBOOTED:
-                what = f"All {len(joints)} servos of bus {bus} rebooted at once: their supply failed."
-                fix = "Check the supply, its plug and its switch."
-                yield Finding("power_lost", bus, what, fix, Rank.SERVO_CAUSE, 2.0)
-            else:
-                what = f"All {len(joints)} servos of bus {bus} were lost at once: it is not one of them."
-                fix = "Check the adapter, the first cable and the supply of the bus."
-                yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE)
-            break
+        if _all_at_once(totals, EventCode.SERVO_REBOOTED, joints) is not None:
+            what = f"All {len(joints)} servos of bus {bus} rebooted at once: their supply failed."
+            fix = "Check the supply, its plug and its switch."
+            yield Finding("power_lost", bus, what, fix, Rank.SERVO_CAUSE, 2.0)
+        elif (t_ns := _all_at_once(totals, EventCode.SERVO_LOST, joints)) is not None:
+            silent[bus] = t_ns
+    if len(silent) > 1 and max(silent.values()) - min(silent.values()) <= _AT_ONCE_NS:
+        named = _joined(tuple(silent))
+        what = f"All servos of buses {named} were lost at once: it is no servo, and no single bus."
+        fix = "Check what these buses share: the machine, a USB hub, a supply."
+        yield Finding("silent_bus", "machine", what, fix, Rank.SERVO_CAUSE)
+        return
+    for bus in silent:
+        count = sum(servo.bus == bus for servo in servos)
+        what = f"All {count} servos of bus {bus} were lost at once: it is not one of them."
+        fix = "Check the adapter, the first cable and the supply of the bus."
+        yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE)
+
+
+def _all_at_once(totals: RunTotals, code: EventCode, joints: set[str]) -> int | None:
+    """Return when a thing happened first that happened to all these joints at once, ns; None: it did not."""
+    times = {group.source: group.t_ns for group in severe_of(totals.events, code) if group.source in joints}
+    if len(joints) < _FEWEST_OF_BUS or set(times) != joints:
+        return None
+    first = min(times.values())
+    return first if max(times.values()) - first <= _AT_ONCE_NS else None
 
 
 def _joined(parts: Sequence[str]) -> str:

@@ -540,6 +540,29 @@ def test_a_servo_that_was_lost_while_the_line_was_disturbed_is_not_accused(
     assert ("Bytes that belong to no packet" in servo.sentence) is not accused
 
 
+@pytest.mark.parametrize(
+    ("at_ms", "told"),
+    [
+        ((5, 30, 60, 90), {"machine": "buses bus0 and bus1 were lost at once"}),
+        ((5, 30, 900, 950), {"bus0": "All 2 servos of bus bus0", "bus1": "All 2 servos of bus bus1"}),
+        ((5, 30, 60, None), {"bus0": "All 2 servos of bus bus0"}),
+        ((5, None, 60, None), {}),
+    ],
+    ids=["both at once", "one after the other", "one of them", "a servo each"],
+)
+def test_buses_that_fall_silent_at_once_are_not_accused_one_by_one(
+    at_ms: tuple[int | None, ...], told: dict[str, str]
+) -> None:
+    joints = ("elbow", "wrist", "hip", "knee")
+    servos = on_bus(*joints[:2]) + on_bus(*joints[2:], bus="bus1")
+    events = tuple(lost(joint, at) for joint, at in zip(joints, at_ms, strict=True) if at is not None)
+    verdict = judge(totals(events=events, servos=servos, plan=plan(REAL, REAL)))
+    found = {one.subject: one for one in verdict.findings if one.code == "silent_bus"}
+    assert found.keys() == told.keys()
+    assert all(told[subject] in one.sentence for subject, one in found.items())
+    assert ("the machine" in found["machine"].remedy) if "machine" in found else True
+
+
 def test_servos_of_a_lost_bus_are_not_accused() -> None:
     gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
     for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):
