@@ -57,8 +57,10 @@ def size_of(picture: Path) -> tuple[int, int]:
     return width, height
 
 
-def test_the_readme_shows_them_and_they_are_small() -> None:
+def test_the_pages_show_them_and_they_are_small() -> None:
     shown = re.findall(r"!\[.+\]\((docs/pictures/.+)\)", (ROOT / "README.md").read_text())
+    on_page = re.findall(r"!\[.+\]\((pictures/.+)\)", (ROOT / "docs/view.md").read_text())
+    shown += [f"docs/{one}" for one in on_page]
     assert {Path(one).name for one in shown} == {
         path.name for path in PICTURES.iterdir() if path.suffix != ".py"
     }
