@@ -49,9 +49,8 @@ def table(data_files: Path, tmp_path: Path) -> Path:
     """The data file of a servo that dxlrun does not know."""
     text = (data_files / "protocol1" / "AX-12A.toml").read_text("utf-8")
     text = text.replace('model = "AX-12A"', 'model = "Mine-1"').replace('["AX-12", "AX-12+"]', "[]")
-    text = text.replace("model_number = 12\n", "model_number = 60001\n")
     path = tmp_path / "mine.toml"
-    path.write_text(text.replace("initial = 12\n", "initial = 60001\n"))
+    path.write_text(text.replace("model_number = 12\n", "model_number = 60001\n"))
     return path
 
 
@@ -82,6 +81,7 @@ def test_a_table_is_taken_as_a_path_or_as_a_text(
     assert load_plugins().broken == {}
     found = control_table("Mine-1", 1.0)
     assert (found.model_number, found.max_tick) == (60001, 1023)
+    assert found.items["model_number"].initial == 60001
     assert added_control_tables(["AX-12A", "Mine-1", "Mine-1"]) == (table.read_text(),)
     assert load_plugins().broken == {}, "a process may load its plug-ins twice"
 

@@ -66,7 +66,7 @@ standard gravity (3rd CGPM, 1901)."""
 
 
 _TABLES = Path(__file__).parent / "tables"
-"""A folder for each protocol, in it one TOML file a model, which may extend another one."""
+"""A folder for each protocol, in it folders of series where they are many; a TOML file a model."""
 
 
 def listings(protocol: float) -> tuple[Listing, ...]:
@@ -75,7 +75,10 @@ def listings(protocol: float) -> tuple[Listing, ...]:
     Raises ValueError or KeyError when a data file is broken.
     """
     folder = _TABLES / f"protocol{protocol:.0f}"
-    texts = {path.stem: path.read_text("utf-8") for path in sorted(folder.glob("*.toml"))}
+    texts = {
+        path.stem: path.read_text("utf-8")
+        for path in sorted(folder.rglob("*.toml"), key=lambda path: path.stem)
+    }
     heads = {name: tomllib.loads(text.partition("\n[")[0]) for name, text in texts.items()}
     return tuple(_listing(name, heads, texts) for name in texts)
 
@@ -85,7 +88,7 @@ def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) ->
     chain = _chain(name, heads)
     head = dict(ChainMap(*(dict(heads[each]) for each in chain)))
     return Listing(
-        names=(str(head["model"]), *words(head["aliases"])),
+        names=(str(head["model"]), *words(heads[name].get("aliases", []))),
         model_number=whole(head, "model_number"),
         firmware=whole(head, "firmware") if "firmware" in head else 0,
         build=functools.cache(
@@ -108,8 +111,8 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
     """Return a model's entry with what it takes over from the one that it `extends`.
 
     Items are merged key by key; `left_out` names items that the model does not have; the baud rates are taken
-    over as a whole. Raises ValueError when the chain leads nowhere or in a circle, KeyError when an item
-    that is to be left out is not there.
+    over as a whole, the aliases not at all. Raises ValueError when the chain leads nowhere or in a circle,
+    KeyError when an item that is to be left out is not there.
     """
     merged: dict[str, object] = {}
     items: dict[str, dict[str, object]] = {}
@@ -121,7 +124,7 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
             items.setdefault(item, {}).update(section(new))
         merged.update(entry)
     in_order = sorted(items.items(), key=lambda pair: whole(pair[1], "address"))
-    return {**merged, "items": dict(in_order)}
+    return {**merged, "aliases": entries[name].get("aliases", []), "items": dict(in_order)}
 
 
 def read_control_table(text: str) -> ControlTable:
@@ -137,7 +140,11 @@ def build_table(data: Entry) -> ControlTable:
 
     Raises ValueError when something in it is wrong, KeyError when an entry is missing.
     """
-    items = tuple(_items(section(data["items"])))
+    entries = dict(section(data["items"]))
+    number = whole(data, "model_number")
+    if "model_number" in entries:
+        entries["model_number"] = {"initial": number, **section(entries["model_number"])}
+    items = tuple(_items(entries))
     _check(items)
     by_name = {item.name: item for item in items}
     goal_speed = _first(by_name, "moving_speed", "profile_velocity", "goal_velocity")
@@ -147,8 +154,8 @@ def build_table(data: Entry) -> ControlTable:
     firmware = data.get("fast_sync_read_firmware")
     return ControlTable(
         model=str(data["model"]),
-        aliases=tuple(words(data["aliases"])),
-        model_number=whole(data, "model_number"),
+        aliases=tuple(words(data.get("aliases", []))),
+        model_number=number,
         protocol=protocol_in(data["protocol"]),
         items=MappingProxyType(by_name),
         baud_rates=MappingProxyType(
