@@ -316,7 +316,7 @@ def test_a_compressed_attachment_that_is_wrong_is_left_out(
         writer.start(schemas.PROFILE)
         writer.add_metadata(schemas.METADATA_NAME, to_metadata(header))
         writer.add_attachment(0, 0, "plan.json.zst", "application/zstd", data)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        writer.finish()
     read = read_log(tmp_path / "run.mcap")
     assert "plan.json" not in read.attachments
     assert "a record of kind attachment cannot be read" in read.damage[0]

@@ -139,7 +139,7 @@ def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path, form:
     main = packets.take(packets.bus == 0)
     assert list(zip(main.cycle.tolist(), main.servo_id.tolist(), strict=True)) == [
         (-1, 254),
-        *((cycle, who) for cycle in (0, 1, 249, 251) for who in (254, 255, 9)),
+        *((cycle, servo_id) for cycle in (0, 1, 249, 251) for servo_id in (254, 255, 9)),
     ]
     assert packets.cycle[packets.bus == 1].tolist() == [0, 1, 249, 251]
     assert [one.first_ns for one in main] == [1, *(1, 5, 6) * 4]
@@ -189,7 +189,7 @@ def in_format_7(path: Path) -> Path:
                     b"".join(one.data for one in some),
                 )
                 writer.add_message(channel, 0, data, 0)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        writer.finish()
     return older
 
 

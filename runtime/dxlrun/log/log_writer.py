@@ -178,7 +178,7 @@ class LogWriter:
     def _end_chunk(self) -> None:
         """Write the chunk, with the packets that belong to its cycles: what is behind it may be lost."""
         self._write_packets()
-        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        self._writer.flush()
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
         self._chunk_bytes = 0
 
@@ -376,5 +376,5 @@ class LogWriter:
         self._writer.add_metadata(
             schemas.SUMMARY_NAME, {"messages": str(self._messages), "gaps": str(self._lost)}
         )
-        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        self._writer.finish()
         self._file.sync()

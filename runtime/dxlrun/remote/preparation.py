@@ -330,7 +330,7 @@ class Preparation:
 # Quantities with units
 
 
-def _seconds(text: str) -> float:
+def _seconds(text: object) -> float:
     return duration(text) / 1e9
 
 
@@ -349,7 +349,7 @@ def _fraction(value: object) -> object:
     return value
 
 
-QUANTITIES: Mapping[str, Callable[[str], object]] = {
+QUANTITIES: Mapping[str, Callable[[object], object]] = {
     "positions": angle,
     "velocities": angular_velocity,
     "accelerations": angular_acceleration,
@@ -359,7 +359,7 @@ QUANTITIES: Mapping[str, Callable[[str], object]] = {
     "start_in": _seconds,
 }
 """Keys of commands -> what makes rad, rad/s, rad/s^2 or s of a quantity with its unit."""
-_LINEAR: Mapping[str, Callable[[str], object]] = {
+_LINEAR: Mapping[str, Callable[[object], object]] = {
     **QUANTITIES,
     "positions": length,
     "velocities": linear_velocity,
@@ -415,7 +415,7 @@ def plain_quantities(
     for joint, value in values.items():
         try:
             quantity = (_LINEAR if joint in linear else QUANTITIES)[field]
-            plain[joint] = quantity(value)  # type: ignore[arg-type]  # of a number: ValueError
+            plain[joint] = quantity(value)
         except ValueError as error:
             mistaken[joint] = f"{joint}: {error}"
     if mistaken:
@@ -440,7 +440,7 @@ def _plain(
     if quantity is None or value is None:
         return value
     try:
-        return quantity(value)  # type: ignore[arg-type]  # of a number: ValueError, the unit is missing
+        return quantity(value)
     except ValueError as error:
         shown = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
         mistaken.append(("".join(f"/{step}" for step in path), f"{shown.removeprefix('.')}: {error}"))
