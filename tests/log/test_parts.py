@@ -357,7 +357,7 @@ def test_a_disk_that_is_full_ends_the_log_with_whole_parts(
 
 def test_a_record_that_is_none_is_refused_as_in_one_file(start: Start) -> None:
     run = start(RecordingPlan(split_ns=SECOND))
-    for kind, sentence in ((RecordKind.CYCLE, "buffer"), (RecordKind.EVENT, "Expected")):
+    for kind, sentence in ((RecordKind.CYCLE, "buffer"), (RecordKind.TAGGED, "Expected")):
         with pytest.raises(ValueError, match=sentence):
             run.log.take(kind, b"?")
     run.log.close()

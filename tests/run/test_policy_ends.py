@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from dxlrun.channels import process
-from dxlrun.channels.events import Severity, decode_event
+from dxlrun.channels.events import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
+from dxlrun.channels.tagged import decode
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.run.guardian import SafeStop
@@ -171,7 +172,8 @@ def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop,
     robot, safe_stop, memory = safe_stop
     robot.buses[0].servo(2).silence(silent)
     _, result = safe_stop.limp((), "torque was cut on request", Severity.WARNING)
-    event = decode_event(records(memory.guardian, RecordKind.EVENT)[-1])
+    event = decode(records(memory.guardian, RecordKind.TAGGED)[-1])
+    assert isinstance(event, Event)
     assert event.text == f"torque was cut on request; {result}"
     if silent:
         assert "not confirmed by lift (ID 2 on bus main): " in result

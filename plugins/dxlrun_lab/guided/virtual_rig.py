@@ -17,11 +17,12 @@ from starlette.types import Message
 
 from dxlrun.channels import heartbeat, mailbox, ring
 from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
-from dxlrun.channels.events import LONGEST_EVENT, Event, decode_event
+from dxlrun.channels.events import LONGEST_EVENT, Event
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import Mailbox
-from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD
+from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Payload, RecordKind, RingWriter
+from dxlrun.channels.tagged import decode
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.client import RemoteRobot
@@ -71,12 +72,8 @@ class RobotOnVirtualTime:
         )
         self._heartbeat = Heartbeat(memory.heartbeat)
         messages = RingWriter(memory.messages)
-        self._rings = {
-            RecordKind.CYCLE: RingWriter(memory.cycles),
-            RecordKind.EVENT: RingWriter(memory.events),
-            RecordKind.TOPIC: messages,
-            RecordKind.MESSAGE: messages,
-        }
+        self._cycle_ring = RingWriter(memory.cycles)
+        self._rings = {Event: RingWriter(memory.events), OpenedTopic: messages, TopicMessage: messages}
         self.simulated = VirtualRobot(plan, log=log, watch=self._watch)
         self.simulated.robot.loop.steering.inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
         self.gateways_link = Link(plan, memory)
@@ -109,11 +106,14 @@ class RobotOnVirtualTime:
             self._our_turn.release()
 
     def _watch(self, kind: RecordKind, payload: Payload) -> None:
-        if kind in self._rings:
-            self._rings[kind].append(kind, payload)
-        if kind is RecordKind.EVENT:
-            self._events.append(decode_event(payload))
+        if kind is RecordKind.TAGGED:
+            found = decode(payload)
+            if type(found) in self._rings:
+                self._rings[type(found)].append(kind, payload)
+            if isinstance(found, Event):
+                self._events.append(found)
         elif kind is RecordKind.CYCLE:
+            self._cycle_ring.append(kind, payload)
             cycle = self.simulated.record.cycle
             if cycle < 0:  # the record before the first cycle
                 return

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord, Floats
-from dxlrun.channels.events import EventCode, GoalReport, decode_event
+from dxlrun.channels.events import Event, EventCode, GoalReport
 from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.channels.tagged import decode
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun_analysis.joints.tracking import rests
@@ -102,9 +103,9 @@ class CycleMemory:
 
     def watch(self, kind: RecordKind, payload: Payload) -> None:
         """Take what happened beside the cycles: goals."""
-        if kind != RecordKind.EVENT:
+        event = decode(payload) if kind == RecordKind.TAGGED else None
+        if not isinstance(event, Event):
             return
-        event = decode_event(payload)
         if event.code == EventCode.GOAL_ACCEPTED:
             self._goals += 1
         elif event.code == EventCode.GOAL_ENDED and event.data:

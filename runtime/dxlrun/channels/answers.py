@@ -14,6 +14,7 @@ from typing import TypeAlias
 import msgspec
 
 Field: TypeAlias = str | int | float | tuple[str, ...]
+_MOST_BITS = 63
 MOST_NAMED = 4
 """Names of a list in a sentence; a program has all of them."""
 
@@ -177,7 +178,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
     fields: Mapping[str, Field] = {}
 
     def __post_init__(self) -> None:
-        """Escape what no UTF-8 has: a plug-in's error may name a file whose name is none."""
+        """Make texts of integers beyond 64 bits, and escape what no UTF-8 has, such as a name of a file."""
         shown = {name: _writable(value) for name, value in self.fields.items()}
         msgspec.structs.force_setattr(self, "fields", shown)
 
@@ -214,26 +215,32 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _writable(value: Field) -> Field:
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:  # MessagePack has no longer ones
+        return str(value)
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
-def encode_answer(answer: Answer, most: int) -> bytes:
-    """Return an answer as JSON of at most so many bytes; of long texts and lists as much as fits."""
-    data = msgspec.json.encode(answer)
-    while len(data) > most and isinstance(answer, Waiting):
-        answer = Waiting(answer.controllers[: len(answer.controllers) // 2])
-        data = msgspec.json.encode(answer)
-    while len(data) > most and isinstance(answer, Refusal):
-        fields = dict(answer.fields)
-        longest = max(fields, key=lambda name: len(str(fields[name])))
-        value = fields[longest]
-        fields[longest] = value[: len(value) // 2] if isinstance(value, str | tuple) else 0
-        answer = Refusal(answer.code, fields)
-        data = msgspec.json.encode(answer)
+class Answered(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=5):
+    """An answer on its way to the gateway."""
+
+    number: int
+    """Of the command."""
+    answer: Answer
+
+
+def encode_answer(number: int, answer: Answer, most: int) -> bytes:
+    """Return the record of an answer, of at most so many bytes; of long texts and lists as much as fits."""
+    data = msgspec.msgpack.encode(Answered(number, answer))
+    while len(data) > most:
+        if isinstance(answer, Waiting):
+            answer = Waiting(answer.controllers[: len(answer.controllers) // 2])
+        elif isinstance(answer, Refusal):
+            fields = dict(answer.fields)
+            longest = max(fields, key=lambda name: len(str(fields[name])))
+            value = fields[longest]
+            fields[longest] = value[: len(value) // 2] if isinstance(value, str | tuple) else 0
+            answer = Refusal(answer.code, fields)
+        else:
+            break
+        data = msgspec.msgpack.encode(Answered(number, answer))
     return data
-
-
-def decode_answer(data: bytes) -> Answer:
-    """Return the answer of some bytes; raises ValueError when they are none."""
-    answer: Answer = msgspec.json.decode(data, type=Answer)
-    return answer

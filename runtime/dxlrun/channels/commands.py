@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer
-from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 
 LOOP = ""
 """Name of the addressee of a command that is for the loop itself; no controller can be called so."""
@@ -31,7 +31,7 @@ _NUMBER = 8
 """Bytes of a float64."""
 
 
-class Command(msgspec.Struct, frozen=True, array_like=True):
+class Command(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=1):
     """A request to a controller, or to the loop."""
 
     number: int
@@ -50,7 +50,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     nothing was prepared, or it was too long."""
 
 
-class TakenCommand(msgspec.Struct, frozen=True, array_like=True):
+class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=2):
     """One command that a cycle took: for a controller, active or not, or for the loop itself."""
 
     t_ns: int
@@ -165,7 +165,7 @@ class CommandRing:
 
     def take(self, command: TakenCommand) -> None:
         """Append one command."""
-        self._writer.append(RecordKind.TAKEN_COMMAND, msgspec.msgpack.encode(command))
+        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(command))
 
 
 def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
@@ -175,15 +175,6 @@ def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
     if command.request and len(record) > most:
         record = msgspec.msgpack.encode(replace(command, request=b""))
     return record
-
-
-decode_command = msgspec.msgpack.Decoder(Command).decode
-"""Return the command of a record; raises ValueError when it is none."""
-
-
-def decode_taken_command(payload: Payload) -> TakenCommand:
-    """Return the command of a record that a cycle left; raises ValueError when it is none."""
-    return msgspec.msgpack.decode(payload, type=TakenCommand)
 
 
 def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:

@@ -9,7 +9,7 @@ from typing import Protocol
 import msgspec
 from msgspec import structs
 
-from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 
 
 @unique
@@ -163,7 +163,7 @@ _MOST_MISSED = 100
 _USUAL_EVENT = 192
 
 
-class Event(msgspec.Struct, frozen=True, array_like=True):
+class Event(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=0):
     """One thing that happened."""
 
     t_ns: int
@@ -180,8 +180,10 @@ class Event(msgspec.Struct, frozen=True, array_like=True):
     @property
     def name(self) -> str:
         """The name of the code, in lower case."""
-        known = _known(self.code)
-        return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
+        try:
+            return EventCode(self.code).name.lower()
+        except ValueError:
+            return f"code_{self.code}"
 
 
 class EventGroup(msgspec.Struct, frozen=True):
@@ -284,25 +286,12 @@ class EventRing:
             _writable(text[:LONGEST_TEXT]),
             data if len(data) <= LONGEST_DATA else b"",
         )
-        self._writer.append(RecordKind.EVENT, msgspec.msgpack.encode(event))
+        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(event))
 
 
 def _writable(text: str) -> str:
     """Replace what no UTF-8 has: a traceback may name a file with such a name."""
     return text.encode(errors="replace").decode()
-
-
-def _known(code: int) -> int:
-    try:
-        return EventCode(code)
-    except ValueError:
-        return code
-
-
-def decode_event(payload: Payload) -> Event:
-    """Return the event of one record. Raises ValueError when it is not one."""
-    event = msgspec.msgpack.decode(payload, type=Event)
-    return structs.replace(event, code=_known(event.code))
 
 
 def event_capacity(period_ns: int, servos: int) -> int:

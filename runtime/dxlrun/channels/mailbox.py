@@ -19,19 +19,18 @@ import mmap
 import os
 import struct
 from collections.abc import Sequence
-from contextlib import suppress
 
 from dxlrun.channels import ring
-from dxlrun.channels.answers import Answer, decode_answer, encode_answer
+from dxlrun.channels.answers import Answer, Answered, encode_answer
 from dxlrun.channels.commands import (
     LONGEST_COMMAND,
     MOST_PER_CYCLE,
     Command,
-    decode_command,
     encode_command,
 )
 from dxlrun.channels.fence import fence
 from dxlrun.channels.ring import Appender, Record, RecordKind, RingReader, RingWriter, record_size
+from dxlrun.channels.tagged import Tagged, decode
 
 LONGEST_SET_POINT = 4096
 """Bytes of a set-point's record."""
@@ -52,7 +51,6 @@ _HEADER = 64
 _MAGIC = int.from_bytes(b"dxlmail2", "little")
 _GENERATION = 2
 _FIXED = struct.Struct("=QQ")
-_ANSWER = struct.Struct("<q")
 
 
 def create(places: int) -> int:
@@ -116,7 +114,7 @@ class MailboxWriter:
         untaken = lane.head - lane.taken
         if len(payload) > LONGEST_COMMAND or untaken + record_size(len(payload)) > _CAPACITY:
             return False
-        lane.append(RecordKind.COMMAND, payload)
+        lane.append(RecordKind.TAGGED, payload)
         return True
 
     def set_point(self, place: int, command: Command) -> bool:
@@ -124,7 +122,7 @@ class MailboxWriter:
         payload = encode_command(command, LONGEST_SET_POINT)
         if len(payload) > LONGEST_SET_POINT:
             return False
-        self._places[place].append(RecordKind.COMMAND, payload)
+        self._places[place].append(RecordKind.TAGGED, payload)
         fence()  # last: the loop looks at the places only after it has changed
         self._words[_GENERATION] += 1
         return True
@@ -175,17 +173,14 @@ class Mailbox:
 
     def answer(self, number: int, answer: Answer) -> None:
         """Answer a command of the gateway; long texts in a refusal's fields are cut."""
-        payload = _ANSWER.pack(number) + encode_answer(answer, LONGEST_ANSWER - _ANSWER.size)
-        self._answers.append(RecordKind.ANSWER, payload)
+        self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
 
     def _decode(self, record: Record | None, commands: list[Command]) -> None:
-        try:
-            if record is not None:
-                commands.append(decode_command(record.payload))
-                return
-        except ValueError:
-            pass
-        self.dropped += 1
+        found = None if record is None else _found(record)
+        if isinstance(found, Command):
+            commands.append(found)
+        else:
+            self.dropped += 1
 
 
 class Answers:
@@ -194,12 +189,15 @@ class Answers:
     def __init__(self, descriptor: int) -> None:
         self._ring = RingReader(descriptor)
 
-    def new(self) -> list[tuple[int, Answer]]:
+    def new(self) -> list[Answered]:
         """Return the answers since the last call, each with its command's number."""
-        found: list[tuple[int, Answer]] = []
-        while (record := self._ring.read()) is not None:
-            if isinstance(record, Record) and len(record.payload) >= _ANSWER.size:
-                with suppress(ValueError):
-                    answer = decode_answer(bytes(record.payload[_ANSWER.size :]))
-                    found.append((_ANSWER.unpack_from(record.payload)[0], answer))
-        return found
+        found = [_found(one) for one in iter(self._ring.read, None) if isinstance(one, Record)]
+        return [one for one in found if isinstance(one, Answered)]
+
+
+def _found(record: Record) -> Tagged | None:
+    """Return what a record has; None where that is nothing of ours."""
+    try:
+        return decode(record.payload)
+    except ValueError:
+        return None

@@ -1,19 +1,17 @@
 """Messages of topics: encoded where they are made, and handed on as they are, to the log and to clients.
 
-A topic is announced once, with its definition, before its first message; the number that it gets then is in
-front of its messages. It is not used again: a controller that is loaded in the run announces its topics, too.
-Each message has its number among those of its topic's name, so a reader knows how many it missed.
+A topic is announced once, with its definition, before its first message; its messages name it by the number
+that it gets then, which is not used again: controllers that are loaded in the run announce topics, too. Each
+message has its number among those of its topic's name, so a reader knows how many it missed.
 """
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass
 from typing import Protocol
 
 import msgspec
 
-from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 from dxlrun.messages.definition import MessageType
 
 LONGEST_MESSAGE = 64 * 1024
@@ -22,12 +20,8 @@ LEAST_CAPACITY = 1 << 20
 """Bytes of a ring: for the topics of the runtime, and of controllers that are loaded in the run."""
 MOST_CAPACITY = 64 << 20
 
-_HEADER = struct.Struct("<qqq")
-"""Time, number of the topic and of the message; the message follows, or of a topic what it is, as JSON."""
 
-
-@dataclass(frozen=True, slots=True)
-class Topic:
+class Topic(msgspec.Struct, frozen=True):
     """A topic that the loop publishes: its name, its type, and the joints that rows of its arrays are of."""
 
     name: str
@@ -36,16 +30,25 @@ class Topic:
     joints: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TopicMessage:
+class OpenedTopic(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=3):
+    """A topic that has messages from here on."""
+
+    number: int
+    """By which its messages name it, in the order of announcement."""
+    before: int
+    """How many messages its name has had."""
+    topic: Topic
+
+
+class TopicMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=4):
     """One message."""
 
     t_ns: int
     """Wake-up of the cycle that published it, ns of the run's clock."""
     topic: int
-    """Number of the topic, in the order of announcement."""
+    """Its number."""
     number: int
-    """Of the message among those of its topic, from 1; of a topic how many its name has had before."""
+    """Of the message among those of its topic's name, from 1."""
     data: bytes
     """CDR."""
 
@@ -80,13 +83,15 @@ class MessageRing:
         count = 0 if before is None else self._counts[before]
         self._counts.append(count)
         self._numbers[topic.name] = number
-        self._writer.append(RecordKind.TOPIC, _HEADER.pack(0, number, count) + msgspec.json.encode(topic))
+        opened = OpenedTopic(number, count, topic)
+        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(opened))
         return number
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
         """Append one message."""
         self._counts[topic] = number = self._counts[topic] + 1
-        self._writer.append(RecordKind.MESSAGE, _HEADER.pack(t_ns, topic, number) + data)
+        message = TopicMessage(t_ns, topic, number, data)
+        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(message))
 
 
 class NoMessages:
@@ -100,22 +105,7 @@ class NoMessages:
         """Forget it."""
 
 
-def decode_topic(payload: Payload) -> tuple[int, Topic]:
-    """Return number and topic of a record. Raises ValueError when it is none."""
-    record = decode_message(payload)
-    return record.topic, msgspec.json.decode(record.data, type=Topic)
-
-
-def decode_message(payload: Payload) -> TopicMessage:
-    """Return the message of a record. Raises ValueError when it is none."""
-    try:
-        t_ns, topic, number = _HEADER.unpack_from(payload)
-    except struct.error as error:
-        raise ValueError(f"a message ends inside its header: {error}") from error
-    return TopicMessage(t_ns, topic, number, bytes(payload[_HEADER.size :]))
-
-
-LONGEST_RECORD = LONGEST_MESSAGE + _HEADER.size
+LONGEST_RECORD = LONGEST_MESSAGE + 64
 """Bytes of a record; a definition is shorter by far."""
 
 

@@ -64,18 +64,8 @@ class RecordKind(IntEnum):
     """cycle.py"""
     PACKETS = 2
     """packets.py: the packets of about one cycle"""
-    EVENT = 3
-    """events.py"""
-    TAKEN_COMMAND = 4
-    """commands.py: a command that a cycle took"""
-    COMMAND = 5
-    """commands.py: a command on its way to the loop"""
-    ANSWER = 6
-    """mailbox.py"""
-    TOPIC = 7
-    """messages.py: a topic that has messages from here on"""
-    MESSAGE = 8
-    """messages.py"""
+    TAGGED = 3
+    """tagged.py: anything else"""
 
 
 class Record(NamedTuple):

@@ -13,11 +13,12 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from dxlrun.channels.commands import decode_taken_command
-from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, decode_event
-from dxlrun.channels.messages import decode_message, decode_topic
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.channels.events import Event, EventCode, LostRecords, Severity
+from dxlrun.channels.messages import OpenedTopic, TopicMessage
 from dxlrun.channels.packets import BatchedPacket, split_packets
 from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.channels.tagged import decode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.log_file import LogFile
@@ -69,16 +70,15 @@ class LogWriter:
         self._sequences: dict[int, int] = {}
         self._known: dict[str, int] = {}
         """Schemas by the names of their messages."""
+        self.topics: dict[bytes, None] = {}
+        """Records of the topics that were opened."""
         self._topic_channels: dict[int, int] = {}
         """Channels of topics by their numbers."""
         self._machine_channel: int | None = None
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self._cycle,
             RecordKind.PACKETS: self._packets,
-            RecordKind.EVENT: self._event_record,
-            RecordKind.TAKEN_COMMAND: self._taken_command,
-            RecordKind.TOPIC: self._topic,
-            RecordKind.MESSAGE: self._message,
+            RecordKind.TAGGED: self._tagged,
         }
         self._diagnostics = Diagnostics(header.joints)
         messages = (schemas.EVENT, schemas.ROS_LOG, schemas.JOINT_STATE, schemas.COMMAND)
@@ -270,8 +270,23 @@ class LogWriter:
                 packets.clear()
                 self._add(channel, t_ns, data)
 
-    def _taken_command(self, payload: Payload) -> None:
-        command = decode_taken_command(payload)
+    def _tagged(self, payload: Payload) -> None:
+        match decode(payload):
+            case Event() as event:
+                self._write_event(event)
+            case TakenCommand() as command:
+                self._taken_command(command)
+            case OpenedTopic(number, topic=topic):
+                self.topics[bytes(payload)] = None
+                self._topic_channels[number] = self._channel(topic.name, topic.type)
+            case TopicMessage(t_ns, number, data=data) if number in self._topic_channels:
+                self._add(self._topic_channels[number], t_ns, data)
+            case other:
+                raise ValueError(
+                    f"{type(other).__name__} does not belong into a log, or its topic was not opened"
+                )
+
+    def _taken_command(self, command: TakenCommand) -> None:
         data = self._command.pack(
             command.t_ns,
             command.cycle,
@@ -285,22 +300,6 @@ class LogWriter:
             command.request.decode(errors="replace"),
         )
         self._add(self._taken_channel, command.t_ns, data)
-
-    def _topic(self, payload: Payload) -> None:
-        """Open the channel of a topic that has messages from now on."""
-        number, topic = decode_topic(payload)
-        self._topic_channels[number] = self._channel(topic.name, topic.type)
-
-    def _message(self, payload: Payload) -> None:
-        """Write one message of a topic, as it is."""
-        message = decode_message(payload)
-        channel = self._topic_channels.get(message.topic)
-        if channel is None:
-            raise ValueError(f"a message is of topic number {message.topic}, which was not announced")
-        self._add(channel, message.t_ns, message.data)
-
-    def _event_record(self, payload: Payload) -> None:
-        self._write_event(decode_event(payload))
 
     def _write_event(self, event: Event) -> None:
         """Write one event, to /events and /rosout."""

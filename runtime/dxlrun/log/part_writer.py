@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -48,18 +49,16 @@ class PartWriter:
         self._kept: deque[tuple[Path, int]] = deque()
         """Closed parts that were not deleted, and the time of the newest record of each."""
         self._summary: LogSummary | None = None
-        self._topics: dict[bytes, None] = {}
-        """Announced topics, which each part announces again."""
         self._path = path / part_name(0)
-        self._log = self._open(0, "start")
+        self._log = self._open(0, "start", ())
 
     @property
     def error(self) -> str | None:
         """Why the log is not whole; nothing is written any more."""
         return self._error or self._log.error
 
-    def _open(self, index: int, began: str) -> LogWriter:
-        """Begin a part; it says why it begins, and whether earlier ones may have been deleted."""
+    def _open(self, index: int, began: str, topics: Iterable[bytes]) -> LogWriter:
+        """Begin a part, which opens these topics; it says why it begins, and what of earlier ones is kept."""
         part = {"index": str(index), "began": began, "keep_ns": str(self._plan.keep_ns or "")}
         self._path = self._folder / part_name(index)
         try:
@@ -70,8 +69,8 @@ class PartWriter:
         except OSError:
             self._path.unlink(missing_ok=True)  # it has nothing, and would look like a part
             raise
-        for topic in self._topics:
-            log.take(RecordKind.TOPIC, topic)
+        for topic in topics:
+            log.take(RecordKind.TAGGED, topic)
         return log
 
     def _next(self, began: str) -> None:
@@ -85,7 +84,7 @@ class PartWriter:
         index = len(self._closed) + 1
         ended = self._path
         try:
-            log = self._open(index, began)
+            log = self._open(index, began, self._log.topics)
         except OSError as error:
             self._error = f"{part_name(index)} cannot be written: {error.strerror or error}"
             return
@@ -100,8 +99,6 @@ class PartWriter:
 
     def take(self, kind: int, payload: Payload) -> None:
         """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
-        if kind == RecordKind.TOPIC:
-            self._topics[bytes(payload)] = None
         if self._error is None:
             self._log.take(kind, payload)
         else:

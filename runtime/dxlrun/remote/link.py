@@ -15,10 +15,11 @@ import msgspec
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, Command
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import Event, EventCode, decode_event
+from dxlrun.channels.events import Event, EventCode
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
-from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader
+from dxlrun.channels.ring import Gap, RecordKind, RingReader
+from dxlrun.channels.tagged import decode
 from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.messages.cdr import Codec
@@ -243,21 +244,23 @@ class Link:
 
     def collect(self) -> None:
         """Collect the answers and events that have come."""
-        for number, answer in self._answers.new():
-            if number in self._pending:  # else it answers a set-point of a stream
-                self._resolve(number, answer)
+        for answered in self._answers.new():
+            if answered.number in self._pending:  # else it answers a set-point of a stream
+                self._resolve(answered.number, answered.answer)
         reports = [one for one in self.topics.collect() if one[0].name == GOALS_TOPIC]
         idle: frozenset[str] = frozenset()
         idle_s = 0.0
         for ring in self._event_rings:
             while (record := ring.read()) is not None:
-                if isinstance(record, Gap) and ring is self._event_rings[0]:
-                    # what the loop has reported until now is still in its ring, and read below
-                    idle_s, idle = self._idle()
-                # the log reports gaps; packets and commands are for it alone
-                if isinstance(record, Record) and record.kind == RecordKind.EVENT:
+                if isinstance(record, Gap):  # the log reports it
+                    if ring is self._event_rings[0]:
+                        # what the loop has reported until now is still in its ring, and read below
+                        idle_s, idle = self._idle()
+                elif record.kind == RecordKind.TAGGED:  # packets and commands are for the log alone
                     with suppress(ValueError):
-                        self._keep(decode_event(record.payload))
+                        found = decode(record.payload)
+                        if isinstance(found, Event):
+                            self._keep(found)
         for topic, message in reports:
             with suppress(ValueError):  # none of ours: the loop encodes them
                 self.goals.take_message(_codec(topic.type).unpack(message.data), message.t_ns * 1e-9)

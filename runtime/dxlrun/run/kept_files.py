@@ -22,8 +22,9 @@ from dxlrun.channels.kept import (
     KeptStates,
     opened_file,
 )
-from dxlrun.channels.messages import decode_message, decode_topic
+from dxlrun.channels.messages import OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Gap, Payload, RecordKind, RingReader
+from dxlrun.channels.tagged import decode
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
@@ -135,14 +136,16 @@ class KeptFiles:
     def take(self, kind: int, payload: Payload) -> None:
         """Take one record; those of other topics are passed by. Raises nothing."""
         with suppress(ValueError):  # damaged: the recorder declares it
-            if kind == RecordKind.TOPIC:
-                number, topic = decode_topic(payload)
-                if topic.name == TOPIC:
-                    self._topic, self._assembly = number, Assembly(Codec(topic.type))
-            elif kind == RecordKind.MESSAGE and self._assembly is not None:
-                message = decode_message(payload)
-                if message.topic == self._topic and (whole := self._assembly.take(message.data)):
-                    self._write(*whole)
+            found = decode(payload) if kind == RecordKind.TAGGED else None
+            if isinstance(found, OpenedTopic) and found.topic.name == TOPIC:
+                self._topic, self._assembly = found.number, Assembly(Codec(found.topic.type))
+            elif (
+                isinstance(found, TopicMessage)
+                and found.topic == self._topic
+                and self._assembly
+                and (whole := self._assembly.take(found.data))
+            ):
+                self._write(*whole)
 
     def _write(self, controller: str, data: bytes) -> None:
         try:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from tests.kit.anew import plan
 from tests.kit.stories import differing
 
-from dxlrun.channels.commands import Command, decode_command, encode_command
+from dxlrun.channels.commands import Command, encode_command
+from dxlrun.channels.tagged import decode
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.motion import read_motion
 from dxlrun.log.reader import read_log
@@ -115,6 +116,6 @@ def test_a_request_that_the_log_does_not_have_is_reported(
 
 def test_a_request_is_left_out_where_there_is_no_room() -> None:
     command = Command(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
-    assert decode_command(encode_command(command)) == command
+    assert decode(encode_command(command)) == command
     whole = len(encode_command(command))
-    assert decode_command(encode_command(command, whole - 1)) == structs.replace(command, request=b"")
+    assert decode(encode_command(command, whole - 1)) == structs.replace(command, request=b"")

@@ -14,12 +14,11 @@ from dxlrun.channels.commands import (
     CommandRing,
     TakenCommand,
     command_capacity,
-    decode_command,
-    decode_taken_command,
     encode_command,
 )
 from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter, create
+from dxlrun.channels.tagged import decode
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 COMMANDS = st.builds(
@@ -44,9 +43,9 @@ def record_of(command: TakenCommand) -> bytes:
 @settings(max_examples=80, deadline=None)
 @given(COMMANDS, st.integers(0, 2**62))
 def test_what_goes_in_comes_out(taken, lease_ns):
-    assert decode_taken_command(record_of(taken)) == taken
+    assert decode(record_of(taken)) == taken
     command = Command(taken.planned, taken.controller, taken.kind, taken.data, taken.origin, lease_ns)
-    assert decode_command(encode_command(command)) == command
+    assert decode(encode_command(command)) == command
 
 
 COMMAND = TakenCommand(5, 1, -1, "left_arm", "trajectory", "process 12", np.arange(5.0).tobytes())
@@ -55,7 +54,7 @@ COMMAND = TakenCommand(5, 1, -1, "left_arm", "trajectory", "process 12", np.aran
 @pytest.mark.parametrize("length", [0, 10, 39, 60])
 def test_bytes_that_are_no_command_are_refused(length):
     record = encode_command(Command(1, "left_arm", "trajectory", b"", "process 12"))
-    for decode, data in ((decode_taken_command, record_of(COMMAND)), (decode_command, record)):
+    for data in (record_of(COMMAND), record):
         for cut in (data[:length][: len(data) - 1], data + b"\0", data[:5] + b"\xff" + data[6:]):
             with pytest.raises(ValueError, match=r"."):
                 decode(cut)
@@ -63,7 +62,7 @@ def test_bytes_that_are_no_command_are_refused(length):
 
 def test_a_lease_below_zero_is_refused():
     with pytest.raises(ValueError, match=">= 0"):
-        decode_command(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
+        decode(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
 
 
 def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_looks_meanwhile():
@@ -86,7 +85,6 @@ def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_loo
     for one in taken:
         ring.take(TakenCommand(0, 0, -1, one.controller, one.kind, one.origin, one.data, one.lease_ns))
     found = list(iter(reader.read, None))
-    assert all(isinstance(one, Record) and one.kind is not RecordKind.COMMAND for one in found)
-    assert [decode_taken_command(one.payload).data for one in found if isinstance(one, Record)] == [
-        one.data for one in taken
-    ]
+    assert all(isinstance(one, Record) and one.kind == RecordKind.TAGGED for one in found)
+    records = [decode(one.payload) for one in found if isinstance(one, Record)]
+    assert [one.data for one in records if isinstance(one, TakenCommand)] == [one.data for one in taken]

@@ -14,10 +14,10 @@ from dxlrun.channels.events import (
     EventCode,
     EventRing,
     Severity,
-    decode_event,
     event_capacity,
 )
 from dxlrun.channels.ring import Handover, record_size
+from dxlrun.channels.tagged import decode
 from dxlrun.clock import VirtualClock
 
 
@@ -30,6 +30,12 @@ def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: 
     return record
 
 
+def decoded(record: bytes) -> Event:
+    event = decode(record)
+    assert isinstance(event, Event)
+    return event
+
+
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=600)
 
 
@@ -38,12 +44,12 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=600)
 @example(EventCode.GATE, Severity.INFO, "x" + "€" * 600)
 @given(st.sampled_from(EventCode), st.sampled_from(Severity), TEXT)
 def test_an_event_comes_out_as_it_went_in(code, severity, text):
-    event = decode_event(emitted(code, severity, "head_yaw_joint", text))
+    event = decoded(emitted(code, severity, "head_yaw_joint", text))
     assert event == Event(5, code, severity, "head_yaw_joint", text)
 
 
 def test_what_cannot_be_encoded_or_is_endless_is_still_recorded():
-    event = decode_event(
+    event = decoded(
         emitted(EventCode.CONTROLLER_FAULT, Severity.ERROR, "\N{ROBOT FACE}" * 500, "\udcff" + "€" * 100_000)
     )
     assert event.text == "?" + "€" * (LONGEST_TEXT - 1)
@@ -51,7 +57,7 @@ def test_what_cannot_be_encoded_or_is_endless_is_still_recorded():
 
 
 def test_a_code_of_a_newer_version_stays_a_number():
-    newer = decode_event(msgspec.msgpack.encode(Event(5, 999, 30, "a", "b")))
+    newer = decoded(msgspec.msgpack.encode(Event(5, 999, 30, "a", "b")))
     assert (newer, newer.name) == (Event(5, 999, 30, "a", "b"), "code_999")
     assert Event(5, 40, 30, "a", "b").name == "gate"
 
@@ -59,7 +65,7 @@ def test_a_code_of_a_newer_version_stays_a_number():
 @pytest.mark.parametrize("cut", [0, 3, 8])
 def test_a_cut_event_is_refused(cut):
     with pytest.raises(ValueError, match="truncated"):
-        decode_event(emitted(EventCode.GATE, Severity.WARNING, "a", "b")[:cut])
+        decoded(emitted(EventCode.GATE, Severity.WARNING, "a", "b")[:cut])
 
 
 def test_the_ring_holds_ten_seconds_of_the_worst_storm():

@@ -219,8 +219,9 @@ def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
         Code.CONTROLLER_FAULT, {"controller": "arm", "problem": '"ä\n' * 10_000, "seen": ("a",) * 999}
     )
     both.reader.answer(5, long)
-    *found, (number, cut) = both.answers.new()
-    assert found == list(enumerate(given))
+    *found, last = both.answers.new()
+    number, cut = last.number, last.answer
+    assert [(one.number, one.answer) for one in found] == list(enumerate(given))
     assert (number, cut.code, cut.fields["controller"]) == (5, Code.CONTROLLER_FAULT, "arm")
     assert long.fields["problem"].startswith(cut.fields["problem"])
     assert len(cut.fields["problem"]) > 20
@@ -229,15 +230,21 @@ def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
 
 def test_an_answer_that_names_many_controllers_is_cut(both):
     both.reader.answer(1, Waiting(tuple(f"controller_{index:060}" for index in range(63))))
-    ((number, answer),) = both.answers.new()
-    assert number == 1
-    assert isinstance(answer, Waiting)
+    (found,) = both.answers.new()
+    assert found.number == 1
+    assert isinstance(found.answer, Waiting)
 
 
 def test_a_refusal_with_a_text_that_is_no_utf_8_is_answered(both):
     both.reader.answer(1, Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"}))
-    ((_, answer),) = both.answers.new()
-    assert answer.text == "no file a\\udcff"
+    (found,) = both.answers.new()
+    assert found.answer.text == "no file a\\udcff"
+
+
+def test_a_refusal_with_an_integer_that_no_record_can_hold_is_answered(both):
+    both.reader.answer(1, Refusal(Code.UNKNOWN_GOAL, {"goal": -(10**30), "last": 2**63 - 1}))
+    (found,) = both.answers.new()
+    assert found.answer.fields == {"goal": f"-1{'0' * 30}", "last": 2**63 - 1}
 
 
 def test_a_descriptor_of_something_else_is_refused():

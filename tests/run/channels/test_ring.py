@@ -48,12 +48,12 @@ def make():
 
 
 def event(payload: bytes) -> Record:
-    return Record(RecordKind.EVENT, payload)
+    return Record(RecordKind.TAGGED, payload)
 
 
 def append(writer: RingWriter, *payloads: bytes) -> None:
     for payload in payloads:
-        writer.append(RecordKind.EVENT, payload)
+        writer.append(RecordKind.TAGGED, payload)
 
 
 def all_of(reader: RingReader) -> list[Record | Gap]:
@@ -451,6 +451,6 @@ def test_a_handover_gives_each_record_at_once():
     taken: list[tuple[RecordKind, bytes]] = []
     handover = Handover(lambda kind, payload: taken.append((kind, bytes(payload))))
     assert handover.head == 0
-    assert handover.append(RecordKind.EVENT, b"a") == 1
+    assert handover.append(RecordKind.TAGGED, b"a") == 1
     assert handover.append(RecordKind.CYCLE, bytearray(b"b")) == handover.head == 2
-    assert taken == [(RecordKind.EVENT, b"a"), (RecordKind.CYCLE, b"b")]
+    assert taken == [(RecordKind.TAGGED, b"a"), (RecordKind.CYCLE, b"b")]

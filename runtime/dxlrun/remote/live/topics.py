@@ -8,7 +8,7 @@ numbers.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
@@ -17,8 +17,9 @@ import msgspec
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.events import Event
-from dxlrun.channels.messages import Topic, TopicMessage, decode_message, decode_topic
-from dxlrun.channels.ring import Record, RecordKind, RingReader
+from dxlrun.channels.messages import OpenedTopic, Topic, TopicMessage
+from dxlrun.channels.ring import Gap, Record, RingReader
+from dxlrun.channels.tagged import Tagged, decode
 from dxlrun.log.schemas import CYCLE, CYCLE_TOPIC, EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
@@ -101,17 +102,14 @@ class LiveTopics:
     def collect(self) -> list[tuple[Topic, TopicMessage]]:
         """Return the messages since the last call; the log declares what was lost on the way."""
         found = []
-        while (record := self.ring.read()) is not None:
-            with suppress(ValueError):
-                if isinstance(record, Record) and record.kind == RecordKind.TOPIC:
-                    number, topic = decode_topic(record.payload)
-                    opened = _LoopTopic(topic, decode_message(record.payload).number)
-                    self.of_loop[topic.name] = self.by_number[number] = opened
-                elif isinstance(record, Record) and record.kind == RecordKind.MESSAGE:
-                    message = decode_message(record.payload)
-                    if (known := self.by_number.get(message.topic)) is not None:
-                        known.take(message)
-                        found.append((known.topic, message))
+        for message in _decoded(iter(self.ring.read, None)):
+            if isinstance(message, OpenedTopic):
+                opened = _LoopTopic(message.topic, message.before)
+                self.of_loop[message.topic.name] = self.by_number[message.number] = opened
+            elif isinstance(message, TopicMessage) and message.topic in self.by_number:
+                known = self.by_number[message.topic]
+                known.take(message)
+                found.append((known.topic, message))
         return found
 
     def described(self, name: str) -> Topic:
@@ -140,6 +138,14 @@ class LiveTopics:
         return _JOINT_STATE.pack(
             (stamp, ""), self.layout.joints, states.position, states.velocity, states.effort
         )
+
+
+def _decoded(records: Iterable[Record | Gap]) -> Iterator[Tagged]:
+    """Yield the messages of records; what is none is not of ours: the loop encodes them."""
+    for record in records:
+        if isinstance(record, Record):
+            with suppress(ValueError):
+                yield decode(record.payload)
 
 
 def _source_states(source: str, record: CycleRecord) -> bytes:
@@ -199,17 +205,12 @@ class TopicStream:
         self.behind = True
 
     def _new_messages(self) -> Iterator[Opened | Sample]:
-        for record in self._records(self._messages) if self._messages is not None else ():
-            with suppress(ValueError):  # none of ours: the loop encodes them
-                if record.kind == RecordKind.TOPIC:
-                    number, topic = decode_topic(record.payload)
-                    if topic.name in self._places:
-                        self._numbers[number] = self._places[topic.name]
-                        yield self._opened(topic)
-                elif record.kind == RecordKind.MESSAGE:
-                    message = decode_message(record.payload)
-                    if message.topic in self._numbers:
-                        yield self._sample(message)
+        for message in _decoded(self._records(self._messages)) if self._messages is not None else ():
+            if isinstance(message, OpenedTopic) and message.topic.name in self._places:
+                self._numbers[message.number] = self._places[message.topic.name]
+                yield self._opened(message.topic)
+            elif isinstance(message, TopicMessage) and message.topic in self._numbers:
+                yield self._sample(message)
 
     def _new_cycles(self) -> Iterator[Opened | Sample]:
         ring = self._cycles
