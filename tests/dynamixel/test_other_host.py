@@ -89,6 +89,17 @@ def test_one_packet_is_not_yet_another_host():
     assert told(rig) == []
 
 
+@pytest.mark.parametrize(("apart", "events"), [(0.9, 1), (1.1, 0)])
+def test_two_packets_are_another_host_only_near_each_other(apart, events):
+    rig, dialect = build("plain")
+    for _ in range(2):
+        rig.buses[0].other_host(dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)
+        since_ns = rig.clock.now_ns()
+        while rig.clock.now_ns() < since_ns + apart * UNREQUESTED_EVENT_NS:
+            rig.cycle()
+    assert len(told(rig)) == events
+
+
 def lose(bus, servo_id):
     bus.truncate_next(servo_id, 0)
 

@@ -9,6 +9,7 @@ behind a silent one lose their replies with it.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -184,8 +185,12 @@ def loop_runs(events: Sequence[Event], t_ns: int) -> bool:
 
 
 def silent_at(events: Sequence[Event], t_ns: int) -> set[str]:
+    """Return what did not answer at a time, as reported; also a servo that starts anew on request."""
     silent: set[str] = set()
     for event in sorted(events, key=lambda event: event.t_ns):
+        if event.t_ns <= t_ns and event.code == EventCode.STEERED and event.text.startswith("reboot "):
+            request = event.text.removeprefix("reboot ").rpartition(" from ")[0]
+            silent.update(json.loads(request)["joints"])
         if event.t_ns <= t_ns and event.code in SILENT:
             silent.add(event.source)
         elif event.t_ns <= t_ns and event.code in HEARD:

@@ -259,13 +259,13 @@ def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Lo
 
 
 def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log) -> None:
-    """From torque off to the next torque on: no goal of any kind and no torque."""
+    """From torque off to the next torque on: no goal of any kind and no torque; no current is no goal."""
     requests = storms.torque_requests(log)
     wire = [
         (t_ns, servo.joint, item)
         for item in ("goal_position", "goal_current", "torque_enable")
         for t_ns, servo, raw in storms.written(sent, bus, item)
-        if item != "torque_enable" or raw
+        if item == "goal_position" or raw
     ]
     for number, one in enumerate(requests):
         if one.off:

@@ -93,6 +93,7 @@ class Servos:
         self._noise_at_ns = -NOISE_EVENT_NS
         self._unrequested_seen = 0
         self._unrequested_at_ns = -UNREQUESTED_EVENT_NS
+        self._lone, self._lone_ns = 0, 0
         self._line_lost = False
 
     @property
@@ -159,7 +160,12 @@ class Servos:
             text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
             self._events.emit(EventCode.BUS_NOISE, Severity.WARNING, name, text)
         count = self._bus.unrequested - self._unrequested_seen
-        if count >= LEAST_UNREQUESTED and now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
+        if count < LEAST_UNREQUESTED:
+            if self._lone != self._bus.unrequested:
+                self._lone, self._lone_ns = self._bus.unrequested, now_ns
+            elif now_ns - self._lone_ns >= UNREQUESTED_EVENT_NS:  # a very late reply
+                self._unrequested_seen = self._lone
+        elif now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
             self._unrequested_seen, self._unrequested_at_ns = self._bus.unrequested, now_ns
             text = (
                 f"{count} packets on bus {name} answer no request of this run: another program or another "
@@ -258,10 +264,7 @@ class Servos:
     @property
     def _noise_waits(self) -> bool:
         bus = self._bus
-        return (
-            bus.noise_bytes > self._noise_seen
-            or bus.unrequested - self._unrequested_seen >= LEAST_UNREQUESTED
-        )
+        return bus.noise_bytes > self._noise_seen or bus.unrequested > self._unrequested_seen
 
     def abandon(self) -> None:
         """Answer what clients requested and waits for too long, while the line is gone."""
