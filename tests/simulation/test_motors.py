@@ -20,8 +20,8 @@ from dxlrun.plan.simulation_plan import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint
+from dxlrun.simulation.motion.shaft import critical_d
 from dxlrun.simulation.servo.making import make_servo
-from dxlrun.simulation.servo.shaft import critical_d
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 S, STEP_NS = 1_000_000_000, 2_000_000

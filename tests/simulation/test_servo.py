@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.registers.memory import Memory
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92

@@ -25,7 +25,7 @@ from dxlrun.simulation.motion.body import ShaftsShown
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
-from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.registers.memory import Memory
 
 MOST_BACKLOG_NS = 20_000_000
 """A host that hands over bytes faster than they pass the wire is not read while so much of them waits.

@@ -33,8 +33,8 @@ from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmis
 from dxlrun.simulation.device.measured import Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice, make_device
 from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.registers.access import ACCESS
 from dxlrun.simulation.servo.making import make_servo
-from dxlrun.simulation.servo.memory import IDENTITY
 from dxlrun.simulation.servo.node import Node, SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
@@ -192,7 +192,7 @@ class SimulatedBus:
         )
         self.servos += (servo,)
         self.nodes = (*self.servos, *self.devices)
-        servo.registers.watch(IDENTITY, self._nodes_by_id.clear)
+        servo.registers.watch(ACCESS.identity, self._nodes_by_id.clear)
         return servo
 
     def add_device(self, config: DeviceConfig) -> SimulatedDevice:
@@ -204,7 +204,7 @@ class SimulatedBus:
         self.devices += (device,)
         self.nodes = (*self.servos, *self.devices)
         self._nodes_by_id.clear()
-        device.registers.watch(IDENTITY, self._nodes_by_id.clear)
+        device.registers.watch(ACCESS.identity, self._nodes_by_id.clear)
         return device
 
     def device(self, servo_id: int) -> SimulatedDevice:

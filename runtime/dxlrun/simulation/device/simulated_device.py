@@ -19,8 +19,8 @@ from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable, read
 from dxlrun.dynamixel.control_table.devices import device_table
 from dxlrun.plan.simulation_plan import DeviceConfig
 from dxlrun.simulation.device.measured import Measured, shown
-from dxlrun.simulation.servo.access import device_rules
-from dxlrun.simulation.servo.memory import IDENTITY, Memory
+from dxlrun.simulation.registers.access import ACCESS, device_error
+from dxlrun.simulation.registers.memory import Memory
 from dxlrun.simulation.servo.node import Answer, SimulatedNode, baud_value
 from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket
 
@@ -59,13 +59,13 @@ class SimulatedDevice(SimulatedNode):
         registers = _registers(table)
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
         memory = Memory(registers, registers.items["firmware_version"].initial or 1)
-        super().__init__(memory, device_rules, note, now_ns)
+        super().__init__(memory, device_error, note, now_ns)
         memory["id"] = config.servo_id
         if "return_delay_time" in memory:
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
         if "baud_rate" in memory:
             memory["baud_rate"] = baud_value(registers, baud_rate)
-        memory.watch(IDENTITY, self._identify)
+        memory.watch(ACCESS.identity, self._identify)
 
     def _identify(self) -> None:
         self.servo_id = self.registers["id"]

@@ -1,1 +1,1 @@
-"""Servo: memory, instructions and protection of a simulated servo."""
+"""Servo: instructions and protection of a simulated servo."""

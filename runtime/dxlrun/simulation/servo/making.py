@@ -6,15 +6,14 @@ from collections.abc import Callable
 
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
 from dxlrun.plan.simulation_plan import ServoConfig
+from dxlrun.simulation.motion.joint_shaft import JointShaft
 from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.mode_shaft import ModeShaft
 from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.servo.joint_shaft import JointShaft
-from dxlrun.simulation.servo.memory import Memory
-from dxlrun.simulation.servo.mode_shaft import ModeShaft
+from dxlrun.simulation.registers.memory import Memory
 from dxlrun.simulation.servo.node import baud_item, baud_value
-from dxlrun.simulation.servo.protocol1_servo import Protocol1Servo
 from dxlrun.simulation.servo.protocol2_servo import Protocol2Servo
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.simulated_servo import Protocol1Servo, SimulatedServo
 
 FIRMWARE = {1.0: 24, 2.0: 45}
 """Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""

@@ -13,8 +13,8 @@ from typing import ClassVar, TypeVar
 import msgspec
 
 from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.simulation.servo.access import Access, Rules
-from dxlrun.simulation.servo.memory import Memory, Run
+from dxlrun.simulation.registers.access import ErrorOf, refusal
+from dxlrun.simulation.registers.memory import Memory, Run
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import (
     BROADCAST,
@@ -52,10 +52,9 @@ class SimulatedNode(ABC):
     answers_damaged = False
     """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
 
-    def __init__(self, memory: Memory, rules: Rules, note: Callable[[str], None], now_ns: int) -> None:
-        """`rules`: those of its items, for writes."""
+    def __init__(self, memory: Memory, error_of: ErrorOf, note: Callable[[str], None], now_ns: int) -> None:
         self._codec = protocol1.CODEC if memory.table.protocol == 1.0 else protocol2.CODEC
-        self._access = Access(memory, rules)
+        self._error_of = error_of
         self.registers = memory  # Its control items, by name, as integers of the wire
         self.note = note
         self.counts = ServoCounts()
@@ -166,10 +165,6 @@ class SimulatedNode(ABC):
     def _takes_part(self, read: GroupRead) -> bool:
         """Return whether it knows a group read."""
 
-    def _knows(self, instruction: int) -> bool:
-        """Return whether it takes notice of an instruction at all."""
-        return True
-
     @abstractmethod
     def _written(self, names: frozenset[str]) -> None:
         """Do what the writing of some items does beside changing them."""
@@ -262,7 +257,7 @@ class SimulatedNode(ABC):
         return next((error for run in runs if (error := self._refusal(run))), 0)
 
     def _refusal(self, run: Run) -> int:
-        return self._access.refusal(run)
+        return refusal(self.registers, run, self._error_of)
 
     # What faults do
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from enum import IntFlag, unique
 
 from dxlrun.dynamixel.control_table import ControlItem
-from dxlrun.simulation.servo.access import GOALS, OperatingMode, torque_rules, watchdog_expired
-from dxlrun.simulation.servo.memory import Memory, Run
-from dxlrun.simulation.servo.shaft import Shaft
+from dxlrun.simulation.motion.shaft import Shaft
+from dxlrun.simulation.registers.access import ACCESS, OperatingMode, torque_error, watchdog_expired
+from dxlrun.simulation.registers.memory import Memory, Run
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
 from dxlrun.simulation.wire.protocol2 import ALERT, ErrorNumber
@@ -34,17 +34,7 @@ class HardwareError(IntFlag):
     OVERLOAD = 0x20
 
 
-_GAINS = (
-    "velocity_i_gain",
-    "velocity_p_gain",
-    "position_d_gain",
-    "position_i_gain",
-    "position_p_gain",
-    "feedforward_2nd_gain",
-    "feedforward_1st_gain",
-)
 _LIMITS = frozenset(("pwm_limit", "current_limit"))
-_PROFILE = ("profile_acceleration", "profile_velocity")
 _SPEAKS = (2, 20, 21, 22)
 """Values of Protocol Type (13) with which a servo obeys Protocol 2.0: without a remote control on the line it
 falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
@@ -77,7 +67,7 @@ class Protocol2Servo(SimulatedServo):
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
-        super().__init__(memory, torque_rules, shaft, note)
+        super().__init__(memory, torque_error, shaft, note)
         memory.has_gaps = False
         memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 
@@ -162,7 +152,7 @@ class Protocol2Servo(SimulatedServo):
             self._plan_watchdog()
             return
         self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
-        for name in _PROFILE:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
+        for name in ACCESS.profile:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
             if name in self.registers:
                 self._set(name, 0)
         self._set("bus_watchdog", -1)
@@ -331,7 +321,12 @@ class Protocol2Servo(SimulatedServo):
         if "protocol_type" in names and registers["protocol_type"] not in _SPEAKS:
             self.note(f"servo {self.servo_id} left Protocol 2.0: protocol type {registers['protocol_type']}")
         by_goal = registers.get("drive_mode") & TORQUE_ON_BY_GOAL
-        if by_goal and not GOALS.isdisjoint(names) and "torque_enable" not in names and not self._shut_down:
+        if (
+            by_goal
+            and not ACCESS.goals.isdisjoint(names)
+            and "torque_enable" not in names
+            and not self._shut_down
+        ):
             registers["torque_enable"] = 1
         if self._has_error_code:
             self._show_controller_state()
@@ -343,7 +338,7 @@ class Protocol2Servo(SimulatedServo):
         Gains, profile and the goals that limit are reset; position control knows one turn only.
         """
         registers = self.registers
-        registers.reset((*_GAINS, *_PROFILE))
+        registers.reset((*ACCESS.gains, *ACCESS.profile))
         self._find_turn()
         registers["goal_position"] = self.shaft.position_tick(self.shaft.angle)
         registers.show("goal_velocity", 0)
@@ -377,4 +372,4 @@ def _is_kept(name: str, item: ControlItem) -> bool:
     """Return whether a backup holds an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
     if name.startswith("indirect_address_"):
         return item.area == "RAM"
-    return item.access == "RW" and (item.area == "EEPROM" or name in _GAINS or name in _PROFILE)
+    return item.access == "RW" and (item.area == "EEPROM" or name in (*ACCESS.gains, *ACCESS.profile))

@@ -1,8 +1,8 @@
 """A simulated servo: it receives instructions, replies, moves its shaft, and can be broken.
 
-What both protocols share is here; `protocol1_servo` and `protocol2_servo` have the instructions of each, and
-how such a servo protects itself. Where the e-Manual has no answer, `[i]` marks what was inferred; nothing was
-compared with a real servo yet.
+What both protocols share is here, and the servo of Protocol 1.0; `protocol2_servo` has the instructions of
+the others, and how they protect themselves. Where the e-Manual has no answer, `[i]` marks what was inferred;
+nothing was compared with a real servo yet.
 
 Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is set to another one falls silent),
 what the two shafts of a 2XL or 2XC share, servos that Drive Mode couples, and what firmware decides beyond
@@ -16,11 +16,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 
 from dxlrun.simulation.motion.mechanics import SUPPLY_OHM
-from dxlrun.simulation.servo.access import Rules
-from dxlrun.simulation.servo.memory import IDENTITY, Memory
+from dxlrun.simulation.motion.shaft import Shaft
+from dxlrun.simulation.registers.access import ACCESS, ErrorOf, lock_error
+from dxlrun.simulation.registers.memory import Memory
 from dxlrun.simulation.servo.node import SimulatedNode
-from dxlrun.simulation.servo.shaft import Shaft
-from dxlrun.simulation.wire.packets import Instruction, InstructionPacket
+from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket
+from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 BOOT_NS = 100_000_000
 """How long a servo receives nothing after a reboot; no manual names it [i]."""
@@ -33,7 +34,7 @@ class SimulatedServo(SimulatedNode):
 
     kind = "servo"
 
-    def __init__(self, memory: Memory, rules: Rules, shaft: Shaft, note: Callable[[str], None]) -> None:
+    def __init__(self, memory: Memory, error_of: ErrorOf, shaft: Shaft, note: Callable[[str], None]) -> None:
         self.shaft = shaft
         self.overload = False  # True while the shaft is loaded beyond the torque
         self.wakes_on_goal = True
@@ -44,12 +45,12 @@ class SimulatedServo(SimulatedNode):
         self._speaks = True  # False when it is set to another protocol
         self._started_ns = self._received_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
-        super().__init__(memory, rules, note, shaft.now_ns)
+        super().__init__(memory, error_of, note, shaft.now_ns)
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
         self._voltage = 0.0
         self.voltage = _supply(memory)
         shaft.mechanics.watch(shaft.index, self._strained)
-        memory.watch(IDENTITY, self._identify)
+        memory.watch(ACCESS.identity, self._identify)
 
     def _identify(self) -> None:
         registers = self.registers
@@ -239,7 +240,60 @@ class SimulatedServo(SimulatedNode):
         """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
         self.note(f"servo {self.servo_id}: turned by hand to {angle} rad")
         self.shaft.rest_at(angle)
-        self.shaft.plan(self.shaft.items)
+        self.shaft.plan(self.shaft.items.aims)
+
+
+class Protocol1Servo(SimulatedServo):
+    """AX, DX, EX, RX, and MX with their first firmware: error bits, Torque Limit 0, and the EEPROM's lock."""
+
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        super().__init__(memory, lock_error, shaft, note)
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        """Return an instruction error also of a bulk read that an AX does not know [i]."""
+        if packet.instruction != Instruction.FACTORY_RESET:
+            return super()._manage(packet)
+        self.registers.restore_factory_values()
+        self.power_up()
+        return 0
+
+    def _takes_part(self, read: GroupRead) -> bool:
+        """Return whether it knows a bulk read: only the MX do, and only for two servos or more."""
+        known = "bulk_read" in self.registers.table.capabilities and len(read.entries) >= 2
+        if not known:
+            self.note(f"servo {self.servo_id} refuses a bulk read of {len(read.entries)}")
+        return known
+
+    # Protection
+
+    def _state(self) -> int:
+        """Return the error bits that last as long as their cause."""
+        registers = self.registers
+        error = int(ErrorBit.OVERLOAD) if self.overload else 0
+        if not registers["min_voltage_limit"] <= round(self.voltage * 10) <= registers["max_voltage_limit"]:
+            error |= ErrorBit.VOLTAGE
+        if round(self.temperature) > registers["temperature_limit"]:
+            error |= ErrorBit.OVERHEATING
+        return error
+
+    def protect(self, refused: int = 0) -> None:
+        """Set Torque Limit to 0 when Shutdown (18) lists an error; Torque Enable (24) stays as it is."""
+        error = self._state() | refused
+        if error & self.registers["shutdown"] and self.registers["torque_limit"]:
+            self.note(f"servo {self.servo_id}: shutdown, torque limit 0: {ErrorBit(error)!r}")
+            self._set("torque_limit", 0)
+
+    def _start_up(self) -> None:
+        self._started_ns = self.shaft.now_ns
+        self.registers["torque_limit"] = self.registers["max_torque"]  # e-Manual, Torque Limit (34)
+
+    def _written(self, names: frozenset[str]) -> None:
+        registers = self.registers
+        if "goal_position" in names and self.wakes_on_goal and "torque_enable" not in names:
+            registers["torque_enable"] = 1
+        if "torque_limit" in names and registers["torque_limit"] > 0:
+            self.overload = False
+        super()._written(names)
 
 
 def _supply(memory: Memory) -> float:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import FREE, LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.servo.access import OperatingMode, watchdog_expired
-from dxlrun.simulation.servo.memory import Memory
-from dxlrun.simulation.servo.shaft import Shaft, Trajectory, critical_d
+from dxlrun.simulation.motion.shaft import Shaft, Trajectory, critical_d
+from dxlrun.simulation.registers.access import ACCESS, OperatingMode, watchdog_expired
+from dxlrun.simulation.registers.memory import Memory
 
 REVERSE, TIME_BASED = 0x01, 0x04
 """Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
@@ -54,37 +53,7 @@ class ModeShaft(Shaft):
     rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
     """
 
-    items: ClassVar[frozenset[str]] = frozenset(
-        (
-            "torque_enable",
-            "operating_mode",
-            "drive_mode",
-            "homing_offset",
-            "goal_position",
-            "goal_velocity",
-            "goal_current",
-            "goal_torque",
-            "goal_pwm",
-            "goal_acceleration",
-            "profile_velocity",
-            "profile_acceleration",
-            "velocity_limit",
-            "current_limit",
-            "torque_limit",
-            "pwm_limit",
-            "bus_watchdog",
-            "position_p_gain",
-            "position_i_gain",
-            "position_d_gain",
-            "velocity_p_gain",
-            "velocity_i_gain",
-            "feedforward_1st_gain",
-            "feedforward_2nd_gain",
-        )
-    )
-    aims: ClassVar[frozenset[str]] = frozenset(
-        ("goal_position", "profile_velocity", "profile_acceleration", "goal_velocity", "goal_acceleration")
-    )
+    items = ACCESS.mode_shaft
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)

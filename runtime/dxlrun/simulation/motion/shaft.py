@@ -12,7 +12,8 @@ from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.registers.access import ShaftItems
+from dxlrun.simulation.registers.memory import Memory
 
 Trajectory = tuple[float, float, float]
 """Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
@@ -21,9 +22,7 @@ Trajectory = tuple[float, float, float]
 class Shaft(ABC):
     """Follows what is written, and is looked at; a subclass for each family of registers."""
 
-    items: ClassVar[frozenset[str]]  # Items whose writing may change the motion
-    aims: ClassVar[frozenset[str]]
-    """Those of them that change only the trajectory while a position is controlled."""
+    items: ClassVar[ShaftItems]
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         self.memory = memory
@@ -93,9 +92,9 @@ class Shaft(ABC):
 
     def plan(self, written: Iterable[str]) -> None:
         """Command what was written, if that is something else."""
-        if self.items.isdisjoint(written):
+        if self.items.aims.isdisjoint(written) and self.items.others.isdisjoint(written):
             return
-        if self._goes_to_goal and self.aims.issuperset(written):
+        if self._goes_to_goal and self.items.aims.issuperset(written):
             if (trajectory := self._new_trajectory()) is not None:
                 self._act(partial(self.mechanics.aim, self.index, *trajectory))
             return

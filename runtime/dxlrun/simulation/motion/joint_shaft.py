@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import FREE, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.servo.access import multi_turn_mode, wheel_mode
-from dxlrun.simulation.servo.memory import Memory
-from dxlrun.simulation.servo.shaft import Shaft, Trajectory, in_turn
+from dxlrun.simulation.motion.shaft import Shaft, Trajectory, in_turn
+from dxlrun.simulation.registers.access import ACCESS, multi_turn_mode, wheel_mode
+from dxlrun.simulation.registers.memory import Memory
 
 SLOPE_TICK = math.radians(300) / 1023
 """Unit of Compliance Slope (28), rad: 0x40 is about 18.8 degrees (manual of the RX-28, example 17)."""
@@ -37,31 +36,7 @@ class JointShaft(Shaft):
     RX (unit 0.1 %), and a controlled speed on the MX.
     """
 
-    items: ClassVar[frozenset[str]] = frozenset(
-        (
-            "torque_enable",
-            "goal_position",
-            "moving_speed",
-            "goal_acceleration",
-            "torque_limit",
-            "cw_angle_limit",
-            "ccw_angle_limit",
-            "control_mode",
-            "cw_compliance_margin",
-            "ccw_compliance_margin",
-            "cw_compliance_slope",
-            "ccw_compliance_slope",
-            "punch",
-            "p_gain",
-            "i_gain",
-            "d_gain",
-            "torque_ctrl_mode_enable",
-            "goal_torque",
-            "multi_turn_offset",
-            "resolution_divider",
-        )
-    )
-    aims: ClassVar[frozenset[str]] = frozenset(("goal_position", "moving_speed", "goal_acceleration"))
+    items = ACCESS.joint_shaft
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)

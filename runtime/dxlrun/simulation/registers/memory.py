@@ -13,9 +13,6 @@ _INDIRECT = re.compile(r"indirect_address_(\d+)")
 _CELLS_KEPT = 1024
 """So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
 
-IDENTITY = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")
-"""Items that decide what the servo receives."""
-
 
 class Cells(NamedTuple):
     """What is in a row of cells."""
@@ -140,11 +137,8 @@ class Memory:
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
-        wire, item = self._values[name], self.table.items[name]
-        if item.encoding == "twos_complement":
-            bits = 8 * item.size
-            return wire - (wire >> bits - 1 << bits)
-        return wire if item.encoding == "unsigned" else item.decode(self.data(name))
+        item = self.table.items[name]
+        return item.decode(self.data(name)) if item.encoding == "sign_magnitude" else signed(item, self[name])
 
     def data(self, name: str) -> bytes:
         """Return the bytes of an item."""
@@ -255,6 +249,11 @@ class Memory:
         if item.initial is not None:
             return item.initial
         return max(0, item.minimum) if item.access == "RW" else 0
+
+
+def signed(item: ControlItem, wire: int) -> int:
+    """Return the integer of an item with its sign, where that is two's complement."""
+    return wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
 
 
 def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
