@@ -34,7 +34,7 @@ from dxlrun.run.simulation_front import Served
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 from dxlrun.testing import plan_of, read_log, simulated_robot
-from dxlrun_view.plugin import dxlrun_commands
+from dxlrun_view import dxlrun_commands
 
 ROOT = Path(__file__).parents[2]
 ROOTS = (ROOT, ROOT / "runtime/dxlrun", ROOT / "plugins")

@@ -11,10 +11,11 @@ import json
 import os
 import shutil
 import struct
-import time
 import zlib
 from pathlib import Path
 from typing import Any
+
+from tests.kit.awaited import until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -74,10 +75,8 @@ class Browser:
         return answer["result"].get("value")
 
     def until(self, condition: str) -> None:
-        end = time.monotonic() + 60
-        while not self.value(condition):
-            assert time.monotonic() < end, condition
-            time.sleep(0.05)
+        """Wait until an expression in the page is true."""
+        until(lambda: self.value(condition), condition)
 
     def drag(self, begin: tuple[float, float], end: tuple[float, float]) -> None:
         """Press the mouse at one place, and let it go at another."""

@@ -7,7 +7,7 @@ import json
 import threading
 from typing import Any
 
-from dxlrun_view.server import TOKEN, Page, hosts_of, listening, server_of
+from dxlrun_view.server import HEADER, Page, hosts_of, listening, server_of
 from dxlrun_view.shown import Source
 
 
@@ -30,7 +30,7 @@ class Served:
         """Return status and answer; `headers` replace those of the page."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
         body = None if content is None else json.dumps(content)
-        given = {TOKEN: self.page.token} | {name.replace("_", "-"): text for name, text in headers.items()}
+        given = {HEADER: self.page.token} | {name.replace("_", "-"): text for name, text in headers.items()}
         connection.request("GET" if body is None else "POST", path, body, given)
         answer = connection.getresponse()
         found = answer.status, answer.read()

@@ -31,7 +31,7 @@ def view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[View]:
     installed = tmp_path / "dxlrun_view-0.1.0.dist-info"
     installed.mkdir()
     (installed / "METADATA").write_text("Name: dxlrun-view\nVersion: 0.1.0\n")
-    (installed / "entry_points.txt").write_text("[dxlrun]\nview = dxlrun_view.plugin\n")
+    (installed / "entry_points.txt").write_text("[dxlrun]\nview = dxlrun_view\n")
     package = str(ROOT / "plugins/dxlrun_view/src")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join((package, str(tmp_path))))
     started: list[subprocess.Popen[str]] = []
@@ -91,11 +91,14 @@ def test_without_a_robot_it_says_how_one_starts(view: View, command: str) -> Non
         ((str(ROOT / "robots/bioloid_torso.yaml"),), 1, "start it in another terminal"),
         (("bad.mcap",), 2, "bad.mcap"),
         (("--port", "99999999"), 2, "port"),
+        (("{log}", "--listen", "192.0.2.1"), 2, "another --listen"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(view: View, words: tuple[str, ...], code: int, part: str) -> None:
+def test_what_cannot_be_shown_is_refused(
+    view: View, log: Path, words: tuple[str, ...], code: int, part: str
+) -> None:
     Path("bad.mcap").write_bytes(b"nothing")
-    found, said = refused(view(*words, "--no-browser"))
+    found, said = refused(view(*(word.format(log=log) for word in words), "--no-browser"))
     assert (found, part in said) == (code, True), said
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 from tests.view.served import Served
 
 from dxlrun import running
@@ -18,7 +18,6 @@ from dxlrun_view.live import LiveRobot
 
 Serve = Callable[..., Served]
 ROBOT = Path(__file__).resolve().parents[2] / "robots/bioloid_torso_imu.yaml"
-DEADLINE_S = 60.0
 JOINT, SERVO = "right_elbow_joint", 4
 SERVOS = {1, 2, 3, 4, 5, 6, 20, 21}
 TORQUE_ENABLE, GOAL_POSITION = 24, 30
@@ -66,14 +65,6 @@ class Run:
         return found
 
 
-def until(condition: Callable[[], Any]) -> Any:
-    give_up = time.monotonic() + DEADLINE_S
-    while not (found := condition()):
-        assert time.monotonic() < give_up
-        time.sleep(0.05)
-    return found
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     one = Run(tmp_path_factory.mktemp("live"))
@@ -104,8 +95,8 @@ def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:
     shown = served.look(shown=True)["shown"]
     assert shown["live"]
     assert not shown["control"]
-    assert len(shown["joints"]) == 8
-    assert all(joint["lower"] < joint["upper"] for joint in shown["joints"])
+    assert len(shown["info"]["joints"]) == 8
+    assert all(lower < upper for lower, upper in shown["info"]["limits"].values())
     assert any(path.endswith("three_parts.yaml") for path in shown["motions"])
     assert not any(path.endswith("effort_arm_lift.yaml") for path in shown["motions"])
     assert until(lambda: served.look(after=0)["events"])
@@ -144,7 +135,7 @@ def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run
     assert status == 409
     assert served.ask("/act", {"verb": "play", "names": ["/etc/passwd"]})[0] == 409
     assert served.ask("/act", {"verb": "switch", "names": ["right_arm"], "on": False})[0] == 200
-    rows = {row["name"]: row["active"] for row in until(lambda: fresh(served))["controllers"]}
+    rows = {row["name"]: row["active"] for row in until(lambda: fresh(served))["info"]["controllers"]}
     assert rows["left_arm"]
     assert not rows["right_arm"]
     assert served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 0.0})[0] == 409
@@ -154,20 +145,31 @@ def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run
 def fresh(served: Served) -> Any:
     """Return what the page shows once the switch is seen."""
     shown = served.look(shown=True)["shown"]
-    row = next(row for row in shown["controllers"] if row["name"] == "right_arm")
+    row = next(row for row in shown["info"]["controllers"] if row["name"] == "right_arm")
     return None if row["active"] else shown
 
 
 def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Run) -> None:
     served = serve(live)
     until(lambda: column(served, "loop/cycle"))
+    before = until(lambda: served.look(after=0)["events"])
     run.end()
-    assert "bioloid_torso_imu" in until(lambda: served.look(shown=True)["shown"]["problem"])
+    assert "goes on when it is started" in until(lambda: served.look(shown=True)["shown"]["problem"])
     assert served.ask("/act", {"verb": "stop"})[0] == 409
+    assert served.ask("/urdf")[1].startswith(b"<?xml")  # its last state is still shown
     run.start()
-    until(lambda: not served.look(shown=True)["shown"]["problem"])
+    until(lambda: served.look(shown=True)["shown"]["run"] == 2)
     first = until(lambda: column(served, "loop/cycle"))
     assert until(lambda: (column(served, "loop/cycle") or 0) > first)
+    shown = served.look(shown=True)["shown"]
+    assert not shown["problem"]
+    begin, end = shown["span"]
+    (curve,) = served.look(spans=[{"names": ["loop/cycle"], "begin": begin, "end": end + 60}])["curves"][0]
+    assert None in curve["value"]  # no line joins the two runs
+    after = until(lambda: served.look(after=before[-1]["number"])["events"])
+    numbers = [event["number"] for event in before + after]
+    assert numbers == [*range(1, len(numbers) + 1)]
+    assert after[-1]["time"] > before[-1]["time"]
 
 
 def test_a_robot_that_does_not_run_is_waited_for(run: Run) -> None:

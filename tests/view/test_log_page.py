@@ -26,10 +26,10 @@ def test_columns_are_those_of_the_cycles(log: Path, recorded: RecordedRobot, ser
     )
     shown = seen["shown"]
     assert not shown["live"]
-    assert JOINT in [joint["name"] for joint in shown["joints"]]
+    assert JOINT in shown["info"]["joints"]
     cycles = np.concatenate([part.cycles for part in open_log(log).slices()])
     (curve,) = seen["curves"][0]
-    row = [joint["name"] for joint in shown["joints"]].index(JOINT)
+    row = shown["info"]["joints"].index(JOINT)
     assert np.allclose(curve["value"], cycles["position"][:, row], atol=1e-6)
     assert np.allclose(curve["time"], (cycles["woken_ns"] - cycles["woken_ns"][0]) * 1e-9, atol=1e-6)
     middle = served.look(time=5.0)["moment"]

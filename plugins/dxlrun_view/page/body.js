@@ -24,6 +24,7 @@ export class Body {
     this.scene.add(this.world);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => { this.dirty = true; });
+    this.controls.addEventListener("start", () => { this.touched = true; });
     this.dirty = true;
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.colour();
@@ -57,12 +58,14 @@ export class Body {
     this.dirty = true;
   }
 
-  load(urdf, imu) {
+  // `link`: the one that an IMU turns, or nothing
+  load(urdf, link) {
+    this.world.clear();
     this.robot = this.parse(urdf, false);
     this.ghost = this.parse(urdf, true);
     this.world.add(this.robot, this.ghost);
-    this.turned = imu && turnedLink(this.robot, imu.link);
-    this.ghostTurned = imu && turnedLink(this.ghost, imu.link);
+    this.turned = link && turnedLink(this.robot, link);
+    this.ghostTurned = link && turnedLink(this.ghost, link);
     this.fit();
   }
 
@@ -84,6 +87,7 @@ export class Body {
   }
 
   fit() {
+    this.touched = false;
     this.robot.updateMatrixWorld(true);
     const box = new Box3().setFromObject(this.robot);
     if (box.isEmpty()) box.set(new Vector3(-0.2, -0.2, 0), new Vector3(0.2, 0.2, 0.4));

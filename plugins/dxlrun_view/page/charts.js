@@ -2,6 +2,8 @@
 import uPlot from "uplot";
 
 const COLOURS = ["--curve1", "--curve2", "--curve3", "--curve4", "--curve5", "--curve6"];
+const isGoal = (name) => name.includes("/goal_");
+const pairOf = (name) => name.replace("/goal_", "/");
 export const isAngle = (name) => /\/(goal_|command_)?(position|velocity)$/.test(name);
 
 export class Charts {
@@ -72,14 +74,17 @@ class Chart {
     this.plot?.destroy();
     const style = getComputedStyle(document.documentElement);
     const colour = (name) => style.getPropertyValue(name).trim();
+    const pairs = [...new Set(this.names.map(pairOf))]; // a goal has its state's colour, dashed
+    const colourOf = (name) => colour(COLOURS[pairs.indexOf(pairOf(name)) % COLOURS.length]);
     const scales = this.names.map((name) => this.all.scaleOf(name));
     this.factors = scales.map(([factor]) => factor);
     const units = [...new Set(scales.map(([, unit]) => unit))].filter(Boolean);
     const axis = { stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 }, font: "11px system-ui" };
-    this.legend.replaceChildren(...this.names.map((name, at) => {
+    this.legend.replaceChildren(...this.names.map((name) => {
       const item = document.createElement("span");
       const mark = item.appendChild(document.createElement("i"));
-      mark.style.background = colour(COLOURS[at % COLOURS.length]);
+      mark.style.borderColor = colourOf(name);
+      mark.classList.toggle("goal", isGoal(name));
       item.append(name, " ", item.value = document.createElement("b"));
       const away = item.appendChild(document.createElement("button"));
       away.textContent = "×"; away.title = `take ${name} out`; away.type = "button";
@@ -95,10 +100,10 @@ class Chart {
     this.plot = new uPlot({
       width: Math.max(this.place.clientWidth, 50), height: Math.max(this.place.clientHeight, 60),
       scales: { x: { time: false, range: () => this.range ?? [0, 1] } },
-      axes: [{ ...axis, values: (_, ticks) => ticks.map(label) },
+      axes: [{ ...axis, size: 34, values: (_, ticks) => ticks.map(label) },
         { ...axis, size: 64, values: (_, ticks) => ticks.map((tick) => String(Number(tick.toPrecision(7)))), label: units.join(", ") || undefined, labelSize: units.length ? 18 : 0, labelFont: "11px system-ui" }],
-      series: [{}, ...this.names.map((name, at) => ({ label: name, stroke: colour(COLOURS[at % COLOURS.length]), width: 1.5, spanGaps: false,
-        dash: /\/goal_/.test(name) ? [5, 4] : undefined, points: { show: false } }))],
+      series: [{}, ...this.names.map((name) => ({ label: name, stroke: colourOf(name), width: 1.5, spanGaps: false,
+        dash: isGoal(name) ? [5, 4] : undefined, points: { show: false } }))],
       legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false } },
       hooks: {
         setSelect: [(plot) => {
@@ -146,7 +151,7 @@ function label(seconds) {
   return `${rounded} s`;
 }
 
-export function figure(value) {
+function figure(value) {
   const size = Math.abs(value);
   if (size !== 0 && size < 0.01) return value.toExponential(1);
   return value.toFixed(size >= 100 ? 0 : size >= 10 ? 1 : 2);

@@ -1,17 +1,18 @@
-// The graph of controllers: who commands whom, what is active, switched and tuned from here.
+// The graph of controllers: what commands what, what is active; switched and tuned from here.
 const SVG = "http://www.w3.org/2000/svg";
 
 export function drawControllers(element, shown, act) {
+  const { controllers } = shown.info;
   const open = element.dataset.open;
   element.replaceChildren();
-  const names = shown.controllers.map((one) => one.name);
-  const depths = depthsOf(shown.controllers);
+  const names = controllers.map((one) => one.name);
+  const depths = depthsOf(controllers);
   const graph = document.createElement("div");
   graph.className = "graph";
   const deepest = Math.max(0, ...Object.values(depths));
   graph.style.gridTemplateColumns = `repeat(${deepest + 1}, minmax(0, 1fr))`;
   const nodes = {};
-  for (const controller of shown.controllers) {
+  for (const controller of controllers) {
     const node = graph.appendChild(document.createElement("div"));
     node.className = `node${controller.active ? " active" : ""}`;
     node.style.gridColumn = deepest - depths[controller.name] + 1;
@@ -38,7 +39,7 @@ export function drawControllers(element, shown, act) {
   }
   element.append(names.length ? graph : Object.assign(text("p", "no controllers"), { className: "empty" }));
   const lines = graph.appendChild(document.createElementNS(SVG, "svg"));
-  const draw = () => connect(lines, graph, nodes, shown.controllers);
+  const draw = () => connect(lines, graph, nodes, controllers);
   new ResizeObserver(draw).observe(graph);
   if (open && names.includes(open)) parameters(element, shown, open, act);
 }
@@ -78,10 +79,10 @@ async function parameters(element, shown, name, act) {
   table.className = "parameters";
   table.createTHead().insertRow().append(text("th", `parameters of ${name}`), text("th", ""));
   const body = table.createTBody();
-  for (const [parameter, now, live, description] of found.parameters) {
+  for (const { name: parameter, value: now, live, range, description } of found.parameters) {
     const row = body.insertRow();
     const label = row.appendChild(text("td", parameter));
-    label.title = description;
+    label.title = [description, range].filter(Boolean).join("; ");
     const cell = row.insertCell();
     if (live && shown.control) {
       const input = cell.appendChild(Object.assign(document.createElement("input"), { value: now, size: 10 }));

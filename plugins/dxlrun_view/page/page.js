@@ -10,9 +10,9 @@ const TORQUE = ["unknown", "on", "doubt", "off", "released", "lost", "rebooting"
 const $ = (id) => document.getElementById(id);
 const deg = 180 / Math.PI;
 
-const page = { shown: null, places: {}, moment: null, after: 0, events: [], time: null, playing: false, paused: null, worst: 0, rate: null, rates: [], touching: null };
+const page = { shown: null, joints: new Map(), places: {}, moment: null, after: 0, events: [], time: null, playing: false, rate: null, rates: [], touching: null };
 
-export async function ask(path, content) {
+async function ask(path, content) {
   const answer = await fetch(path, {
     method: content === undefined ? "GET" : "POST",
     headers: { "X-Dxlrun-Token": TOKEN, ...(content === undefined ? {} : { "Content-Type": "application/json" }) },
@@ -25,7 +25,7 @@ export async function ask(path, content) {
   return answer;
 }
 
-export async function act(action, quiet) {
+async function act(action, quiet) {
   try {
     const done = await (await ask("act", action)).json();
     if (!quiet && done.said) say(done.said);
@@ -51,7 +51,7 @@ const body = webgl() && new Body($("scene"),
   async (path) => (await ask(`mesh?name=${encodeURIComponent(path)}`)).arrayBuffer(),
   (path) => { missingMeshes.add(path); say(`The URDF's mesh ${path} was not found beside the robot file; that part is not drawn.`, true); });
 const charts = new Charts($("charts"), scaleOf);
-charts.zoomed = () => { if (charts.zoom && page.shown?.live) pause(true); if (!charts.zoom) pause(false); };
+charts.zoomed = () => pause(charts.zoom !== null);
 
 function webgl() {
   try { return Boolean(document.createElement("canvas").getContext("webgl2")); } catch { return false; }
@@ -60,43 +60,48 @@ function webgl() {
 // factor and unit of a column, as a person reads it
 function scaleOf(name) {
   const [owner, column] = [name.slice(0, name.lastIndexOf("/")), name.slice(name.lastIndexOf("/") + 1)];
-  const joint = page.shown?.joints.find((one) => one.name === owner);
+  const joint = page.joints.get(owner);
   if (name === "loop/late") return [1e3, "ms"];
   if (!joint && !(isAngle(name) && page.shown?.columns.includes(name))) return [1, ""];
   const linear = joint?.unit === "m";
   if (/position$/.test(column)) return linear ? [1e3, "mm"] : [deg, "deg"];
   if (/velocity$/.test(column)) return linear ? [1e3, "mm/s"] : [deg, "deg/s"];
-  if (/effort$/.test(column)) return joint?.effort_unit ? [1, joint.effort_unit] : [100, "%"];
+  if (/effort$/.test(column)) return joint?.effortUnit ? [1, joint.effortUnit] : [100, "%"];
   return column === "temperature" ? [1, "°C"] : column === "voltage" ? [1, "V"] : [1, ""];
 }
 
 const value = (name) => { const found = page.moment?.values[page.places[name]]; return found === undefined ? null : found; };
 
 async function arrived(shown) {
-  const first = !page.shown || page.shown.columns.length !== shown.columns.length;
-  const before = JSON.stringify(page.shown?.controllers);
+  const { info, live, control, problem } = shown;
+  const first = page.shown?.run !== shown.run;
   page.shown = shown;
-  if (first && shown.columns.length) {
+  if (first) {
     page.places = Object.fromEntries(shown.columns.map((name, at) => [name, at]));
-    if (!charts.charts.length) {
-      const joint = shown.joints[0]?.name;
-      charts.add(joint ? [`${joint}/position`, `${joint}/goal_position`] : ["loop/late"]);
-    } else for (const chart of charts.charts) chart.build();
+    page.joints = new Map(info.joints.map((name) => [name, jointOf(info, name)]));
+    page.rates = [];
+    if (!charts.charts.length && shown.columns.length) charts.add(info.joints.length ? ["position", "goal_position"].map((column) => `${info.joints[0]}/${column}`) : ["loop/late"]);
+    else for (const chart of charts.charts) chart.build();
     buildJoints();
     await loadBody();
+    if (!live) buildTimeline();
   }
   fillNames();
-  document.title = `${shown.robot} – dxlrun`;
-  $("robot").textContent = shown.robot;
-  $("kind").textContent = shown.live ? (shown.control ? "live, steered here" : "live") : `log${shown.every > 1 ? `, every ${shown.every}th cycle` : ""}`;
-  $("stop").hidden = !shown.live;
-  document.querySelector(".bar label").hidden = false;
-  $("timeline").hidden = shown.live;
-  $("dot").className = `dot ${shown.problem ? "bad" : shown.paused ? "warn" : "good"}`;
-  if (shown.problem) say(shown.problem, true, 1);
-  if (first || before !== JSON.stringify(shown.controllers)) drawControllers($("controllers"), shown, act);
+  document.title = `${info.robot} – dxlrun`;
+  document.body.classList.toggle("gone", Boolean(problem));
+  $("robot").textContent = info.robot;
+  $("kind").textContent = live ? (control ? "live, steered here" : "live") : `log${shown.every > 1 ? `, every ${shown.every}th cycle` : ""}`;
+  $("stop").hidden = $("pause").hidden = !live;
+  $("timeline").hidden = live;
+  $("dot").className = `dot ${problem ? "bad" : info.paused ? "warn" : "good"}`;
+  if (problem) say(problem, true, 1);
   buildButtons();
-  if (!shown.live && first) buildTimeline();
+}
+
+function jointOf({ units, effort_units, limits }, name) {
+  const unit = units[name] ?? "rad", most = unit === "m" ? 0.1 : Math.PI;
+  const [lower, upper] = limits[name] ?? [-most, most];
+  return { name, unit, lower, upper, effortUnit: effort_units[name] ?? "" };
 }
 
 function fillNames() {
@@ -106,21 +111,18 @@ function fillNames() {
 }
 
 async function loadBody() {
-  const text = await (await ask("urdf")).text().catch(() => "");
-  if (!text || !body) {
-    $("nobody").hidden = false;
-    $("nobody").textContent = !body ? "This browser draws no 3-D (WebGL is off); curves and tables work."
-      : "This robot has no URDF: its robot file names one by  model: {urdf: ...}. Curves and tables work.";
-    return;
-  }
-  const turned = page.shown.columns.filter((name) => name.endsWith("/orientation.w")).map((name) => name.slice(0, -14));
-  const imu = page.shown.imu && turned.includes(page.shown.imu) ? { source: page.shown.imu, link: page.shown.imu_link } : null;
-  page.imu = imu;
-  if (!body.robot) body.load(text, imu);
+  const text = await (await ask("urdf")).text();
+  const why = !page.shown.run ? "waits for the robot …" : !body ? "This browser draws no 3-D (WebGL is off); curves and tables work."
+    : text ? "" : "This robot has no URDF: its robot file names one by  model: {urdf: ...}. Curves and tables work.";
+  $("no-scene").textContent = why;
+  $("no-scene").hidden = !why;
+  if (why) return;
+  page.imu = `${page.shown.imu}/orientation.w` in page.places ? page.shown.imu : null;
+  body.load(text, page.imu && page.shown.imu_link);
 }
 
 function buildButtons() {
-  const { live, control, paused, motions = [] } = page.shown;
+  const { live, control, motions, info: { paused } } = page.shown;
   const wanted = live && control ? `${paused}|${motions.join()}` : "";
   if ($("buttons").dataset.made === wanted) return;
   $("buttons").dataset.made = wanted;
@@ -152,18 +154,18 @@ function buildJoints() {
   table.createTHead().insertRow().append(...heads.map((text, at) => Object.assign(document.createElement("th"), { textContent: text, className: at === 4 ? "load" : [5, 6].includes(at) ? "wide" : "" })));
   const tbody = table.createTBody();
   rows.clear();
-  for (const joint of page.shown.joints) {
+  for (const joint of page.joints.values()) {
     const cells = heads.map(() => document.createElement("td"));
     const [name, reach, position, goal, load, heat, volts, torque] = cells;
     load.className = "load"; heat.className = volts.className = "wide";
-    name.textContent = joint.name.replace(/_joint$/, ""); name.className = "joint"; name.tabIndex = 0;
-    name.title = [joint.name, joint.servo, "click: curve of position and goal"].filter(Boolean).join("; ");
+    const parts = joint.name.replace(/_joint$/, "").split(/(?<=_)/);
+    name.append(...parts.flatMap((part) => [part, document.createElement("wbr")])); name.className = "joint"; name.tabIndex = 0;
+    name.title = `${joint.name}; click: curve of position and goal`;
     name.onclick = () => { charts.toggle(`${joint.name}/position`); charts.toggle(`${joint.name}/goal_position`); };
     name.onkeydown = (event) => { if (event.key === "Enter") name.onclick(); };
-    const lower = joint.lower ?? (joint.unit === "m" ? -0.1 : -Math.PI), upper = joint.upper ?? (joint.unit === "m" ? 0.1 : Math.PI);
     let slider = null, is = null, to = null;
     if (page.shown.control && page.shown.live) {
-      slider = Object.assign(document.createElement("input"), { type: "range", min: lower, max: upper, step: "any" });
+      slider = Object.assign(document.createElement("input"), { type: "range", min: joint.lower, max: joint.upper, step: "any" });
       slider.setAttribute("aria-label", `goal of ${joint.name}`);
       slider.oninput = () => { page.touching = joint.name; lead(joint.name, Number(slider.value)); };
       slider.onchange = () => { lead(joint.name, Number(slider.value)); setTimeout(() => { if (page.touching === joint.name) page.touching = null; }, 600); };
@@ -177,9 +179,9 @@ function buildJoints() {
     tag.className = "tag";
     if (slider) tag.onclick = () => act({ verb: "torque", names: [joint.name], on: tag.textContent !== "on" });
     tbody.insertRow().append(...cells);
-    rows.set(joint.name, { joint, lower, upper, slider, is, to, position, goal, load, heat, volts, tag });
+    rows.set(joint.name, { joint, slider, is, to, position, goal, load, heat, volts, tag });
   }
-  $("joints").replaceChildren(page.shown.joints.length ? table : Object.assign(document.createElement("p"), { className: "empty", textContent: "waits for the robot …" }));
+  $("joints").replaceChildren(rows.size ? table : Object.assign(document.createElement("p"), { className: "empty", textContent: "waits for the robot …" }));
 }
 
 // send the newest goal of a slider, one at a time
@@ -200,7 +202,7 @@ async function lead(joint, goal) {
 function drawJoints() {
   const set = (cell, text) => { if (cell.textContent !== text) cell.textContent = text; };
   for (const [name, row] of rows) {
-    const { joint, lower, upper } = row;
+    const { lower, upper } = row.joint;
     const [factor, unit] = scaleOf(`${name}/position`);
     const position = value(`${name}/position`), goal = value(`${name}/goal_position`), effort = value(`${name}/effort`);
     const share = (angle) => `${Math.min(100, Math.max(0, (angle - lower) / (upper - lower) * 100))}%`;
@@ -209,8 +211,7 @@ function drawJoints() {
     const beyond = goal !== null && position !== null && Math.abs(goal - position) > (unit === "deg" ? 0.09 : 0.005);
     row.goal.classList.toggle("hot", beyond);
     if (row.is) { row.is.style.left = share(position ?? lower); row.to.style.left = share(goal ?? position ?? lower); row.to.hidden = goal === null; }
-    if (row.slider && page.touching !== name && document.activeElement !== row.slider) row.slider.value = goal ?? position ?? 0;
-    if (row.slider && page.touching !== name && document.activeElement === row.slider && !goals.has(name) && !leading) row.slider.value = goal ?? position ?? 0;
+    if (row.slider && page.touching !== name && (document.activeElement !== row.slider || !leading)) row.slider.value = goal ?? position ?? 0;
     const [by, effortUnit] = scaleOf(`${name}/effort`);
     set(row.load, effort === null ? "–" : `${figure1(effort * by)} ${effortUnit}`);
     const heat = value(`${name}/temperature`), volts = value(`${name}/voltage`);
@@ -250,12 +251,11 @@ function drawFigures() {
     page.rates.push([moment.time, cycle]);
     while (page.rates.length > 2 && page.rates[0][0] < moment.time - 2) page.rates.shift();
     const [[t0, c0]] = page.rates;
-    if (cycle < c0) page.rates = []; else if (moment.time > t0) page.rate = (cycle - c0) / (moment.time - t0);
-    page.worst = Math.max(page.worst * 0.999, late ?? 0);
+    if (moment.time > t0) page.rate = (cycle - c0) / (moment.time - t0);
   }
-  const rows = shown.live
-    ? [["rate", page.rate === null ? "–" : `${page.rate.toFixed(0)} of ${shown.rate.toFixed(0)} Hz`], ["woke up late", `${((late ?? 0) * 1e3).toFixed(2)} ms`], ["skipped", String(shown.skipped)]]
-    : [["rate", `${shown.rate.toFixed(0)} Hz`], ["woke up late", `${((late ?? 0) * 1e3).toFixed(2)} ms`], ["skipped", String(shown.skipped)], ["cycle", cycle === null ? "–" : cycle.toFixed(0)]];
+  const { rate, skipped } = shown.info;
+  const rows = [["rate", shown.live ? `${page.rate === null ? "–" : page.rate.toFixed(0)} of ${rate.toFixed(0)} Hz` : `${rate.toFixed(0)} Hz`],
+    ["woke up late", `${((late ?? 0) * 1e3).toFixed(2)} ms`], ["skipped", String(skipped)], ["cycle", cycle === null ? "–" : cycle.toFixed(0)]];
   const list = $("figures");
   if (list.children.length !== rows.length) {
     list.replaceChildren(...rows.map(([name]) => {
@@ -267,14 +267,23 @@ function drawFigures() {
   rows.forEach(([, text], at) => { const cell = list.children[at].lastChild; if (cell.textContent !== text) cell.textContent = text; });
 }
 
+// what is active at the time line's place, or now
+function drawGraph() {
+  for (const one of page.shown.info.controllers) one.active = Boolean(value(`${one.name}/active`) ?? one.active);
+  const graph = JSON.stringify(page.shown.info.controllers);
+  if (graph === page.graph) return;
+  page.graph = graph;
+  drawControllers($("controllers"), page.shown, act);
+}
+
 function drawBody() {
   if (!body?.robot) return;
   const positions = {}, goals = {};
-  for (const { name } of page.shown.joints) {
+  for (const name of page.joints.keys()) {
     positions[name] = value(`${name}/position`);
     goals[name] = value(`${name}/goal_position`) ?? positions[name];
   }
-  const turn = page.imu ? ["x", "y", "z", "w"].map((axis) => value(`${page.imu.source}/orientation.${axis}`)) : null;
+  const turn = page.imu ? ["x", "y", "z", "w"].map((axis) => value(`${page.imu}/orientation.${axis}`)) : null;
   body.showGhost = $("ghost").checked;
   body.pose(positions, goals, turn?.every((one) => one !== null) ? turn : null);
 }
@@ -286,38 +295,44 @@ function buildTimeline() {
   const [begin, end] = page.shown.span;
   page.time ??= begin;
   Object.assign($("time"), { min: begin, max: end, value: page.time });
-  for (const { time, what } of page.shown.marks) $("jump").append(new Option(`${time.toFixed(2)} s: ${what}`, time));
+  offer("worst cycles", page.shown.marks);
+}
+
+// a group of places to jump to
+function offer(label, places) {
+  if (!places.length) return;
+  const group = $("jump").appendChild(Object.assign(document.createElement("optgroup"), { label }));
+  group.append(...places.map(({ time, what }) => new Option(`${time.toFixed(2)} s: ${what}`.slice(0, 70), time)));
 }
 
 function markEvents() {
   const [begin, end] = page.shown.span;
-  $("marks").replaceChildren(...page.events.filter((event) => event.severity >= 30).map((event) => {
+  const severe = page.events.filter((event) => event.severity >= 30);
+  $("marks").replaceChildren(...severe.map((event) => {
     const mark = document.createElement("i");
     mark.style.left = `${(event.time - begin) / (end - begin) * 100}%`;
     mark.className = event.severity >= 40 ? "bad" : "";
     mark.title = event.text;
     return mark;
   }));
-  for (const event of page.events.filter((one) => one.severity >= 30).slice(0, 40)) $("jump").append(new Option(`${event.time.toFixed(2)} s: ${event.text}`.slice(0, 70), event.time));
+  offer("warnings", severe.slice(0, 40).map(({ time, text }) => ({ time, what: text })));
 }
 
 function jump(time) {
   page.time = Math.min(Math.max(time, page.shown.span[0]), page.shown.span[1]);
-  charts.zoom = [page.time - charts.seconds / 2, page.time + charts.seconds / 2];
-  curvesDue = 0;
+  pause(false);
 }
 
 function pause(paused) {
-  page.paused = paused ? newestTime : null;
-  if (paused && !charts.zoom) charts.zoom = charts.span(newestTime);
-  if (!paused) charts.zoom = null;
+  charts.zoom = paused ? charts.span(centre()) : null;
   $("pause").textContent = paused ? "go on" : "pause";
   curvesDue = 0;
 }
 
 // ---- the loop
 
-let curvesDue = 0, shownDue = 0, curves = [], failures = 0, drawnCurves = 0;
+let curvesDue = 0, shownDue = 0, failures = 0;
+const centre = () => (page.shown.live ? newestTime : page.time + charts.seconds / 2); // newest time of the plots
 async function look() {
   const now = performance.now();
   const log = page.shown && !page.shown.live;
@@ -326,9 +341,9 @@ async function look() {
     if (page.time >= page.shown.span[1]) play(false);
   }
   page.clock = now;
-  const centre = log ? page.time + charts.seconds / 2 : newestTime;
-  const wantsCurves = page.shown && now >= curvesDue && (!log || page.time !== page.drawn || curvesDue === 0) && !$("plots").hidden;
-  const spans = wantsCurves ? charts.spans(centre) : [];
+  const wantsCurves = page.shown && now >= curvesDue && (!log || page.time !== page.drawn || curvesDue === 0);
+  const newest = wantsCurves && centre();
+  const spans = wantsCurves ? charts.spans(newest) : [];
   const names = charts.charts.map((one) => one.names.join());
   const seen = await (await ask("look", { time: log ? page.time : null, after: page.after, shown: now >= shownDue, spans })).json();
   if (seen.shown) { shownDue = now + (log ? 1e9 : SHOWN_MS); await arrived(seen.shown); }
@@ -340,9 +355,9 @@ async function look() {
   if (wantsCurves) {
     curvesDue = now + CURVES_MS;
     page.drawn = page.time;
-    if (names.join(";") === charts.charts.map((one) => one.names.join()).join(";")) { charts.draw(seen.curves, centre, log ? page.time : undefined); drawnCurves += 1; }
+    if (names.join(";") === charts.charts.map((one) => one.names.join()).join(";")) charts.draw(seen.curves, newest, log ? page.time : undefined);
   }
-  drawFigures(); drawJoints(); drawBody();
+  drawFigures(); drawJoints(); drawGraph(); drawBody();
   if (log) { if (document.activeElement !== $("time")) $("time").value = page.time; $("now").textContent = `${page.time.toFixed(2)} of ${page.shown.span[1].toFixed(1)} s`; }
   if (performance.now() > saidUntil && !$("message").hidden) say("");
 }
@@ -368,18 +383,18 @@ async function follow() {
 function play(playing) {
   if (playing && page.time >= page.shown.span[1]) page.time = page.shown.span[0];
   page.playing = playing;
-  charts.zoom = null;
+  pause(false);
   $("play").textContent = playing ? "❚❚" : "▶";
   $("play").setAttribute("aria-label", playing ? "Pause" : "Play");
 }
 
 $("stop").onclick = () => act({ verb: "stop" });
-$("pause").onclick = () => pause(page.paused === null && charts.zoom === null);
-$("window").onchange = () => { charts.seconds = Number($("window").value); charts.zoom = null; pause(false); };
+$("pause").onclick = () => pause(charts.zoom === null);
+$("window").onchange = () => { charts.seconds = Number($("window").value); pause(false); };
 $("another").onclick = () => charts.add();
 $("fit").onclick = () => body?.fit();
 $("play").onclick = () => play(!page.playing);
-$("time").oninput = () => { page.time = Number($("time").value); charts.zoom = null; curvesDue = 0; };
+$("time").oninput = () => jump(Number($("time").value));
 $("jump").onchange = () => { if ($("jump").value) jump(Number($("jump").value)); $("jump").value = ""; };
 $("pick").onchange = () => {
   const name = $("pick").value.trim();

@@ -1,1 +1,20 @@
-"""dxlrun_view: a running robot, or a log, on a page in the browser."""
+"""A running robot, or a log, on a page in the browser; what dxlrun finds here by its entry point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun import Command, hookimpl
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for."""
+    return 4
+
+
+@hookimpl
+def dxlrun_commands() -> Sequence[Command]:
+    """Return the verb."""
+    help_line = "Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers."
+    return (Command("view", "dxlrun_view.view:view", help_line),)

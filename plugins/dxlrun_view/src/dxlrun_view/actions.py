@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal, cast
+from typing import Literal
 
 import msgspec
 
-from dxlrun import DxlrunError, InputError, Refused, RemoteRobot
-from dxlrun_view.live import LiveRobot, controller_of
+from dxlrun import DxlrunError, InputError, RemoteRobot
+from dxlrun.remote.replies import Parameter
+from dxlrun_view.live import LiveRobot, info_of
 from dxlrun_view.shown import Source
 
 Verb = Literal[
@@ -25,7 +25,7 @@ class Action(msgspec.Struct, frozen=True):
     names: tuple[str, ...] = ()
     """Joints, controllers or groups that it is about."""
     on: bool = True
-    value: float | bool | str | None = None
+    value: float | bool | str = 0.0
     """Of a slider: rad or m. Of a parameter: as in the robot file."""
     parameter: str = ""
 
@@ -40,8 +40,7 @@ class Done(msgspec.Struct, frozen=True):
 
     said: str
     """For the page's line of messages."""
-    parameters: tuple[tuple[str, str, bool, str], ...] = ()
-    """Name, value, whether it may be changed in a run, and description."""
+    parameters: tuple[Parameter, ...] = ()
 
 
 def act(source: Source, action: Action) -> Done:
@@ -70,7 +69,7 @@ def _done(robot: RemoteRobot, action: Action) -> Done:
             robot.switch(action.names if action.on else (), () if action.on else action.names)
             said = f"{name} is {'active' if action.on else 'not active'}"
         case "goal":
-            said = _goal(robot, name, float(action.value or 0.0))
+            said = _goal(robot, name, float(action.value))
         case "pause":
             robot.pause()
         case "resume":
@@ -79,10 +78,9 @@ def _done(robot: RemoteRobot, action: Action) -> Done:
             goals = robot.play(name).goals
             said = f"plays {name}" + (f" (goal {goals[0].number})" if goals else "")
         case "parameters":
-            rows = robot.parameter_table(name)
-            return Done("", tuple((one.name, str(one.value), one.live, one.description) for one in rows))
+            return Done("", robot.parameter_table(name))
         case "set_parameter":
-            (new,) = robot.set_parameters(name, {action.parameter: action.value or 0.0}).values()
+            (new,) = robot.set_parameters(name, {action.parameter: action.value}).values()
             said = f"{name}: {action.parameter} is {new[1]}"
     return Done(said)
 
@@ -91,7 +89,7 @@ def stopped(robot: RemoteRobot) -> str:
     """Take the torque of all joints; where the run refuses that, end it: its policy takes the torque then."""
     try:
         robot.torque("all", on=False, release=True)
-    except (Refused, DxlrunError) as error:
+    except DxlrunError as error:
         robot.stop(wait=False)
         return f"the run ends: torque off was refused ({error})"
     return "STOP: torque is off, all joints are limp"
@@ -99,9 +97,9 @@ def stopped(robot: RemoteRobot) -> str:
 
 def _goal(robot: RemoteRobot, joint: str, value: float) -> str:
     """Bring a joint to a position by the active controller that commands it."""
-    for row in map(controller_of, cast("list[Mapping[str, object]]", robot.info()["controllers"])):
+    for row in info_of(robot).controllers:
         if row.active and joint in row.joints and "position" in row.command:
-            leads = "trajectory" in row.takes
+            leads = "trajectory" in row.goals
             robot.send(row.name, "position", {joint: value}, seconds=LEAD_S if leads else None)
             return f"{joint} to {value:.3f} by {row.name}"
     raise InputError(f"no active controller commands the position of {joint}; activate one")

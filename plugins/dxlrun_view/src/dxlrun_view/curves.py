@@ -45,10 +45,12 @@ class Moment(msgspec.Struct, frozen=True):
     """In the order of the columns."""
 
 
-def columns_of(joints: Sequence[str], states: Sequence[str], references: Sequence[str] = ()) -> list[str]:
+def columns_of(
+    joints: Sequence[str], states: Sequence[str], references: Sequence[str] = ()
+) -> tuple[str, ...]:
     """Return the names of all columns of a robot, in their order."""
     of_joints = [f"{joint}/{column}" for column in JOINT_COLUMNS for joint in joints]
-    return [CYCLE, LATE, *of_joints, *states, *references]
+    return (CYCLE, LATE, *of_joints, *states, *references)
 
 
 class History:

@@ -34,7 +34,7 @@ from dxlrun_view.curves import (
     numbers_in,
     thinned,
 )
-from dxlrun_view.shown import Controller, Happening, Joint, Mark, Shown
+from dxlrun_view.shown import Controller, LiveEvent, Mark, RobotInfo, Shown
 
 MOST_CYCLES = 100_000
 """Shown of a log, in some 120 MB for 20 joints."""
@@ -73,35 +73,31 @@ class RecordedRobot:
         self._begin_ns = int(cycles["woken_ns"][0])
         self._every, self._skipped = read.every, read.skipped
         self._marks = self._worst(read.worst)
-        self._times, self._active = self._seconds(cycles["woken_ns"]), cycles["active"].copy()
+        self._times = self._seconds(cycles["woken_ns"])
         self._history = self._columns(cycles)
-        self._happenings = tuple(
-            Happening(number, float(self._seconds(event.t_ns)), int(event.severity), event.source, event.text)
+        self._events = tuple(
+            LiveEvent(number, float(self._seconds(event.t_ns)), int(event.severity), event.source, event.text)
             for number, event in enumerate(sorted(read.events, key=lambda each: each.t_ns), 1)
         )
         self._plan = self._planned()
-        self._folder = Path(reader.metadata.get("run", {}).get("robot_file", "")).parent
+        self._info = self._of_run(reader.metadata.get("run", {}).get("robot_file", ""))
         self._fields = tuple(sorted(self._drawable()))
         self._topics: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     @property
     def folder(self) -> Path | None:
         """Where its robot file was, as far as it is still there."""
-        return self._folder if self._folder.is_dir() else None
+        folder = Path(self._info.file).parent
+        return folder if folder.is_dir() else None
 
     def shown(self) -> Shown:
         """Return what the page has around the curves."""
-        header = self._header
         frames = self._plan.frames if self._plan is not None else None
         return Shown(
-            robot=header.robot,
+            info=self._info,
             live=False,
-            rate=1e9 / header.period_ns,
             columns=self._history.columns,
-            joints=self._joints(),
-            controllers=self._controllers(),
             span=self._history.span,
-            skipped=self._skipped,
             every=self._every,
             fields=self._fields,
             marks=self._marks,
@@ -121,13 +117,9 @@ class RecordedRobot:
         inside = (times >= begin) & (times <= end)
         return thinned(name, times[inside], values[inside], points)
 
-    def active(self, time_s: float) -> int:
-        """Return the mask of the controllers that were active at a time."""
-        return int(self._active[max(int(np.searchsorted(self._times, time_s, "right")) - 1, 0)])
-
-    def events(self, after: int) -> tuple[Happening, ...]:
+    def events(self, after: int) -> tuple[LiveEvent, ...]:
         """Return the events behind this number."""
-        return self._happenings[after:]
+        return self._events[after:]
 
     def urdf(self) -> str:
         """Return the robot's URDF; empty: the log has none."""
@@ -170,7 +162,8 @@ class RecordedRobot:
     def _columns(self, cycles: NDArray[np.void]) -> History:
         header = self._header
         layout, times = header.layout, self._times
-        columns = columns_of(header.joints, layout.source_states, header.references)
+        active = [f"{one.name}/active" for one in header.controllers]
+        columns = columns_of(header.joints, layout.source_states, (*header.references, *active))
         history = History(columns, len(cycles))
         history.fill(times, CYCLE, cycles["cycle"].astype(np.float64))
         history.fill(times, LATE, (cycles["woken_ns"] - cycles["scheduled_ns"]) * 1e-9)
@@ -181,6 +174,9 @@ class RecordedRobot:
             history.fill(times, state, cycles["source_state"][:, row])
         for row, reference in enumerate(header.references):
             history.fill(times, reference, cycles["reference"][:, row])
+        for row, name in enumerate(active):
+            is_active = (cycles["active"] >> np.uint64(row)) & np.uint64(1)
+            history.fill(times, name, is_active.astype(np.float64))
         return history
 
     def _worst(self, cycles: NDArray[np.void]) -> tuple[Mark, ...]:
@@ -199,41 +195,34 @@ class RecordedRobot:
         except (KeyError, DxlrunError, msgspec.MsgspecError, ValueError):
             return None
 
-    def _joints(self) -> tuple[Joint, ...]:
-        if self._plan is None:
-            return tuple(Joint(name, "rad", "") for name in self._header.joints)
-        return tuple(
-            Joint(
-                joint.name,
-                "m" if joint.linear else "rad",
-                joint.servo_model.effort_unit.replace("1", "") if joint.servo_model else "",
-                joint.lower if joint.bounded else None,
-                joint.upper if joint.bounded else None,
-                f"{joint.servo_model.model}, {joint.servo}" if joint.servo_model else joint.servo,
-            )
-            for joint in self._plan.loop.joints
+    def _of_run(self, file: str) -> RobotInfo:
+        """Return what the robot said of itself in the run, as far as the log has it."""
+        header, plan = self._header, self._plan
+        info = RobotInfo(
+            header.robot,
+            1e9 / header.period_ns,
+            skipped=self._skipped,
+            joints=header.joints,
+            controllers=tuple(Controller(one.name, "", active=False) for one in header.controllers),
+            file=file,
         )
-
-    def _controllers(self) -> tuple[Controller, ...]:
-        plans = {one.name: one for one in self._plan.loop.controllers} if self._plan is not None else {}
-        found: list[Controller] = []
-        for one in self._header.controllers:
-            plan = plans.get(one.name)
-            if plan is None:
-                found.append(Controller(one.name, "", active=False, joints=one.joints))
-            else:
-                found.append(
-                    Controller(
-                        one.name,
-                        plan.type,
-                        active=plan.active,
-                        joints=plan.joints,
-                        command=plan.command,
-                        into=plan.into,
-                        fallback=plan.fallback,
-                    )
-                )
-        return tuple(found)
+        if plan is None:
+            return info
+        joints, controllers = plan.loop.joints, {one.name: one for one in plan.loop.controllers}
+        return msgspec.structs.replace(
+            info,
+            units={joint.name: "m" for joint in joints if joint.linear},
+            effort_units={
+                joint.name: joint.servo_model.effort_unit.replace("1", "")
+                for joint in joints
+                if joint.servo_model is not None
+            },
+            limits={joint.name: (joint.lower, joint.upper) for joint in joints if joint.bounded},
+            controllers=tuple(
+                msgspec.convert(controllers.get(row.name, row), Controller, from_attributes=True)
+                for row in info.controllers
+            ),
+        )
 
 
 class _Read:

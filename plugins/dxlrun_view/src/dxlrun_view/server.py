@@ -1,17 +1,19 @@
-"""Server of the page: one process of its own on 127.0.0.1, for one person's browser, and for no web site.
+"""Server of the page: one process of its own on 127.0.0.1, for the user's browser, and for no web site.
 
 Each request must name this server as its host (no foreign name that points to 127.0.0.1 gets through), come
-from this page if it says from where, and show the token of the page's address. Whoever may not steer by
-`--control` can still stop.
+from this page if it says from where, and show the token of the page's address. STOP
+works without `--control`.
 """
 
 from __future__ import annotations
 
+import errno
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager
 from importlib.resources import files
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -26,14 +28,16 @@ from starlette.routing import Route
 from dxlrun import DxlrunError, InputError
 from dxlrun_view.actions import Action, act
 from dxlrun_view.curves import Curve, Moment
-from dxlrun_view.shown import Happening, Shown, Source
+from dxlrun_view.shown import LiveEvent, Shown, Source
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PORT = 8765
-ANY = "0.0.0.0"  # noqa: S104  compared; it is listened on if the user says so
-TOKEN = "X-Dxlrun-Token"  # noqa: S105  the name of a header
+ANY = str(IPv4Address(0))
+"""Stands for every address of this machine."""
+HEADER = "X-Dxlrun-Token"
+"""Has the token of the page's address."""
 MOST_POINTS = 4000
 MOST_CURVES = 64
 MOST_BYTES = 1 << 16
@@ -77,7 +81,7 @@ class Seen(msgspec.Struct, frozen=True):
     """The answer."""
 
     moment: Moment
-    events: tuple[Happening, ...]
+    events: tuple[LiveEvent, ...]
     curves: tuple[tuple[Curve, ...], ...]
     shown: Shown | None = None
 
@@ -115,7 +119,7 @@ class Page:
             origin = request.headers.get("origin")
             if host not in self._hosts or origin not in (None, *(f"http://{one}" for one in self._hosts)):
                 return _refused(403, "this page answers itself alone, and no other web site")
-            given = request.headers.get(TOKEN, "")
+            given = request.headers.get(HEADER, "")
             if token and not secrets.compare_digest(given.encode(), self.token.encode()):
                 return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")
             try:
@@ -143,11 +147,12 @@ class Page:
         return _json(await run_in_threadpool(self._seen, asked))
 
     def _seen(self, asked: Look) -> Seen:
+        moment = self.source.at(asked.time)
         shown = None
         if asked.shown:
             shown = msgspec.structs.replace(self.source.shown(), control=self.control)
         return Seen(
-            self.source.at(asked.time),
+            moment,
             self.source.events(asked.after),
             tuple(self._curves(span) for span in asked.spans),
             shown,
@@ -216,23 +221,19 @@ def hosts_of(address: str, port: int) -> tuple[str, ...]:
 
 def listening(address: str, port: int | None) -> socket.socket:
     """Return a listening socket; without a port the usual one, or if that is taken any. Raises InputError."""
-    tried = (PORT, 0) if port is None else (port,)
-    for one in tried:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((address, one))
-            listener.listen(64)
-        except OSError as error:
-            listener.close()
-            if one == tried[-1]:
-                why = error.strerror or error
-                raise InputError(
-                    f"{address}:{one} cannot be listened on: {why}; give another --port"
-                ) from error
-        else:
-            return listener
-    raise AssertionError(tried)
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((address, PORT if port is None else port))
+        listener.listen(64)
+    except OSError as error:
+        listener.close()
+        if port is None:
+            return listening(address, 0)
+        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
+        why = f"{address}:{port} cannot be listened on: {error.strerror or error}"
+        raise InputError(f"{why}; give another {other}") from error
+    return listener
 
 
 class Server(uvicorn.Server):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -10,22 +11,8 @@ import msgspec
 from dxlrun_view.curves import Curve, Moment
 
 
-class Joint(msgspec.Struct, frozen=True):
-    """One joint, as the page's table has it."""
-
-    name: str
-    unit: str
-    """Of its position: rad or m."""
-    effort_unit: str
-    """Empty: the fraction of the servo's maximum."""
-    lower: float | None = None
-    upper: float | None = None
-    servo: str = ""
-    """Model, ID and bus."""
-
-
 class Controller(msgspec.Struct, frozen=True):
-    """One controller of the graph."""
+    """A controller of the graph, a row of RobotInfo."""
 
     name: str
     type: str
@@ -35,12 +22,33 @@ class Controller(msgspec.Struct, frozen=True):
     into: tuple[str, ...] = ()
     """Controllers whose references it commands."""
     fallback: str = ""
-    takes: tuple[str, ...] = ()
-    """Kinds of commands."""
+    goals: tuple[str, ...] = ()
+    """Commands that are goals, by their kinds."""
 
 
-class Happening(msgspec.Struct, frozen=True):
-    """One event."""
+class RobotInfo(msgspec.Struct, frozen=True):
+    """The part of `RemoteRobot.info` that a page uses; a log has the same."""
+
+    robot: str
+    rate: float = 0.0
+    """Hz, nominal."""
+    paused: bool = False
+    skipped: int = 0
+    """Periods."""
+    joints: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[str, ...]] = {}
+    units: Mapping[str, str] = {}
+    """Of positions: rad or m."""
+    effort_units: Mapping[str, str] = {}
+    """Empty: the fraction of the servo's maximum."""
+    limits: Mapping[str, tuple[float, float]] = {}
+    """Of positions; a joint that turns without end has none."""
+    controllers: tuple[Controller, ...] = ()
+    file: str = ""
+
+
+class LiveEvent(msgspec.Struct, frozen=True):
+    """An event as `RemoteRobot.events` has it."""
 
     number: int
     time: float
@@ -58,21 +66,16 @@ class Mark(msgspec.Struct, frozen=True):
     what: str
 
 
-class Shown(msgspec.Struct, frozen=True):
+class Shown(msgspec.Struct, frozen=True, kw_only=True):
     """A robot or a log, as far as it changes seldom."""
 
-    robot: str
+    info: RobotInfo
     live: bool
-    rate: float
-    """Hz, nominal."""
     columns: tuple[str, ...]
-    joints: tuple[Joint, ...]
-    controllers: tuple[Controller, ...]
     span: tuple[float, float]
     """s, of the oldest and the newest moment."""
-    skipped: int = 0
-    """Periods."""
-    paused: bool = False
+    run: int = 1
+    """Greater by one for each run of the robot: all of the page is built anew."""
     problem: str = ""
     """Why there is nothing new: the robot does not run, or has ended."""
     every: int = 1
@@ -101,12 +104,12 @@ class Source(Protocol):
         """Return what changes seldom."""
 
     def at(self, time_s: float | None) -> Moment:
-        """Return all columns at a time, by default the newest."""
+        """Return all columns at a time, by default the newest, for which a running robot is asked."""
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
         """Return a part of a curve; raises KeyError for one that there is not."""
 
-    def events(self, after: int) -> tuple[Happening, ...]:
+    def events(self, after: int) -> tuple[LiveEvent, ...]:
         """Return the events behind this number."""
 
     def urdf(self) -> str:

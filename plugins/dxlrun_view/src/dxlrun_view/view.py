@@ -45,8 +45,8 @@ def view(
     port
         Serve the page on this port; without it on 8765, or if that is taken on a free one.
     listen
-        Serve it on this address. On another one than 127.0.0.1 whoever has the page's address, with its
-        token, sees the robot from the network.
+        Serve it on this address. On another one than 127.0.0.1 the page is open to every machine of the
+        network that is given its address with the token.
     """
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")
@@ -67,8 +67,8 @@ def view(
             signal.signal(signal.SIGINT, end)
             signal.signal(signal.SIGTERM, end)
             if listen != "127.0.0.1":
-                print_warning(f"{listen}: whoever has this address sees the robot from the network")
-            show(f"{source.shown().robot}: {url}", "Ctrl-C ends the page, not the robot.")
+                print_warning(f"{listen}: every machine that is given this address can open the page")
+            show(f"{source.shown().info.robot}: {url}", "Ctrl-C ends the page, not the robot.")
             sys.stdout.flush()
             if browser:
                 threading.Thread(target=_open, args=(url,), daemon=True).start()
