@@ -25,14 +25,12 @@ from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, 
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import Budget, BusPlan
 
-FAST_LATENCY_NS = 1_000_000
-"""The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
+FAST_LATENCY_NS = 1_000_000  # The shortest latency timer of an FTDI adapter (protocol.md, Time budget)
 _COMFORTABLE = 0.9
 """Share of the period above which controllers and the operating system have too little left."""
 _LEAST_DEVICE_MARGIN_NS, _MOST_DEVICE_MARGIN_NS = 100_000, 5_000_000
 """A stock kernel wakes some 50-100 us late."""
-WATCHDOG_NS = 200_000_000
-"""Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)."""
+WATCHDOG_NS = 200_000_000  # Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)
 
 
 def compile_buses(

@@ -27,8 +27,7 @@ from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
-_RATE_TOLERANCE = 1e-6
-"""Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""
+_RATE_TOLERANCE = 1e-6  # Relative; a loop rate of 33.3 Hz is three times 11.1 Hz
 _OFFERED = (
     "install the package that offers it into this environment (`pip install PACKAGE`); "
     "`dxlrun plugins` lists the types that there are"
@@ -49,8 +48,7 @@ class CompiledController(msgspec.Struct, frozen=True):
     plan: ControllerPlan
     offer: Offer
     parameters: ParametersModel
-    motors: tuple[str, ...] = ()
-    """Figures of its joints' motors that it needs."""
+    motors: tuple[str, ...] = ()  # Figures of its joints' motors that it needs
     asked_by: Mapping[CommandName, KeyPath] = {}
     """The key of its parameters for which it claims a command interface, see `Interfaces`."""
 

@@ -36,10 +36,8 @@ class CompiledDevice(msgspec.Struct, frozen=True):
     source: SourcePlan
     described: Device
     table: DeviceTable
-    read: Mapping[str, DeviceItem]
-    """Items of its states, by the states' names."""
-    path: Path | None = None
-    """The file of its table, where the robot file names one."""
+    read: Mapping[str, DeviceItem]  # Items of its states, by the states' names
+    path: Path | None = None  # The file of its table, where the robot file names one
 
 
 def compile_devices(file: RobotFile) -> dict[str, CompiledDevice]:

@@ -21,8 +21,7 @@ from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
 """Interfaces of every joint that may be read without a claim; `age` is that of the state, s."""
-_LONGEST = 6
-"""Names of joints in one message."""
+_LONGEST = 6  # Names of joints in one message
 
 
 class GraphEdge(msgspec.Struct, frozen=True):

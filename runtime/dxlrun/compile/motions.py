@@ -55,8 +55,7 @@ LEAD_NS = 1_000_000_000
 """From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
 MOST_TARGETS = 200_000
 """Of all formulas of a motion file: 20 joints for 100 s at 100 Hz. One takes some 300 bytes and 5 us."""
-MOST_CHARACTERS = 20_000_000
-"""Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s."""
+MOST_CHARACTERS = 20_000_000  # Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s
 SETTLE_NS = 1_000_000_000
 """From the last target to the end of the part, where the controller has no `goal_time`."""
 

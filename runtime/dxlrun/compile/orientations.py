@@ -13,8 +13,7 @@ from dxlrun.description.frames.urdf import Urdf
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import SensorPlan
 
-_ALIKE_RAD = math.radians(1.0)
-"""Between two orientations that are meant to be one. [i]"""
+_ALIKE_RAD = math.radians(1.0)  # Between two orientations that are meant to be one. [i]
 
 
 def check_orientations(

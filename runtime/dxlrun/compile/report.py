@@ -21,8 +21,7 @@ from dxlrun.plan.robot_plan import MotionPart, Plan
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
-Row = dict[str, Any]
-"""What JSON has of one thing."""
+Row = dict[str, Any]  # What JSON has of one thing
 
 
 def check_report(
@@ -206,12 +205,9 @@ class PolicyRow(msgspec.Struct, frozen=True):
     """What happens when something does not go on as planned."""
 
     name: str
-    does: str
-    """Its steps and how the robot is left; or which joints are held while the run continues."""
-    longest: float
-    """s, that the steps take at the most"""
-    without_loop: str
-    """What of it is left when the loop is gone: what the guardian does."""
+    does: str  # Its steps and how the robot is left; or which joints are held while the run continues
+    longest: float  # s, that the steps take at the most
+    without_loop: str  # What of it is left when the loop is gone: what the guardian does
 
 
 def policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> list[PolicyRow]:

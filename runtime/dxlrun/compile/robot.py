@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
 """Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
-_HIGHEST = 98
-"""The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))."""
+_HIGHEST = 98  # The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))
 
 
 class Compiled(msgspec.Struct, frozen=True):
@@ -54,8 +53,7 @@ class Compiled(msgspec.Struct, frozen=True):
 
     plan: Plan
     warnings: tuple[Problem, ...]
-    rate: float
-    """Of the loop, Hz, as the file has it."""
+    rate: float  # Of the loop, Hz, as the file has it
     joints: tuple[CompiledJoint, ...]
     parts: tuple[MotionPart, ...]
 

@@ -24,8 +24,7 @@ from dxlrun.errors import Mark
 
 Quantity = Literal["position", "velocity", "acceleration"]
 QUANTITIES: tuple[Quantity, ...] = ("position", "velocity", "acceleration")
-LONGEST_FORMULA = 1000
-"""Characters; bounds parsing and evaluation together with the list of operations."""
+LONGEST_FORMULA = 1000  # Characters; bounds parsing and evaluation together with the list of operations
 DEEPEST_FORMULA = 100
 """Levels of operations; a sum of n terms has n. Keeps the evaluator away from Python's recursion limit."""
 
@@ -85,8 +84,7 @@ class SampledTarget(msgspec.Struct, frozen=True):
 class Sample(msgspec.Struct, frozen=True):
     """The targets of one moment."""
 
-    t_ns: int
-    """Since the part's start."""
+    t_ns: int  # Since the part's start
     targets: dict[str, SampledTarget]
     mark: Mark
 

@@ -15,8 +15,7 @@ from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 
-_LEAST_TIMEOUT_NS = 50_000_000
-"""A process without real time may wait so long for a processor."""
+_LEAST_TIMEOUT_NS = 50_000_000  # A process without real time may wait so long for a processor
 _TIMEOUT_PERIODS = 5
 
 

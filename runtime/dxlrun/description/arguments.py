@@ -17,8 +17,7 @@ from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.problems import problems_of
 from dxlrun.errors import Mark, Problem, suggestion
 
-COMMAND_LINE = "command line"
-"""The file in the mark of a problem of `name:=value`."""
+COMMAND_LINE = "command line"  # The file in the mark of a problem of `name:=value`
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")

@@ -11,12 +11,9 @@ from pydantic import AfterValidator, Field
 from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
-SIMULATED = "sim"
-"""The port of a simulated bus."""
-_HIGHEST_ID_OF_PROTOCOL_2 = 252
-"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
-_LONGEST_TIMER_NS = 255_000_000
-"""The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
+SIMULATED = "sim"  # The port of a simulated bus
+_HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
+_LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
 
 
 def _protocol(value: float) -> float:

@@ -22,12 +22,9 @@ from dxlrun.errors import InputError, Mark, Problem
 
 KeyPath = tuple[str | int, ...]
 """The way from the top of a document to a value: keys of mappings, indices of lists."""
-LARGEST_FILE = 1 << 20
-"""Bytes."""
-DEEPEST = 32
-"""Mappings and lists inside each other."""
-MOST_NODES = 200_000
-"""Keys, values, mappings and lists of a file, with every use of an anchor counted."""
+LARGEST_FILE = 1 << 20  # Bytes
+DEEPEST = 32  # Mappings and lists inside each other
+MOST_NODES = 200_000  # Keys, values, mappings and lists of a file, with every use of an anchor counted
 
 _SCALARS: Mapping[str, object] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
@@ -40,8 +37,7 @@ _SCALARS: Mapping[str, object] = {
 _INT = re.compile(r"[-+]?[0-9]+(?:_[0-9]+)*")
 _BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:_[0-9]+)*(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_LONGEST_NUMBER = 64
-"""Characters; more is text: the conversion of a million digits takes long."""
+_LONGEST_NUMBER = 64  # Characters; more is text: the conversion of a million digits takes long
 _Loader: type[yaml.SafeLoader] = getattr(
     yaml, "CSafeLoader", yaml.SafeLoader
 )  # the fast one where it was built
@@ -53,8 +49,7 @@ class Marks(msgspec.Struct, frozen=True):
     file: str
     values: Mapping[KeyPath, Mark]
     keys: Mapping[KeyPath, Mark]
-    origins: Mapping[KeyPath, str] = {}
-    """`rate:=100` for each value in which an argument was put."""
+    origins: Mapping[KeyPath, str] = {}  # `rate:=100` for each value in which an argument was put
 
     def value(self, *path: str | int) -> Mark:
         """Return the place of a value, or else of the nearest parent that the file has."""
@@ -251,16 +246,12 @@ class Filled(msgspec.Struct, frozen=True):
     """A scalar after arguments were put into it."""
 
     value: object
-    origin: str | None = None
-    """`rate:=100` when an argument is in it."""
-    problems: tuple[tuple[str, str], ...] = ()
-    """What is wrong, and how to fix it."""
-    unknown: bool = False
-    """The value could not be made; further checks of it are skipped."""
+    origin: str | None = None  # `rate:=100` when an argument is in it
+    problems: tuple[tuple[str, str], ...] = ()  # What is wrong, and how to fix it
+    unknown: bool = False  # The value could not be made; further checks of it are skipped
 
 
-Fill = Callable[[KeyPath, str, bool], Filled]
-"""Path, text and whether it was quoted -> the value."""
+Fill = Callable[[KeyPath, str, bool], Filled]  # Path, text and whether it was quoted -> the value
 
 
 def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
@@ -274,8 +265,7 @@ class Grown(msgspec.Struct, frozen=True):
     data: dict[str, object]
     marks: Marks
     problems: tuple[Problem, ...]
-    unknown: frozenset[KeyPath]
-    """Where a problem was already reported, so that the value there means nothing."""
+    unknown: frozenset[KeyPath]  # Where a problem was already reported, so that the value there means nothing
 
 
 def grow(tree: Tree, file: str, fill: Fill) -> Grown:

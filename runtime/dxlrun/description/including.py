@@ -28,10 +28,8 @@ from dxlrun.description.problems import shown
 from dxlrun.errors import InputError, Mark, Problem
 
 KEY = "include"
-MOST_LEVELS = 8
-"""Files that include each other in a row."""
-MOST_FILES = 64
-"""Of one robot."""
+MOST_LEVELS = 8  # Files that include each other in a row
+MOST_FILES = 64  # Of one robot
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -40,8 +38,7 @@ class Source(msgspec.Struct, frozen=True):
     path: Path
     text: str
     tree: Tree
-    declared: Grown
-    """Its values before arguments are put in."""
+    declared: Grown  # Its values before arguments are put in
 
     def grown(self, fill: Fill) -> Grown:
         """Return its values with arguments put in."""

@@ -24,8 +24,7 @@ from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion
 from dxlrun.description.robot import Robot
 
-Schema = dict[str, Any]
-"""A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""
+Schema = dict[str, Any]  # A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _ARGUMENT: Schema = {
@@ -42,8 +41,7 @@ _SCALARS = ("string", "integer", "number", "boolean")
 _ABOUT = ("description", "default", "examples")
 
 
-Models = Mapping[str, type[BaseModel]]
-"""Models of parameters, by the type that has them."""
+Models = Mapping[str, type[BaseModel]]  # Models of parameters, by the type that has them
 
 
 def robot_schema(controllers: Models, sensors: Models) -> Schema:

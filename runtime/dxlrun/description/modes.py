@@ -21,18 +21,12 @@ COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort",
 class Mode(IntEnum):
     """What a servo does with its goals; the number is in the log."""
 
-    UNKNOWN = 0
-    """Not known, or changing now: the joint gets no goals."""
-    POSITION = 1
-    """Goes to a position, as fast as it can or at a speed; of a continuous joint over many turns."""
-    VELOCITY = 2
-    """Turns at a speed, for ever."""
-    EFFORT = 3
-    """Exerts a torque, or draws a current."""
-    PWM = 4
-    """Gets a fraction of the full voltage."""
-    EFFORT_POSITION = 5
-    """Goes to a position with no more effort than is commanded."""
+    UNKNOWN = 0  # Not known, or changing now: the joint gets no goals
+    POSITION = 1  # Goes to a position, as fast as it can or at a speed; of a continuous joint over many turns
+    VELOCITY = 2  # Turns at a speed, for ever
+    EFFORT = 3  # Exerts a torque, or draws a current
+    PWM = 4  # Gets a fraction of the full voltage
+    EFFORT_POSITION = 5  # Goes to a position with no more effort than is commanded
 
 
 _MODES: dict[frozenset[str], Mode] = {

@@ -114,8 +114,7 @@ class MotionDescription(msgspec.Struct, frozen=True):
     motion: Motion
     marks: Marks
     path: Path
-    text: str
-    """As it was read."""
+    text: str  # As it was read
 
 
 def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:

@@ -27,15 +27,12 @@ class Description(msgspec.Struct, frozen=True):
     robot: Robot
     marks: Marks
     path: Path
-    text: str
-    """As it was read."""
-    arguments: dict[str, str]
-    """All its arguments, with the values of this run."""
+    text: str  # As it was read
+    arguments: dict[str, str]  # All its arguments, with the values of this run
     left_out: frozenset[KeyPath] = frozenset()
     """`("controllers", "head")`, `("poses",)`: what the file has in a wrong form and no guess stands in for;
     only in a survey."""
-    included: Mapping[str, str] = {}
-    """The text of each file that it includes, by name."""
+    included: Mapping[str, str] = {}  # The text of each file that it includes, by name
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -57,8 +54,7 @@ class Replacement(msgspec.Struct, frozen=True):
     """A value that stands in for what a robot file has at a place, or puts something there."""
 
     path: KeyPath
-    value: object
-    """As the file would have it: `5 rad/s^2`, 0.5, true."""
+    value: object  # As the file would have it: `5 rad/s^2`, 0.5, true
 
 
 def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:

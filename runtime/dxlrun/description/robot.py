@@ -105,8 +105,7 @@ class TorqueStep(Form):
     over: Annotated[Duration, Field(gt=0)] = key("How long it takes.", "1 s", 1_000_000_000)
 
 
-Word = Literal["limp", "hold"]
-"""Torque off; or torque on, every joint where it is."""
+Word = Literal["limp", "hold"]  # Torque off; or torque on, every joint where it is
 
 
 def _kind_of_step(step: object) -> str:

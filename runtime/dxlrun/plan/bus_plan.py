@@ -21,12 +21,10 @@ class Field(msgspec.Struct, frozen=True):
     """One item inside a block of bytes, little-endian."""
 
     offset: int
-    size: int
-    """1, 2 or 4"""
+    size: int  # 1, 2 or 4
     encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
     """A servo's item is no float32."""
-    bit: int | None = None
-    """Of a device's item: the only bit of it that is meant."""
+    bit: int | None = None  # Of a device's item: the only bit of it that is meant
 
     def tick(self, block: bytes | memoryview) -> int:
         """Return the item as the servo counts, out of the bytes of its block.
@@ -50,8 +48,7 @@ class StateLayout(msgspec.Struct, frozen=True):
     position: Field
     velocity: Field
     effort: Field
-    spare: int
-    """Bytes behind the block that can be read with it, see `exchange`."""
+    spare: int  # Bytes behind the block that can be read with it, see `exchange`
 
 
 class GoalLayout(msgspec.Struct, frozen=True):
@@ -77,26 +74,20 @@ class GoalLayout(msgspec.Struct, frozen=True):
 class TorqueLimit(msgspec.Struct, frozen=True):
     """Where a servo's torque is limited in RAM, and where its own limit stands, which it begins with."""
 
-    name: str
-    """As the e-Manual writes it: `Torque Limit (34)`."""
+    name: str  # As the e-Manual writes it: `Torque Limit (34)`
     address: int
     full_address: int
-    size: int
-    """Of both, bytes."""
+    size: int  # Of both, bytes
 
 
 class RegisterValue(msgspec.Struct, frozen=True):
     """One item of a servo's memory and what it shall hold."""
 
     address: int
-    size: int
-    """1, 2 or 4"""
-    value: int
-    """The integer on the wire; one below 0 in two's complement."""
-    name: str
-    """As the control table has it: `position_p_gain`."""
-    eeprom: bool = False
-    """True where it survives power-off, and is written only while torque is off."""
+    size: int  # 1, 2 or 4
+    value: int  # The integer on the wire; one below 0 in two's complement
+    name: str  # As the control table has it: `position_p_gain`
+    eeprom: bool = False  # True where it survives power-off, and is written only while torque is off
 
     @property
     def data(self) -> bytes:
@@ -107,10 +98,8 @@ class RegisterValue(msgspec.Struct, frozen=True):
 class Scale(msgspec.Struct, frozen=True):
     """Unit and reach of a goal."""
 
-    per_tick: float
-    """rad/s, the unit of the state's effort, or fraction of the full voltage"""
-    most: int
-    """Highest tick without its sign, by the manual; the servo's own limit may be lower."""
+    per_tick: float  # rad/s, the unit of the state's effort, or fraction of the full voltage
+    most: int  # Highest tick without its sign, by the manual; the servo's own limit may be lower
 
 
 class OwnLimit(msgspec.Struct, frozen=True):
@@ -128,14 +117,10 @@ class ModePlan(msgspec.Struct, frozen=True):
     mode: Mode
     operating: tuple[RegisterValue, ...]
     """What selects the mode, in the order in which it is written, with torque off."""
-    goals: tuple[GoalLayout, ...]
-    """The blocks of its goals, in the order in which they are sent."""
-    lower_tick: int
-    """Lowest goal position."""
-    upper_tick: int
-    """Highest goal position."""
-    present_rad_s_per_tick: float
-    """Unit of the present speed in this mode."""
+    goals: tuple[GoalLayout, ...]  # The blocks of its goals, in the order in which they are sent
+    lower_tick: int  # Lowest goal position
+    upper_tick: int  # Highest goal position
+    present_rad_s_per_tick: float  # Unit of the present speed in this mode
     speed: Scale | None = None
     effort: Scale | None = None
     pwm: Scale | None = None
@@ -144,16 +129,14 @@ class ModePlan(msgspec.Struct, frozen=True):
 class ServoPlan(msgspec.Struct, frozen=True):
     """One servo and what it moves: s = direction * (theta - reference) * ratio, the position of its joint."""
 
-    joint: str
-    """What it moves, as sentences name it: its joint, or of a transmission `wrist/left`."""
+    joint: str  # What it moves, as sentences name it: its joint, or of a transmission `wrist/left`
     row: int
     """Row of the joint in the state and goal arrays of the whole robot; where several servos move one joint
     (`MechanicsPlan`), its own row in the arrays of the servos."""
     servo_id: int
     model: str
     model_number: int
-    reference: float
-    """rad, counted from the servo's raw 0"""
+    reference: float  # rad, counted from the servo's raw 0
     direction: int
     rad_per_tick: float
     max_tick: int
@@ -162,39 +145,29 @@ class ServoPlan(msgspec.Struct, frozen=True):
     effort_per_tick: float
     """The joint's effort per tick of present load or current: Nm (N where it is linear), or what the servo
     measures, A or the fraction of the maximum."""
-    lower_tick: int
-    """Lowest goal that the joint's limits allow, as the servo counts."""
-    upper_tick: int
-    """Highest goal that the joint's limits allow, as the servo counts."""
+    lower_tick: int  # Lowest goal that the joint's limits allow, as the servo counts
+    upper_tick: int  # Highest goal that the joint's limits allow, as the servo counts
     state: StateLayout
     goal: GoalLayout
-    torque_address: int
-    """Where torque enable stands, one byte."""
+    torque_address: int  # Where torque enable stands, one byte
     hardware_error_address: int | None
     """Where hardware error status stands, one byte; None where the model has none."""
-    torque_limit: TorqueLimit | None = None
-    """None where the model has none that limits position control."""
+    torque_limit: TorqueLimit | None = None  # None where the model has none that limits position control
     registers: tuple[RegisterValue, ...] = ()
     """What the robot file declares, in the order in which it is written: EEPROM first."""
-    modes: tuple[ModePlan, ...] = ()
-    """The modes in which the servo can be."""
-    start_mode: Mode = Mode.POSITION
-    """In which it is brought at the start; one of `modes`."""
+    modes: tuple[ModePlan, ...] = ()  # The modes in which the servo can be
+    start_mode: Mode = Mode.POSITION  # In which it is brought at the start; one of `modes`
     own_limits: tuple[OwnLimit, ...] = ()
-    slow: tuple[str, ...] = ()
-    """Items that are read slowly, by name."""
-    torque_on_return: bool = False
-    """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
-    continuous: bool = False
-    """The joint is a wheel, or one of many turns."""
+    slow: tuple[str, ...] = ()  # Items that are read slowly, by name
+    torque_on_return: bool = False  # Torque is given back after a reboot (policy `on_returned_servo: hold`)
+    continuous: bool = False  # The joint is a wheel, or one of many turns
     torque_at_start: bool = True
     """The start gives it torque; False: it stays limp until a client requests torque."""
     ratio: float = 1.0
     """What the joint moves while the servo turns by 1 rad: rad (1 / gear ratio), or m where it is linear."""
     name: str = ""
     """Its own among all servos, where several move one joint: `hip/1`, `wrist/left`; empty: its joint's."""
-    linear: bool = False
-    """The joint's positions are m, its speeds m/s."""
+    linear: bool = False  # The joint's positions are m, its speeds m/s
 
     @property
     def own_name(self) -> str:
@@ -236,27 +209,19 @@ class Member(msgspec.Struct, frozen=True):
     servo_id: int
     address: int
     length: int
-    spare: int
-    """Bytes behind the block that can be read with it."""
-    device: int = -1
-    """Index of the device on its bus; -1: it is a servo."""
-    block: int = 0
-    """Number of the device's block."""
+    spare: int  # Bytes behind the block that can be read with it
+    device: int = -1  # Index of the device on its bus; -1: it is a servo
+    block: int = 0  # Number of the device's block
 
 
 class DeviceField(msgspec.Struct, frozen=True):
     """One state of a device: number on the wire * scale + offset."""
 
-    state: str
-    """`angular_velocity.x`"""
-    place: Field
-    """In its block."""
-    scale: float
-    """SI units per tick."""
-    offset: float
-    """SI units at tick 0."""
-    column: int
-    """Of the state among `source_states` of the cycle's record."""
+    state: str  # `angular_velocity.x`
+    place: Field  # In its block
+    scale: float  # SI units per tick
+    offset: float  # SI units at tick 0
+    column: int  # Of the state among `source_states` of the cycle's record
 
 
 class DeviceBlock(msgspec.Struct, frozen=True):
@@ -265,27 +230,22 @@ class DeviceBlock(msgspec.Struct, frozen=True):
     address: int
     length: int
     fields: tuple[DeviceField, ...]
-    spare: int = 0
-    """Bytes behind the block that can be read with it."""
+    spare: int = 0  # Bytes behind the block that can be read with it
 
 
 class DeviceCommand(msgspec.Struct, frozen=True):
     """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
 
-    name: str
-    """`led`"""
-    item: str
-    """As the control table has it."""
+    name: str  # `led`
+    item: str  # As the control table has it
     address: int
     size: int
     encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
     scale: float
     offset: float
-    lowest: float
-    """SI units"""
+    lowest: float  # SI units
     highest: float
-    column: int
-    """Of the command among `device_commands` of the cycle's record."""
+    column: int  # Of the command among `device_commands` of the cycle's record
     safe: float | None = None
     """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
 
@@ -304,15 +264,11 @@ class DevicePlan(msgspec.Struct, frozen=True):
     """Something on a bus that is no servo: read each cycle, never given torque, goals or a mode."""
 
     name: str
-    servo_id: int
-    """Its ID."""
+    servo_id: int  # Its ID
     model: str
-    model_number: int | None
-    """None: it is not checked."""
-    source: int
-    """Row of the device among the sources of the cycle's record."""
-    blocks: tuple[DeviceBlock, ...]
-    """Each is a read of its own."""
+    model_number: int | None  # None: it is not checked
+    source: int  # Row of the device among the sources of the cycle's record
+    blocks: tuple[DeviceBlock, ...]  # Each is a read of its own
     commands: tuple[DeviceCommand, ...] = ()
 
 
@@ -324,8 +280,7 @@ class Budget(msgspec.Struct, frozen=True):
     wire_ns: int
     return_delay_ns: int
     latency_ns: int
-    goal_bytes: int
-    """Those of `request_bytes` that are goals, which have no reply."""
+    goal_bytes: int  # Those of `request_bytes` that are goals, which have no reply
 
     @property
     def goals_ns(self) -> int:
@@ -347,8 +302,7 @@ class BusPlan(msgspec.Struct, frozen=True):
     """One serial line: its servos, its prepared packets, its budget."""
 
     name: str
-    port: str
-    """Device path, or `sim`."""
+    port: str  # Device path, or `sim`
     protocol: float
     baud_rate: int
     latency_ns: int
@@ -361,20 +315,14 @@ class BusPlan(msgspec.Struct, frozen=True):
     """The state read of each group, when all its servos answer, in the form that every firmware knows."""
     limp: tuple[Transaction, ...]
     """Torque off, to be sent at any moment: to all servos first, then servo by servo, acknowledged."""
-    torque_reads: tuple[Transaction, ...]
-    """Read torque enable, in the order of `servos`."""
-    budget: Budget
-    """Of a cycle with the reads that were chosen: the fast forms where `fast` says so."""
+    torque_reads: tuple[Transaction, ...]  # Read torque enable, in the order of `servos`
+    budget: Budget  # Of a cycle with the reads that were chosen: the fast forms where `fast` says so
     fast: tuple[bool, ...] = ()
     """Of each group: it is to be read by a fast form, if that is answered at the start."""
-    read_by: str = ""
-    """What the e-Manual calls the instructions of the reads: `fast sync read + read`."""
-    watchdog_ticks: int = 0
-    """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
-    slow_period_ns: int = 0
-    """In which time each slow register is read once; 0: none is."""
-    devices: tuple[DevicePlan, ...] = ()
-    """What is on the bus and is no servo."""
+    read_by: str = ""  # What the e-Manual calls the instructions of the reads: `fast sync read + read`
+    watchdog_ticks: int = 0  # Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed
+    slow_period_ns: int = 0  # In which time each slow register is read once; 0: none is
+    devices: tuple[DevicePlan, ...] = ()  # What is on the bus and is no servo
     device_margin_ns: int = 1_000_000
     """How long a device is awaited beyond the latest moment of its reply by the wire."""
 

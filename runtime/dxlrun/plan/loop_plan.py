@@ -36,45 +36,38 @@ class SchedulerPlan(msgspec.Struct, frozen=True):
     policy: Policy
     priority: int
     lock_memory: bool
-    cores: tuple[int, ...] = ()
-    """Where the loop may run; empty: anywhere."""
+    cores: tuple[int, ...] = ()  # Where the loop may run; empty: anywhere
     polling_ns: int | None = None
     """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
     reply_polling_ns: int | None = None
     """Longest time that a reply is polled for, 0: never; None: as a tenth of a core allows."""
-    idle_latency: bool = False
-    """Keep the cores from deep idle states."""
+    idle_latency: bool = False  # Keep the cores from deep idle states
 
 
 class JointPlan(msgspec.Struct, frozen=True):
     """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
 
     name: str
-    lower: float
-    """rad, or m of a linear joint; the tighter one of the file's limit and the servo's reach"""
+    lower: float  # rad, or m of a linear joint; the tighter one of the file's limit and the servo's reach
     upper: float
     velocity: float | None
     """rad/s; the servo's top speed where the file gives none; None: not known either, or a log of the time
     before acceleration limits, which replays without one"""
     effort: float | None = None
     """Nm, A or the fraction of maximum, as the model measures it; None: no limit in the file"""
-    continuous: bool = False
-    """A wheel, or a joint of many turns."""
+    continuous: bool = False  # A wheel, or a joint of many turns
     bounded: bool = True
     """`lower` and `upper` bind velocity, effort and PWM too; not those of a continuous joint whose limits the
     file does not give: a wheel turns for ever."""
-    top_speed: float | None = None
-    """The servo's own, rad/s; None: not known."""
+    top_speed: float | None = None  # The servo's own, rad/s; None: not known
     top_effort: float | None = None
     """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
     acceleration: float | None = None
     """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
-    servo: str = ""
-    """ID and bus, for sentences"""
+    servo: str = ""  # ID and bus, for sentences
     motor: MotorModel | None = None
     """Its servo's motor, of the motor file that the robot file names; None: it names none"""
-    servo_model: ServoModel | None = None
-    """Its servo by the manual; None: several servos move it"""
+    servo_model: ServoModel | None = None  # Its servo by the manual; None: several servos move it
 
     linear: bool = False
     """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
@@ -116,14 +109,10 @@ class SourcePlan(msgspec.Struct, frozen=True):
 
     name: str
     kind: Literal["device", "sensor"]
-    states: tuple[str, ...]
-    """Names of its states: `angular_velocity.x`."""
-    commands: tuple[str, ...] = ()
-    """Names of what may be commanded, of a device: `led`."""
-    ranges: tuple[tuple[float, float], ...] = ()
-    """Lowest and highest value of each command, SI units."""
-    label: str = ""
-    """As sentences name it: `imu (ID 241 on bus main)`."""
+    states: tuple[str, ...]  # Names of its states: `angular_velocity.x`
+    commands: tuple[str, ...] = ()  # Names of what may be commanded, of a device: `led`
+    ranges: tuple[tuple[float, float], ...] = ()  # Lowest and highest value of each command, SI units
+    label: str = ""  # As sentences name it: `imu (ID 241 on bus main)`
 
 
 class SensorPlan(msgspec.Struct, frozen=True):
@@ -131,21 +120,16 @@ class SensorPlan(msgspec.Struct, frozen=True):
 
     name: str
     type: str
-    distribution: str
-    """Publisher of the plug-in: `name version`."""
-    parameters: str
-    """JSON that `Parameters` accepts"""
+    distribution: str  # Publisher of the plug-in: `name version`
+    parameters: str  # JSON that `Parameters` accepts
     states: tuple[str, ...]
-    period_ns: int
-    """Between two samples."""
-    timeout_ns: int
-    """Age at which its values are no longer valid."""
+    period_ns: int  # Between two samples
+    timeout_ns: int  # Age at which its values are no longer valid
     on_lost: Literal["continue", "stop"] = "continue"
     """What becomes of the run when it brings nothing for that time."""
     links: tuple[str, ...] = ()
     """Of the URDF, whose simulated motion it senses; empty: it measures the real world."""
-    simulated: bool = False
-    """It can be stepped on virtual time."""
+    simulated: bool = False  # It can be stepped on virtual time
 
 
 class ControllerPlan(msgspec.Struct, frozen=True):
@@ -153,37 +137,26 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 
     name: str
     type: str
-    distribution: str
-    """Publisher of the plug-in: `name version`."""
-    parameters: str
-    """JSON that `Parameters` accepts"""
+    distribution: str  # Publisher of the plug-in: `name version`
+    parameters: str  # JSON that `Parameters` accepts
     joints: tuple[str, ...]
-    command: tuple[str, ...]
-    """Claimed command interfaces."""
+    command: tuple[str, ...]  # Claimed command interfaces
     publishes: tuple[str, ...]
     active: bool
-    every: int
-    """Updated every n-th cycle."""
-    rate: float | None = None
-    """Updates per second that the file asks for, Hz; None: the loop's."""
+    every: int  # Updated every n-th cycle
+    rate: float | None = None  # Updates per second that the file asks for, Hz; None: the loop's
     fallback: str = ""
     """Name of the controller that takes over when this one breaks its contract; empty: none."""
-    into: tuple[str, ...] = ()
-    """Controllers whose references it commands; empty: it commands the servos."""
+    into: tuple[str, ...] = ()  # Controllers whose references it commands; empty: it commands the servos
     reference: tuple[str, ...] = ()
     """Interfaces that it exports on each of its joints, for controllers that are `into` it."""
     reads: tuple[str, ...] = ()
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
-    topics: tuple[str, ...] = ()
-    """Its own topics: `/arm/state`."""
-    provides: tuple[str, ...] = ()
-    """States that it provides to others: `orientation.x`."""
-    device_commands: tuple[str, ...] = ()
-    """Commands of devices that it claims: `light/led`."""
-    takeovers: tuple[str, ...] = ()
-    """Controllers that it may let take over."""
-    partial: bool = False
-    """It goes on with its other joints while some have no torque."""
+    topics: tuple[str, ...] = ()  # Its own topics: `/arm/state`
+    provides: tuple[str, ...] = ()  # States that it provides to others: `orientation.x`
+    device_commands: tuple[str, ...] = ()  # Commands of devices that it claims: `light/led`
+    takeovers: tuple[str, ...] = ()  # Controllers that it may let take over
+    partial: bool = False  # It goes on with its other joints while some have no torque
 
     @property
     def commands_servos(self) -> bool:
@@ -201,16 +174,12 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 class ScheduledCommand(msgspec.Struct, frozen=True):
     """A prepared command that the loop hands to a controller at a time."""
 
-    at_ns: int
-    """Since the loop's first deadline."""
+    at_ns: int  # Since the loop's first deadline
     controller: str
     kind: str
-    data: bytes
-    """Little-endian float64"""
-    origin: str
-    """Its source: `three_parts.yaml:7:5`."""
-    request: str = ""
-    """The command that `data` was prepared from, as JSON."""
+    data: bytes  # Little-endian float64
+    origin: str  # Its source: `three_parts.yaml:7:5`
+    request: str = ""  # The command that `data` was prepared from, as JSON
 
 
 class LoopPlan(msgspec.Struct, frozen=True):
@@ -220,25 +189,17 @@ class LoopPlan(msgspec.Struct, frozen=True):
     scheduler: SchedulerPlan
     joints: tuple[JointPlan, ...]
     controllers: tuple[ControllerPlan, ...]
-    commands: tuple[ScheduledCommand, ...]
-    """Sorted by time."""
-    end_ns: int | None
-    """Stop by itself at this time since the first deadline; None: run until a stop."""
+    commands: tuple[ScheduledCommand, ...]  # Sorted by time
+    end_ns: int | None  # Stop by itself at this time since the first deadline; None: run until a stop
     overrun: OverrunPolicy = "skip"
-    tolerated_skips: float = TOLERATED_SKIPS
-    """Share of its periods that a run may skip and still be good."""
-    least_period_ns: int = 0
-    """The shortest period that the buses allow, by the time budget; 0: not computed."""
-    slowest_period_ns: int = 0
-    """The longest period in which no Bus Watchdog stops its servos; 0: any."""
+    tolerated_skips: float = TOLERATED_SKIPS  # Share of its periods that a run may skip and still be good
+    least_period_ns: int = 0  # The shortest period that the buses allow, by the time budget; 0: not computed
+    slowest_period_ns: int = 0  # The longest period in which no Bus Watchdog stops its servos; 0: any
     policies: PolicyPlan = PolicyPlan()
     schedule: ScheduleName = "absolute"
-    sources: tuple[SourcePlan, ...] = ()
-    """Devices, then sensors."""
-    urdf: str | None = None
-    """The robot's URDF as it was read; None: the robot file names none."""
-    sensors: tuple[SensorPlan, ...] = ()
-    """In the order of those of the sources that are sensors."""
+    sources: tuple[SourcePlan, ...] = ()  # Devices, then sensors
+    urdf: str | None = None  # The robot's URDF as it was read; None: the robot file names none
+    sensors: tuple[SensorPlan, ...] = ()  # In the order of those of the sources that are sensors
 
     @property
     def references(self) -> tuple[str, ...]:

@@ -13,14 +13,10 @@ class CouplingPlan(msgspec.Struct, frozen=True):
     matrix of a differential: half of the sum and half of the difference of the inputs.)
     """
 
-    name: str
-    """Of its joint or its transmission."""
-    joints: tuple[int, ...]
-    """Rows of its joints in the arrays of the joints."""
-    servos: tuple[int, ...]
-    """Rows of its servos in the arrays of the servos."""
-    matrix: tuple[tuple[float, ...], ...]
-    """M: a row for each joint, a column for each servo."""
+    name: str  # Of its joint or its transmission
+    joints: tuple[int, ...]  # Rows of its joints in the arrays of the joints
+    servos: tuple[int, ...]  # Rows of its servos in the arrays of the servos
+    matrix: tuple[tuple[float, ...], ...]  # M: a row for each joint, a column for each servo
     inverse: tuple[tuple[float, ...], ...]
     """M^+, its pseudo-inverse: a row for each servo, a column for each joint."""
     tolerance: float = 0.0
@@ -35,10 +31,8 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
     """
 
     couplings: tuple[CouplingPlan, ...] = ()
-    direct: tuple[tuple[int, int], ...] = ()
-    """Row of each joint with one servo, and the row of that servo."""
-    servos: tuple[str, ...] = ()
-    """Names of all servos, by their rows: `head`, `hip/1`, `wrist/left`."""
+    direct: tuple[tuple[int, int], ...] = ()  # Row of each joint with one servo, and the row of that servo
+    servos: tuple[str, ...] = ()  # Names of all servos, by their rows: `head`, `hip/1`, `wrist/left`
 
     @property
     def coupled(self) -> bool:

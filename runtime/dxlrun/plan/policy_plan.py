@@ -9,8 +9,7 @@ import msgspec
 
 PolicyName = Literal["on_exit", "on_fault", "on_lost_servo", "on_stale_command"]
 POLICIES: tuple[PolicyName, ...] = ("on_exit", "on_fault", "on_lost_servo", "on_stale_command")
-Last = Literal["limp", "hold"]
-"""How a robot is left: torque off, or torque on where it stands."""
+Last = Literal["limp", "hold"]  # How a robot is left: torque off, or torque on where it stands
 TORQUE_STAYS = (
     "torque stays on, as the policy says: the robot holds until its power is off; "
     "the next run needs --take-over"
@@ -20,12 +19,9 @@ TORQUE_STAYS = (
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
 full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
-SLOW_LINEAR_SPEED = 0.05
-"""m/s, of linear joints: a gripper's fingers close in a second [i]."""
-SLOW_START_NS = 1_000_000_000
-"""How long after `ease_in` the slow speed holds (failures: limit violation)."""
-_NEVER_S = 1e9
-"""What takes longer is as good as endless, and still a whole number of ns."""
+SLOW_LINEAR_SPEED = 0.05  # m/s, of linear joints: a gripper's fingers close in a second [i]
+SLOW_START_NS = 1_000_000_000  # How long after `ease_in` the slow speed holds (failures: limit violation)
+_NEVER_S = 1e9  # What takes longer is as good as endless, and still a whole number of ns
 SETTLE_NS = 300_000_000
 """A joint that has had its pose as goal for so long and is not there is blocked, too weak, or lost."""
 
@@ -54,20 +50,14 @@ def longest_pose_ns(
 class Step(msgspec.Struct, frozen=True):
     """One thing that is done, cycle by cycle, before the robot is left: a pose, or less torque."""
 
-    text: str
-    """As a person reads it: `pose home at 60 deg/s`."""
-    longest_ns: int
-    """How long it takes at the most."""
+    text: str  # As a person reads it: `pose home at 60 deg/s`
+    longest_ns: int  # How long it takes at the most
     targets: tuple[float | None, ...] = ()
     """rad, one a joint, None where the pose says nothing; empty: this step is no pose."""
-    speed: float = 0.0
-    """rad/s, toward the pose"""
-    linear_speed: float | None = None
-    """m/s, of linear joints; None: the pose has none"""
-    fraction: float = 1.0
-    """Of each servo's own torque limit, at the end of the step."""
-    levels: int = 0
-    """In how many steps the torque becomes less; 0: it stays."""
+    speed: float = 0.0  # rad/s, toward the pose
+    linear_speed: float | None = None  # m/s, of linear joints; None: the pose has none
+    fraction: float = 1.0  # Of each servo's own torque limit, at the end of the step
+    levels: int = 0  # In how many steps the torque becomes less; 0: it stays
 
 
 class Policy(msgspec.Struct, frozen=True):
@@ -100,8 +90,7 @@ class GroupPolicy(msgspec.Struct, frozen=True):
     """What happens when a servo of a group of joints is lost."""
 
     name: str
-    rows: frozenset[int]
-    """Rows of its joints."""
+    rows: frozenset[int]  # Rows of its joints
     on_lost_servo: Literal["hold", "limp", "stop"]
     """Its controllers wait, the group loses its torque, or the run ends."""
 
@@ -109,14 +98,11 @@ class GroupPolicy(msgspec.Struct, frozen=True):
 class PolicyPlan(msgspec.Struct, frozen=True):
     """The four policies of a robot."""
 
-    on_exit: Policy = LIMP
-    """When a run was asked to stop, or came to its end."""
-    on_fault: Policy = LIMP
-    """When the loop or a bus failed, or a controller whose fallback did not take over."""
+    on_exit: Policy = LIMP  # When a run was asked to stop, or came to its end
+    on_fault: Policy = LIMP  # When the loop or a bus failed, or a controller whose fallback did not take over
     on_lost_servo: Policy = HOLD
     on_stale_command: Policy = HOLD
-    groups: tuple[GroupPolicy, ...] = ()
-    """For joints that stand in one of them, in place of `on_lost_servo`."""
+    groups: tuple[GroupPolicy, ...] = ()  # For joints that stand in one of them, in place of `on_lost_servo`
     limit_ns: int = 1_500_000_000
     """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
 

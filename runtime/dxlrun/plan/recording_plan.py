@@ -13,10 +13,8 @@ class RecordingPlan(msgspec.Struct, frozen=True):
     """What the robot file says about the log."""
 
     directory: str = "logs"
-    split_bytes: int | None = None
-    """A part that is so long ends."""
-    split_ns: int | None = None
-    """A part that is so old ends."""
+    split_bytes: int | None = None  # A part that is so long ends
+    split_ns: int | None = None  # A part that is so old ends
     keep_ns: int | None = None
     """A part whose newest record is older than this is deleted; None: every part is kept."""
 

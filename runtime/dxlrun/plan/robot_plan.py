@@ -18,17 +18,14 @@ from dxlrun.plan.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
 class SimulationPlan(msgspec.Struct, frozen=True):
     """What only simulated servos and buses need."""
 
-    loads: dict[str, Load] = {}
-    """By joint, as it is felt there; one that is missing moves nothing but itself."""
-    adapters: dict[str, AdapterConfig] = {}
-    """By bus."""
+    loads: dict[str, Load] = {}  # By joint, as it is felt there; one that is missing moves nothing but itself
+    adapters: dict[str, AdapterConfig] = {}  # By bus
     times: dict[str, ServoTimes] = {}
     """By servo (`own_name`); one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = {}
     """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
-    devices: dict[str, Shown] = {}
-    """By device."""
+    devices: dict[str, Shown] = {}  # By device
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -40,10 +37,8 @@ class Plan(msgspec.Struct, frozen=True):
     exit_timeout_ns: int
     recording: RecordingPlan
     source_file: str
-    source_text: str
-    """The robot file as it was read."""
-    arguments: dict[str, str]
-    """The arguments of the robot file as this run took them."""
+    source_text: str  # The robot file as it was read
+    arguments: dict[str, str]  # The arguments of the robot file as this run took them
     included: dict[str, str] = {}
     """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
     played: dict[str, str] = {}
@@ -51,10 +46,8 @@ class Plan(msgspec.Struct, frozen=True):
     frames: FramesPlan | None = None
     """What moves the robot's frames, and how they are logged; None: it has no URDF."""
     simulation: SimulationPlan = SimulationPlan()
-    groups: dict[str, tuple[str, ...]] = {}
-    """Names that stand for some joints."""
-    gateway: bool = True
-    """Others may steer the run, over a Unix socket."""
+    groups: dict[str, tuple[str, ...]] = {}  # Names that stand for some joints
+    gateway: bool = True  # Others may steer the run, over a Unix socket
     mechanics: MechanicsPlan = MechanicsPlan()
     """Which servos move which joints; empty: each joint has one servo."""
 

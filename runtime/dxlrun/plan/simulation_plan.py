@@ -51,8 +51,7 @@ class ServoConfig(msgspec.Struct, frozen=True):
     servo_id: int
     model: str
     position: float  # rad, from the servo's raw 0
-    return_delay_ns: int = 500_000
-    """Initial value of Return Delay Time, rounded to its unit of 2 us."""
+    return_delay_ns: int = 500_000  # Initial value of Return Delay Time, rounded to its unit of 2 us
     load: Load = NO_LOAD  # What its shaft moves
     firmware: int | None = None
     """Firmware Version: it decides the control table where a model has two, and the fast reads.
@@ -70,10 +69,8 @@ class Shown(msgspec.Struct, frozen=True):
     states: dict[str, str] = {}
     """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
     values: dict[str, float] = {}  # By item: what it shows, SI units
-    noise: dict[str, float] = {}
-    """By item: standard deviation of what it shows, SI units."""
-    link: str = ""
-    """Link of the robot's URDF that it is fixed to; empty: it stands upright and still."""
+    noise: dict[str, float] = {}  # By item: standard deviation of what it shows, SI units
+    link: str = ""  # Link of the robot's URDF that it is fixed to; empty: it stands upright and still
     table: str = ""  # Text of its control table, where that is none of dxlrun's own
 
 
@@ -113,8 +110,7 @@ class BusConfig(msgspec.Struct, frozen=True):
     """Texts of the control tables of plug-ins: the process of the simulated buses loads no plug-ins."""
     adapter: AdapterConfig = WHOLE_REPLIES  # What is between the line and the host
     devices: tuple[DeviceConfig, ...] = ()  # What is on the line beside the servos
-    recorded: str = ""
-    """Path of the log whose bus of this name answers instead of servos; empty: none does."""
+    recorded: str = ""  # Path of the log whose bus of this name answers instead of servos; empty: none does
 
 
 class CoupledServo(msgspec.Struct, frozen=True):
@@ -144,8 +140,7 @@ class UrdfJoint(msgspec.Struct, frozen=True):
 
     name: str
     reference: float  # rad, of the servo from its raw 0
-    per_rad: float
-    """rad or m of the joint for each rad of the servo, with the sign of its direction"""
+    per_rad: float  # rad or m of the joint for each rad of the servo, with the sign of its direction
     linear: bool = False  # It slides, in m; only such ones move slides of the URDF
 
 
@@ -173,8 +168,6 @@ class SimulationConfig(msgspec.Struct, frozen=True):
     seed: int = 0  # Of what the faults leave to chance
     links: dict[str, str] = {}
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
-    bodies: UrdfBodies | None = None
-    """What the servos move together; None: each joint moves by itself."""
+    bodies: UrdfBodies | None = None  # What the servos move together; None: each joint moves by itself
     couplings: tuple[Coupling, ...] = ()  # Servos that share joints; all others move one each
-    sensed: SensedBodies | None = None
-    """The bodies with which devices move that are on a link; None: none is."""
+    sensed: SensedBodies | None = None  # The bodies with which devices move that are on a link; None: none is

@@ -18,8 +18,7 @@ class Status(NamedTuple):
     """An intact status packet, taken apart; a tuple, because the loop makes one for every reply."""
 
     servo_id: int
-    error: int
-    """What it means is the protocol's: `describe_error` has the words."""
+    error: int  # What it means is the protocol's: `describe_error` has the words
     parameters: bytes | memoryview
 
 
@@ -27,26 +26,20 @@ class Awaited(msgspec.Struct, frozen=True):
     """One status packet that is due after an instruction."""
 
     servo_id: int
-    length: int
-    """Number of its parameter bytes, without stuffing."""
+    length: int  # Number of its parameter bytes, without stuffing
 
 
 class Transaction(msgspec.Struct, frozen=True):
     """One instruction packet and the shape of its replies."""
 
     packet: bytes
-    servo_id: int
-    """The servo that the instruction addresses."""
-    awaited: tuple[Awaited, ...]
-    """The replies, in their order; empty: there is none."""
+    servo_id: int  # The servo that the instruction addresses
+    awaited: tuple[Awaited, ...]  # The replies, in their order; empty: there is none
     due_ns: int
     """From the start of the write to the last byte of all replies, by the wire; without: the wire time."""
-    timeout_ns: int
-    """From the start of the write to giving up; 0 without reply."""
-    widest: int = 0
-    """The most bytes that one of the replies has on the line, stuffing included."""
-    fast: bool = False
-    """All that answer share one status packet of the broadcast ID, which is not stuffed."""
+    timeout_ns: int  # From the start of the write to giving up; 0 without reply
+    widest: int = 0  # The most bytes that one of the replies has on the line, stuffing included
+    fast: bool = False  # All that answer share one status packet of the broadcast ID, which is not stuffed
     tail: int = 0
     """How many of the replies, the last ones, are awaited briefly once the others came: until
     `tail_timeout_ns` from the start of the write, and `tail_margin_ns` from the last of the others."""
@@ -58,16 +51,11 @@ class Transaction(msgspec.Struct, frozen=True):
 class Outcome(IntEnum):
     """What came of a transaction; a lost packet is data, not an exception."""
 
-    SENT = 0
-    """No reply was awaited."""
-    OK = 1
-    """Everything that was awaited came."""
-    TIMEOUT = 2
-    """Something awaited did not come, and nothing else did."""
-    GARBLED = 3
-    """Bytes came, but not what was awaited."""
-    REFUSED = 4
-    """The servo answered with an error and without the data."""
+    SENT = 0  # No reply was awaited
+    OK = 1  # Everything that was awaited came
+    TIMEOUT = 2  # Something awaited did not come, and nothing else did
+    GARBLED = 3  # Bytes came, but not what was awaited
+    REFUSED = 4  # The servo answered with an error and without the data
 
 
 class Reply(msgspec.Struct):
@@ -78,17 +66,12 @@ class Reply(msgspec.Struct):
     """
 
     outcome: Outcome
-    error: int
-    """Error byte of the status packet"""
+    error: int  # Error byte of the status packet
     parameters: bytes | memoryview
-    last_ns: int
-    """Time of the read() that brought the last byte of the status packet."""
-    strays: int
-    """Intact packets that were not awaited, and bytes of noise, since the transaction before."""
-    echoed: bool
-    """True when the instruction itself came back: the adapter echoes."""
-    sent_ns: int = 0
-    """Start of the write of the instruction."""
+    last_ns: int  # Time of the read() that brought the last byte of the status packet
+    strays: int  # Intact packets that were not awaited, and bytes of noise, since the transaction before
+    echoed: bool  # True when the instruction itself came back: the adapter echoes
+    sent_ns: int = 0  # Start of the write of the instruction
 
     @property
     def answered(self) -> bool:

@@ -14,8 +14,7 @@ class SimulationJob(msgspec.Struct, frozen=True):
     ledger: str | None = None  # JSON-lines file of every byte on the buses
     priority: int = 0  # Real-time priority that it asks for, 1 to 99; 0: none
     core: int = -1  # Core that it stays on; -1: any
-    shafts: int = -1
-    """Descriptor of the slot into which it writes how its shafts move; -1: none."""
+    shafts: int = -1  # Descriptor of the slot into which it writes how its shafts move; -1: none
 
 
 class Request(msgspec.Struct):
@@ -51,5 +50,4 @@ class SimulationMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """How late replies were handed over, by what it is of, such as median and p99; empty before the first."""
     happened: str | None = None  # a fault that was injected now
     fault: str | None = None  # a fault line that was understood, in its canonical writing
-    error: str | None = None
-    """Why the configuration cannot be served, or what is wrong with a fault line."""
+    error: str | None = None  # Why the configuration cannot be served, or what is wrong with a fault line

@@ -25,10 +25,8 @@ from dxlrun.errors import Mark, suggestion
 
 MOST_CONDITION = 100.0
 """Condition number of a matrix: beyond it a tick of a servo is more than a hundred of a joint. [i]"""
-MOST_SPEED_RATIO = 1.5
-"""Between the top speeds of the servos of one joint. [i]"""
-_LEAST_SHARE = 0.01
-"""Of its reach that a joint without limits must be left by the limits of the others. [i]"""
+MOST_SPEED_RATIO = 1.5  # Between the top speeds of the servos of one joint. [i]
+_LEAST_SHARE = 0.01  # Of its reach that a joint without limits must be left by the limits of the others. [i]
 
 Rows = tuple[tuple[float, ...], ...]
 MATRICES: Mapping[str, Rows] = {"differential": ((0.5, 0.5), (0.5, -0.5))}
@@ -39,14 +37,12 @@ class Coupling(msgspec.Struct, frozen=True, eq=False):
     """Servos that move joints together: q = M s."""
 
     name: str
-    place: KeyPath
-    """Of its joint or its transmission."""
+    place: KeyPath  # Of its joint or its transmission
     joints: tuple[str, ...]
     servos: tuple[CompiledServo, ...]
     matrix: Rows
     inverse: Rows
-    tolerance: float
-    """rad or m; 0 where no servo can disagree"""
+    tolerance: float  # rad or m; 0 where no servo can disagree
     transmission: bool
 
     @property

@@ -17,24 +17,17 @@ from dxlrun.plan.bus_plan import ServoPlan
 class DescribedServo(msgspec.Struct, frozen=True):
     """One servo as the robot file has it, with what its joint has for it."""
 
-    title: str
-    """What it moves, as sentences name it: `head`, `hip`, `wrist/left`."""
-    name: str
-    """Its own: `head`, `hip/1`, `wrist/left`."""
-    joints: tuple[str, ...]
-    """The joints that it moves."""
-    place: KeyPath
-    """Of its keys in the file."""
-    defaults: KeyPath
-    """Where what it does not have itself is; the same place for the only servo of a joint."""
+    title: str  # What it moves, as sentences name it: `head`, `hip`, `wrist/left`
+    name: str  # Its own: `head`, `hip/1`, `wrist/left`
+    joints: tuple[str, ...]  # The joints that it moves
+    place: KeyPath  # Of its keys in the file
+    defaults: KeyPath  # Where what it does not have itself is; the same place for the only servo of a joint
     bus: str
     id: int
     model: str
-    reference: float
-    """rad from the servo's raw 0"""
+    reference: float  # rad from the servo's raw 0
     direction: int
-    ratio: float
-    """What its joint, or its transmission's input, moves while it turns by 1 rad: rad or m."""
+    ratio: float  # What its joint, or its transmission's input, moves while it turns by 1 rad: rad or m
     linear: bool
     continuous: bool
     torque: bool

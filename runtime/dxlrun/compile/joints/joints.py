@@ -45,8 +45,7 @@ _EXAMPLES: Mapping[str, str] = {
 }
 MOST_STARTING_S = 10.0
 """A joint that needs longer to its highest speed, and to stop from it, is one with a mistaken unit. [i]"""
-_SAME = math.radians(1.0)
-"""References nearer than this are taken as equal: a horn has teeth, a trim has not."""
+_SAME = math.radians(1.0)  # References nearer than this are taken as equal: a horn has teeth, a trim has not
 
 
 class CompiledJoint(msgspec.Struct, frozen=True):
@@ -57,8 +56,7 @@ class CompiledJoint(msgspec.Struct, frozen=True):
     servos: tuple[CompiledServo, ...]
     reach: Interval
     """rad or m, in the joint's coordinate; of a joint of a transmission with the others where it is widest"""
-    coupling: Coupling | None = None
-    """How several servos move it; None: it has one of its own."""
+    coupling: Coupling | None = None  # How several servos move it; None: it has one of its own
 
     @property
     def table(self) -> ControlTable:

@@ -16,12 +16,10 @@ from dxlrun.plan.loop_plan import JointPlan
 if TYPE_CHECKING:
     from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone
 
-_TOLERANCE = 1e-6
-"""rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees."""
+_TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees
 
 
-_ROUNDING = 1e-9
-"""Part of a speed that differences of positions and times may be off."""
+_ROUNDING = 1e-9  # Part of a speed that differences of positions and times may be off
 
 
 class Interval(msgspec.Struct, frozen=True):

@@ -26,10 +26,8 @@ P_GAINS = ("p_gain", "position_p_gain")
 class Motors(msgspec.Struct, frozen=True):
     """The motor files of a robot that could be read."""
 
-    servos: Mapping[str, MotorDescription] = {}
-    """By the servo that it describes"""
-    simulations: Mapping[str, MotorDescription] = {}
-    """By the servo that is to be simulated as another one"""
+    servos: Mapping[str, MotorDescription] = {}  # By the servo that it describes
+    simulations: Mapping[str, MotorDescription] = {}  # By the servo that is to be simulated as another one
 
     def of_servo(self, name: str) -> MotorDescription | None:
         """Return the file that describes a servo, by the servo's own name."""

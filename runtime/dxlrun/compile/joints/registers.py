@@ -62,8 +62,7 @@ _FIXED: Mapping[str, tuple[int, str]] = MappingProxyType(
     }
 )
 """Values that the start-up requires: an item may be declared as its own, and no other."""
-_TORQUE_AT_BOOT = 0x01
-"""Startup Configuration, bit 0 (e-Manual XM430-W350, Startup Configuration (60))."""
+_TORQUE_AT_BOOT = 0x01  # Startup Configuration, bit 0 (e-Manual XM430-W350, Startup Configuration (60))
 _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")

@@ -19,10 +19,8 @@ from dxlrun.dynamixel.plan.mode_plan import mode_plans
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import RegisterValue
 
-AUTO = "auto"
-"""In place of a model: it is read from the servo."""
-_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
-"""The model that is assumed where none is known, by protocol."""
+AUTO = "auto"  # In place of a model: it is read from the servo
+_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # The model that is assumed where none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
 """Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
 Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
@@ -36,12 +34,10 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     described: DescribedServo
     table: ControlTable
-    registers: tuple[RegisterValue, ...]
-    """Its declared registers, in the order in which they are written."""
+    registers: tuple[RegisterValue, ...]  # Its declared registers, in the order in which they are written
     motor: MotorModel | None
     known_bus: bool
-    certain: bool
-    """False while its model is still to be read, so that what does not fit it is no error yet."""
+    certain: bool  # False while its model is still to be read, so that what does not fit it is no error yet
 
     @property
     def reach(self) -> Interval:

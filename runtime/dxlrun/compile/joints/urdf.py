@@ -25,8 +25,7 @@ class CompiledUrdf(msgspec.Struct, frozen=True):
 
     text: str
     urdf: Urdf
-    moved: tuple[str, ...]
-    """Joints of the robot file that move a joint of the URDF."""
+    moved: tuple[str, ...]  # Joints of the robot file that move a joint of the URDF
 
 
 def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> CompiledUrdf | None:

@@ -20,10 +20,8 @@ NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 class Transform(msgspec.Struct, frozen=True):
     """A frame in another one: p_there = rotation * p_here + translation."""
 
-    translation: Vector = (0.0, 0.0, 0.0)
-    """m"""
-    rotation: Quaternion = NO_TURN
-    """Of length 1."""
+    translation: Vector = (0.0, 0.0, 0.0)  # m
+    rotation: Quaternion = NO_TURN  # Of length 1
 
     def __matmul__(self, inner: Transform) -> Transform:
         """Return a frame that lies in this one, seen from where this one lies."""

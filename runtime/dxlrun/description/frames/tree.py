@@ -26,13 +26,11 @@ from dxlrun.description.frames.transform import (
 from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint, read_urdf
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
-ODOM = "odom"
-"""The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)."""
+ODOM = "odom"  # The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)
 _ABOVE_ODOM = ("world", "map", ODOM)
 ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
 """States of a source that turns a body."""
-IMU_LINKS = ("{}", "{}_link", "{}_frame")
-"""What the link of an IMU may be called, from the IMU's name."""
+IMU_LINKS = ("{}", "{}_link", "{}_frame")  # What the link of an IMU may be called, from the IMU's name
 
 MovedBy = Literal["root", "fixed", "servo", "mimic", "imu", "nothing"]
 _UNKNOWN: Quaternion = (math.nan, math.nan, math.nan, math.nan)
@@ -42,26 +40,19 @@ _NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
 class FramesPlan(msgspec.Struct, frozen=True):
     """How the frames of a robot are logged."""
 
-    rate: float
-    """Messages of /tf in a second, Hz; no more than there are cycles. 0: none."""
-    moved: tuple[str, ...] = ()
-    """Joints of the robot that move joints of the URDF."""
-    imu: str = ""
-    """The source whose orientation turns the body; empty: its root stands still."""
-    imu_link: str = ""
-    """The link of the URDF whose orientation that is."""
+    rate: float  # Messages of /tf in a second, Hz; no more than there are cycles. 0: none.
+    moved: tuple[str, ...] = ()  # Joints of the robot that move joints of the URDF
+    imu: str = ""  # The source whose orientation turns the body; empty: its root stands still
+    imu_link: str = ""  # The link of the URDF whose orientation that is
 
 
 class Frame(msgspec.Struct, frozen=True):
     """One frame of the tree."""
 
     name: str
-    parent: str
-    """Empty: it has none."""
-    joint: UrdfJoint | None
-    """Of the URDF; None: the root, or a body that its IMU turns in `odom`."""
-    moved_by: MovedBy
-    """`nothing`: a joint that could move, but has no servo: it is where it rests."""
+    parent: str  # Empty: it has none
+    joint: UrdfJoint | None  # Of the URDF; None: the root, or a body that its IMU turns in `odom`
+    moved_by: MovedBy  # `nothing`: a joint that could move, but has no servo: it is where it rests
 
     @property
     def moves(self) -> bool:

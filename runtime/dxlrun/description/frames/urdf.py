@@ -18,8 +18,7 @@ from dxlrun.errors import InputError, Mark, Problem, suggestion
 Vector: TypeAlias = "tuple[float, float, float]"
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
 _TYPES: tuple[str, ...] = get_args(JointType)
-_FREE = ("floating", "planar")
-"""Types of a URDF that no single servo moves."""
+_FREE = ("floating", "planar")  # Types of a URDF that no single servo moves
 TURNING = ("revolute", "continuous")
 SLIDING = "prismatic"
 _NOWHERE: Vector = (0.0, 0.0, 0.0)
@@ -49,12 +48,9 @@ class UrdfJoint(msgspec.Struct, frozen=True):
     type: JointType
     parent: str
     child: str
-    xyz: Vector = _NOWHERE
-    """m, in the parent"""
-    rpy: Vector = _NOWHERE
-    """rad, roll, pitch and yaw about the parent's axes"""
-    axis: Vector = (1.0, 0.0, 0.0)
-    """In the joint's own frame; of length 1."""
+    xyz: Vector = _NOWHERE  # m, in the parent
+    rpy: Vector = _NOWHERE  # rad, roll, pitch and yaw about the parent's axes
+    axis: Vector = (1.0, 0.0, 0.0)  # In the joint's own frame; of length 1
     limits: UrdfLimits = UrdfLimits()
     mimic: Mimic | None = None
     mark: Mark = Mark("")
@@ -69,12 +65,10 @@ class Urdf(msgspec.Struct, frozen=True):
     """A robot's tree of links."""
 
     name: str
-    root: str
-    """The link without a parent."""
+    root: str  # The link without a parent
     links: tuple[str, ...]
     """From the root downwards, each behind its parent; otherwise in the order of the file."""
-    joints: tuple[UrdfJoint, ...]
-    """As the links: the joint of each but the root."""
+    joints: tuple[UrdfJoint, ...]  # As the links: the joint of each but the root
 
     def joint(self, name: str) -> UrdfJoint | None:
         """Return a joint by its name; None: there is none."""

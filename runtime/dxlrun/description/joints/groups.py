@@ -22,8 +22,7 @@ DEFAULTS, GROUPS, ALL = "joint_defaults", "groups", "all"
 NAMING = ("joints", "pose", "torque")
 """Keys whose list or mapping names joints; so does each entry of `poses`."""
 
-Groups = Mapping[str, tuple[str, ...]]
-"""The joints that the name of a group stands for."""
+Groups = Mapping[str, tuple[str, ...]]  # The joints that the name of a group stands for
 NO_GROUPS: Groups = {}
 _Moves = dict[KeyPath, list[KeyPath]]
 """Where the parts of a document are put, each at as many places as it is needed."""

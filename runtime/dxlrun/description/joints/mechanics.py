@@ -16,15 +16,12 @@ from dxlrun.description.units import Acceleration, Angle, Effort, Length, Measur
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
 """Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
-LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0
-"""Travel a servo turn; as above."""
+LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0  # Travel a servo turn; as above
 TOLERANCE_RAD = math.radians(3.0)
 """By which the servos of one joint may disagree if the file gives nothing: backlash, a loaded gear. [i]"""
-TOLERANCE_M = 1e-3
-"""The same of a linear joint. [i]"""
+TOLERANCE_M = 1e-3  # The same of a linear joint. [i]
 
-MotorFile = Annotated[str, Field(min_length=1)]
-"""Name of a motor file, as `dxlrun identify` writes it."""
+MotorFile = Annotated[str, Field(min_length=1)]  # Name of a motor file, as `dxlrun identify` writes it
 _MOST_TOLERANCE_RAD = math.radians(20.0)
 """Servos that are further apart pull against each other, whatever they hold. [i]"""
 

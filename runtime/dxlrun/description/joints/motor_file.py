@@ -149,8 +149,7 @@ class MotorDescription(msgspec.Struct, frozen=True):
     motor: MotorModel
     marks: Marks
     path: Path
-    text: str
-    """As it was read."""
+    text: str  # As it was read
     uncertainty: Mapping[str, float] = {}
     """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by the names of its form."""
 

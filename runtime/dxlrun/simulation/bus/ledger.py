@@ -29,14 +29,12 @@ OTHER_HOST = "another host sends"  # How the note of an instruction of another h
 class LedgerEntry(NamedTuple):
     """Bytes that passed the wire together, or a note about something that was done to the bus."""
 
-    t_ns: int
-    """`in`: when the host handed them over; `out`: when the last of them had passed the wire."""
+    t_ns: int  # `in`: when the host handed them over; `out`: when the last of them had passed the wire
     bus: str
     direction: Direction  # Seen from the servos: `in` came from the host, `out` went to it
     data: bytes
     note: str
-    late_ns: int = 0
-    """`out`, in real time: how long after it should have been the host got the last of them."""
+    late_ns: int = 0  # `out`, in real time: how long after it should have been the host got the last of them
 
 
 # 73 years on the clock of the machine; differences of two such times fit into 64 bits

@@ -31,8 +31,7 @@ from dxlrun.simulation.wire.packets import (
 _MODEL, _FIRMWARE = (0, 1), (6,)
 """Addresses of what a ping of Protocol 2.0 answers (e-Manual, X series, Control Table); of other models the
 firmware is elsewhere, and a ping that was not recorded is not answered."""
-_ANSWER_NS = 500_000
-"""Delay of an answer that is put together: Return Delay Time as shipped (e-Manual)."""
+_ANSWER_NS = 500_000  # Delay of an answer that is put together: Return Delay Time as shipped (e-Manual)
 
 
 class RecordedBus(SimulatedBus):

@@ -18,8 +18,7 @@ from dxlrun.log.reader import open_log
 class Heard(NamedTuple):
     """Bytes that the host received together."""
 
-    delay_ns: int
-    """From the end of the instruction on the wire to the last of them, as the host saw it."""
+    delay_ns: int  # From the end of the instruction on the wire to the last of them, as the host saw it
     data: bytes
 
 

@@ -33,15 +33,12 @@ class Measured(msgspec.Struct):
     """The world around one device, in SI units."""
 
     volts: float
-    angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """rad/s, in the device's own axes."""
+    angular_velocity: Vector = (0.0, 0.0, 0.0)  # rad/s, in the device's own axes
     linear_acceleration: Vector = (0.0, 0.0, STANDARD_GRAVITY)
     """m/s^2, in the device's own axes; gravity counts as upward, as of every accelerometer at rest."""
-    orientation: Quaternion = NO_TURN
-    """Quaternion x, y, z, w of the device in the world."""
+    orientation: Quaternion = NO_TURN  # Quaternion x, y, z, w of the device in the world
     celsius: float = ROOM_CELSIUS
-    update: Callable[[], None] = lambda: None
-    """Brings what moves to the time of the device."""
+    update: Callable[[], None] = lambda: None  # Brings what moves to the time of the device
 
     def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:
         """Let the device be turned about an axis of its own from now on, beside what moves it otherwise.

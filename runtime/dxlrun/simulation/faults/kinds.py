@@ -28,8 +28,7 @@ NOISE_BYTES = 8
 TIMER_NS = 16_000_000  # latency timer of an FTDI adapter as it is shipped (AN232B-04)
 HOT_CELSIUS = 90.0
 """Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
-BOOT_NS = 100_000_000
-"""How long a servo that starts again receives nothing; no manual names it [i]."""
+BOOT_NS = 100_000_000  # How long a servo that starts again receives nothing; no manual names it [i]
 BROWNOUT_NS = 200_000_000
 BABBLE_NS = 200_000_000
 BABBLE_PAUSE_NS = 2_000_000
@@ -57,8 +56,7 @@ Holds = dict[tuple[str, int], Hold]
 
 _Act = TypeVar("_Act", bound=Callable[..., None])
 
-Draw = Callable[[Random], Mapping[str, Value]]
-"""What a storm draws of a kind: values by key."""
+Draw = Callable[[Random], Mapping[str, Value]]  # What a storm draws of a kind: values by key
 
 
 class Kind(NamedTuple):
@@ -72,11 +70,9 @@ class Kind(NamedTuple):
     needs: tuple[str, ...]
 
 
-KINDS: dict[str, Kind] = {}
-"""By name, in the order in which they are listed."""
+KINDS: dict[str, Kind] = {}  # By name, in the order in which they are listed
 
-WHEN = ("bus", "at", "packet")
-"""Keys of every kind, which say where and when; a storm begins at no packet."""
+WHEN = ("bus", "at", "packet")  # Keys of every kind, which say where and when; a storm begins at no packet
 
 
 def _kind(of: str, draw: Draw = lambda random: {}) -> Callable[[_Act], _Act]:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 Value = int | float | str | bytes | tuple[str, ...]
 
-SHORTEST_PAUSE_NS = 100_000
-"""A babbling servo without pauses would leave the simulation no time."""
+SHORTEST_PAUSE_NS = 100_000  # A babbling servo without pauses would leave the simulation no time
 _MOST_BYTES = 256
 _MOST_DEGREES = 36_000.0
 
@@ -19,8 +18,7 @@ class Reader(NamedTuple):
     """Reads a value from its text, and writes it back; `example` stands for it in the help."""
 
     example: str
-    read: Callable[[str], Value]
-    """Raises ValueError with what to write."""
+    read: Callable[[str], Value]  # Raises ValueError with what to write
     show: Callable[..., str] = str
 
 
@@ -94,8 +92,7 @@ def _show_angle(value: float) -> str:
 
 _time_of = Reader("TIME", _time(1, "longer than 0, such as 500ms"), _show_time)
 _angle_of = Reader("ANGLE", _angle, _show_angle)
-TURN = Reader("ANGLE", _turn, _show_angle)
-"""Of `by` where it is an angle."""
+TURN = Reader("ANGLE", _turn, _show_angle)  # Of `by` where it is an angle
 READERS: Mapping[str, Reader] = {
     "bus": Reader("NAME", _read(str, bool, "the name of a bus")),
     "servo": Reader("ID", _whole(0, 253)),

@@ -17,8 +17,7 @@ import numpy as np
 
 from dxlrun.simulation.motion.plant import Floats
 
-FREE = 1e6
-"""A limit that nothing reaches: rad/s, rad/s^2, Nm. Finite, so that no step makes 0 * infinity."""
+FREE = 1e6  # A limit that nothing reaches: rad/s, rad/s^2, Nm. Finite, so that no step makes 0 * infinity.
 
 _ARRIVED = 1e-9  # rad; nearer to the goal a trajectory is there
 
@@ -36,8 +35,7 @@ class ServoCommand(NamedTuple):
     """rad/s, the most that the trajectory has; where it is `turning`: the speed with its sign"""
     acceleration: float = FREE  # rad/s^2 of the trajectory
     turning: float = 0.0  # 1: the trajectory continues for ever at `speed`
-    p_ccw: float = 0.0
-    """duty per rad of error, where the goal is counter-clockwise of the shaft"""
+    p_ccw: float = 0.0  # duty per rad of error, where the goal is counter-clockwise of the shaft
     p_cw: float = 0.0
     margin_ccw: float = 0.0  # rad of error that are left alone
     margin_cw: float = 0.0

@@ -26,8 +26,7 @@ _RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
 _ARRIVED, _ON_THE_WAY = 0x01, 0x02
 """Bits of Moving Status (123): the profile's kind, in position, a profile is under way."""
 
-_IN_POSITION_TICKS = 10
-"""So near is "in position"; the manual of the X series names no number [i]."""
+_IN_POSITION_TICKS = 10  # So near is "in position"; the manual of the X series names no number [i]
 
 
 SAMPLING_S = 1e-3

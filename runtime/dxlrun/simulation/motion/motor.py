@@ -16,8 +16,7 @@ from dxlrun.dynamixel.control_table import ControlTable
 STALL_POWER_W = 20.0
 """Stall torque times no-load speed where the manual gives no stall torque: as an XM430-W350 [i]."""
 
-STALL_CURRENT_A = 1.5
-"""Where the manual gives none and the model measures none: as an AX-12A [i]."""
+STALL_CURRENT_A = 1.5  # Where the manual gives none and the model measures none: as an AX-12A [i]
 
 _FILE = Path(__file__).parent / "motors.toml"
 
@@ -30,16 +29,14 @@ class Motor(msgspec.Struct, frozen=True):
     for the Physics Simulation of Servo Actuators" (arXiv 2410.08650).
     """
 
-    stall_torque: float
-    """Nm of the motor at `voltage` and standstill; friction is not taken off"""
+    stall_torque: float  # Nm of the motor at `voltage` and standstill; friction is not taken off
     damping: float
     """Nm s/rad that the motor loses to its own voltage: torque constant squared over resistance"""
     torque_per_ampere: float  # Nm/A
     voltage: float  # V at which `stall_torque` holds; 0: whatever it is supplied with
     inertia: float  # kg m^2 of rotor and gear
     friction: float = 0.0  # Nm (Coulomb)
-    load_friction: float = 0.0
-    """Nm of friction for each Nm between the motor's torque and the load's"""
+    load_friction: float = 0.0  # Nm of friction for each Nm between the motor's torque and the load's
     viscous_friction: float = 0.0  # Nm s/rad
     p_gain_duty: float = 0.0
     """Duty for each rad of error and each unit of the P gain; 0: not identified, the manual's holds"""

@@ -23,8 +23,7 @@ ErrorOf = Callable[[Memory, ControlItem, int], int]
 
 _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
-_MULTI_TURN_GOAL = 28_672
-"""Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))."""
+_MULTI_TURN_GOAL = 28_672  # Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))
 _MULTI_TURN_LIMIT = 4095
 _MAGNITUDE = (1 << SIGN_BIT) - 1
 TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y

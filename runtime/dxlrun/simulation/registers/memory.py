@@ -34,8 +34,7 @@ class Run(NamedTuple):
     address: int
     data: bytes
     cells: Cells
-    after: dict[str, int]
-    """The integers of the items that a write touches, as they would be after it."""
+    after: dict[str, int]  # The integers of the items that a write touches, as they would be after it
 
 
 class Memory:

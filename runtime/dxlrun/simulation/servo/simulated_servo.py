@@ -23,8 +23,7 @@ from dxlrun.simulation.servo.node import SimulatedNode
 from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 
-BOOT_NS = 100_000_000
-"""How long a servo receives nothing after a reboot; no manual names it [i]."""
+BOOT_NS = 100_000_000  # How long a servo receives nothing after a reboot; no manual names it [i]
 
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 

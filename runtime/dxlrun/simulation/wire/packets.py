@@ -91,8 +91,7 @@ class Codec(NamedTuple):
     length_bytes: int  # Of the length, which follows the ID
     shortest: int  # The least length
     longest_pause_ns: int  # Longest gap inside an instruction
-    packet: Callable[[bytes, int], InstructionPacket]
-    """The packet that some bytes are, and its `end`."""
+    packet: Callable[[bytes, int], InstructionPacket]  # The packet that some bytes are, and its `end`
     status_packet: Callable[[int, int, bytes], bytes]  # Of ID, error and parameters
     read: Callable[[bytes], tuple[int, int] | None]  # Address and length of a read's parameters
     write: Callable[[bytes], tuple[int, bytes] | None]  # Address and data of a write's

@@ -15,8 +15,7 @@ from dxlrun.simulation.wire.packets import (
 )
 
 HEADER = b"\xff\xff"
-LONGEST = 4 + 255
-"""Bytes of the longest packet: header, ID, a length byte of 255 and what it counts."""
+LONGEST = 4 + 255  # Bytes of the longest packet: header, ID, a length byte of 255 and what it counts
 
 
 @unique

@@ -33,8 +33,7 @@ _OVERHEAD = 7  # Bytes that the length does not count: header, reserved byte, ID
 _STUFFED = HEADER + b"\xfd"
 
 
-_LONGEST_KNOWN = 1265
-"""Bytes that list all servos of a line once: longer lists are rubbish, and not kept."""
+_LONGEST_KNOWN = 1265  # Bytes that list all servos of a line once: longer lists are rubbish, and not kept
 
 SLOT_NS = 1_000_000  # What a servo's slot after a broadcast ping is longer than its reply [i]
 _PING_REPLY = 14
