@@ -7,10 +7,12 @@ import select
 import shutil
 import sys
 import termios
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 from dxlrun.errors import InputError
+from dxlrun.output.terminal import print_error
 
 LOOK_S = 0.02
 """Between two looks while Enter is awaited."""
@@ -35,6 +37,17 @@ class Dialogue(Protocol):
 def yes(dialogue: Dialogue, question: str) -> bool:
     """Ask a question that only a clear yes agrees to."""
     return dialogue.ask(f"{question} [y/N] ").lower() in ("y", "yes")
+
+
+@contextmanager
+def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
+    """Print how things are left when what is inside ends early, by Ctrl-C or an error; empty: nothing."""
+    try:
+        yield
+    except BaseException:
+        if left := sentence():
+            print_error(left)
+        raise
 
 
 class Terminal:

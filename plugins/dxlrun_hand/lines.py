@@ -1,17 +1,49 @@
-"""The lines of a robot file's buses, opened for this process alone."""
+"""The lines of a robot file's buses: found by their adapters, opened for this process alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
 from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
-from dxlrun.errors import InputError, suggestion
-from dxlrun.output.terminal import print_error
+from dxlrun.errors import InputError, PortError, suggestion
+from dxlrun_hand.dialogue import Dialogue
 
+TRIES = 3
 Opened = Callable[[str], TunablePort]
 """Opens a port by its path."""
+Devices = Callable[[], Iterable[str]]
+"""Returns the serial ports that are there, lasting names first."""
+
+
+def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
+    """Return the lasting name of the adapter that is plugged in; raises PortError after three tries."""
+    for _ in range(TRIES):
+        dialogue.ask(f"Unplug the adapter of bus {bus}, and press Enter ")
+        others = {os.path.realpath(path) for path in devices()}
+
+        def added(others: Collection[str] = others) -> list[str]:
+            return [path for path in devices() if os.path.realpath(path) not in others]
+
+        dialogue.ask_while(
+            "Plug it in again, and press Enter when its port is shown",
+            lambda: f"  {', '.join(added()) or 'no port yet'}",
+        )
+        names = added()
+        adapters = {os.path.realpath(name) for name in names}
+        if len(adapters) == 1:
+            dialogue.say(f"Bus {bus} is at {names[0]}.")
+            return names[0]
+        dialogue.say(
+            f"{len(adapters)} adapters appeared ({', '.join(names)}): plug in the one of bus {bus} alone."
+            if adapters
+            else "No adapter appeared: was it unplugged before the first Enter, and is it plugged in now?"
+        )
+    raise PortError(
+        f"the adapter of bus {bus} was not found; `dxlrun doctor` lists those that are plugged in"
+    )
 
 
 @contextmanager
@@ -39,14 +71,3 @@ def chosen_names(
         )
     meant = {name for word in words for name in groups.get(word, (word,))}
     return [name for name in known if name in meant or not words]
-
-
-@contextmanager
-def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
-    """Print how things are left when what is inside ends early, by Ctrl-C or an error; empty: nothing."""
-    try:
-        yield
-    except BaseException:
-        if left := sentence():
-            print_error(left)
-        raise

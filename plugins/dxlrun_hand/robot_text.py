@@ -114,13 +114,8 @@ class RobotText:
 
     def _own(self, path: KeyPath) -> tuple[Source, KeyPath, yaml.Node]:
         """Return the file that has a value, or else the most of the way to it, with the node there."""
-        best: tuple[Source, KeyPath, yaml.Node] | None = None
-        for source in reversed(self._sources):  # the strongest first
-            at, node = _nearest(source.tree.root, path)
-            if best is None or len(at) > len(best[1]):
-                best = source, at, node
-        assert best is not None  # noqa: S101 (a robot has a file)
-        return best
+        found = ((source, *_nearest(source.tree.root, path)) for source in reversed(self._sources))
+        return max(found, key=lambda one: len(one[1]))  # the first of the longest: the strongest file
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:

@@ -16,7 +16,7 @@ from dxlrun.log.target import new_target
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
-from dxlrun_hand.dialogue import Dialogue, yes
+from dxlrun_hand.dialogue import Dialogue, ending_with, yes
 from dxlrun_hand.taught_motion import Shown, Taught, text_of
 
 LONGEST_AGE_NS = 1_000_000_000
@@ -142,8 +142,16 @@ class Teaching:
         joints = [joint for name in names for joint in self._groups[name] if joint not in self.limp]
         if joints:
             self.limp += joints  # before, as an answer may get lost
-            done = self._robot.torque(joints, False, release=True)
-            self.released += done.deactivated
+            try:
+                self._robot.torque(joints, False, release=True)
+            finally:  # also where it is refused, as a servo does not answer: its controller was deactivated
+                self.released = self._deactivated()
+
+    def _deactivated(self) -> list[str]:
+        """Return the controllers that were active at the beginning, and are not now."""
+        controllers = cast("Mapping[str, Any]", self._robot.info())["controllers"]
+        inactive = {one["name"] for one in controllers if not one["active"]}
+        return [plan.name for plan in self._plans if plan.active and plan.name in inactive]
 
     def _hold(self, names: Sequence[str]) -> None:
         joints = [joint for name in names for joint in self._groups[name] if joint in self.limp]
@@ -212,8 +220,6 @@ def taught(
     robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], target: Path, way_speed: float
 ) -> int:
     """Teach a motion, save it, and play it where the person says so; return the exit code."""
-    from dxlrun_hand.lines import ending_with
-
     task = Teaching(robot, dialogue, words, way_speed)
     with ending_with(task.left):
         shown = task.teach()

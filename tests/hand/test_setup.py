@@ -13,8 +13,8 @@ from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id
 from dxlrun.errors import InputError, PortError
 from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun_hand import port_search
 from dxlrun_hand.commands.setup import set_up
+from dxlrun_hand.lines import find_port
 from dxlrun_hand.servo_setup import SetUp
 
 ROBOT = """\
@@ -246,19 +246,20 @@ def test_a_group_means_its_joints_and_torque_goes_off(bench: Bench) -> None:
 class Desk:
     """Adapters that are plugged in and out, as the system lists them: a lasting name, and a device."""
 
-    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
-        monkeypatch.setattr(port_search, "APPEARS_S", 0.2)
 
-    def plug(self, *numbers: int) -> Callable[[], None]:
-        """Return what makes these adapters those that are plugged in."""
+    def plug(self, *numbers: int) -> Callable[..., str]:
+        """Return what makes these adapters those that are plugged in, and looks at what is shown then."""
 
-        def change() -> None:
+        def change(look: Callable[[], str] = str) -> str:
             for path in self.directory.glob("*-*"):
                 path.unlink()
             for number in numbers:
                 (self.directory / f"b-tty{number}").touch()
                 (self.directory / f"a-id{number}").symlink_to(self.directory / f"b-tty{number}")
+            self.shown = look()
+            return ""
 
         return change
 
@@ -267,15 +268,15 @@ class Desk:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
-    return Desk(tmp_path, monkeypatch)
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
 
 
-def found(desk: Desk, *steps: tuple[Callable[[], None], Callable[[], None]]) -> tuple[str, Script]:
+def found(desk: Desk, *steps: tuple[Callable[..., str], Callable[..., str]]) -> tuple[str, Script]:
     script = Script(
         *(one for out, back in steps for one in (("Unplug the adapter of bus main", out), ("Plug it", back)))
     )
-    return port_search.find_port("main", script, desk), script
+    return find_port("main", script, desk), script
 
 
 def test_the_adapter_that_comes_back_is_the_one(desk: Desk) -> None:
@@ -283,6 +284,7 @@ def test_the_adapter_that_comes_back_is_the_one(desk: Desk) -> None:
     path, script = found(desk, (desk.plug(2), desk.plug(1, 2)))
     assert path == str(desk.directory / "a-id1")  # its lasting name
     assert f"Bus main is at {path}." in script.said
+    assert desk.shown == f"  {path}, {desk.directory / 'b-tty1'}"
 
 
 def test_an_adapter_that_was_not_there_before_is_found_too(desk: Desk) -> None:
@@ -298,6 +300,7 @@ def test_none_and_several_are_asked_for_again(desk: Desk) -> None:
     assert "2 adapters appeared" in script.text
     with pytest.raises(PortError, match="the adapter of bus main was not found"):
         found(desk, *[(desk.plug(1), desk.plug(1))] * 3)
+    assert desk.shown == "  no port yet"
 
 
 def test_a_port_that_is_not_there_is_looked_for(bench: Bench, desk: Desk) -> None:

@@ -13,7 +13,7 @@ from tests.kit.hands import LiveRobot, Script, interrupt, written
 
 from dxlrun import RemoteRobot, connect
 from dxlrun.description.motion import Motion, read_motion
-from dxlrun.errors import InputError, ServoFault
+from dxlrun.errors import InputError, Refused, ServoFault
 from dxlrun_hand.taught_motion import Shown, Taught
 from dxlrun_hand.teaching import Teaching, taught
 
@@ -47,9 +47,10 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRobot]:
 
 @pytest.fixture
 def robot(live: LiveRobot) -> Iterator[RemoteRobot]:
-    """The robot as it is after its start."""
+    """The robot as it is after its start; on a busy machine servos may be lost for some cycles."""
     with connect() as robot:
         yield robot
+        live.until(lambda: not {"lost", "rebooting"} & {*robot.states().torque})
         robot.torque("all", True)
         robot.switch([one["name"] for one in robot.info()["controllers"] if not one["active"]])
 
@@ -158,6 +159,22 @@ def test_after_ctrl_c_it_is_said_what_is_limp(
     assert capsys.readouterr().err == (left if limp else "")
     assert (robot.states().joint("elbow")["torque"] != "on") is limp
     assert (tmp_path / "a.yaml").exists() is (at in ("comes back", "Play"))
+
+
+def test_a_refusal_that_deactivated_a_controller_names_it(
+    robot: RemoteRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """So it is refused where a servo does not answer: its torque goes off when it is back."""
+    switch = RemoteRobot.torque
+
+    def refuse(robot: RemoteRobot, joints: list[str], on: bool, *, release: bool = False) -> None:
+        switch(robot, joints, on, release=release)
+        raise Refused("elbow does not answer")
+
+    monkeypatch.setattr(RemoteRobot, "torque", refuse)
+    with pytest.raises(Refused):
+        taught(robot, Script(("Limp", "")), ("elbow",), tmp_path / "a.yaml", SPEED)
+    assert "deactivated: arm: `dxlrun switch --activate arm`" in capsys.readouterr().err
 
 
 def test_a_servo_that_falls_silent_ends_it(

@@ -1,4 +1,4 @@
-"""Hands: a scripted person who answers dialogues, and servos on virtual time that it connects and turns."""
+"""Hands: scripts that answer dialogues, and simulated servos that they connect and turn."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class LiveRobot:
         self._servos = subprocess.Popen(command, **pipes)
         self._run: subprocess.Popen[bytes] | None = None
         try:
-            self._until(self.link.exists)
+            self.until(self.link.exists)
             if runs:
                 self.start()
         except BaseException:
@@ -138,7 +138,7 @@ class LiveRobot:
         words = [sys.executable, "-P", "-c", CODE, str(self._robot), f"port:={self.link}", "--no-record"]
         with self._said.open("wb") as said:
             self._run = subprocess.Popen(words, cwd=self._directory, stdout=said, stderr=said)
-        self._until(lambda: bool(running()))
+        self.until(lambda: bool(running()))
 
     def __enter__(self) -> Self:
         return self
@@ -169,7 +169,8 @@ class LiveRobot:
         self._servos.stdin.write(f"{fault}\n")
         self._servos.stdin.flush()
 
-    def _until(self, done: Callable[[], bool]) -> None:
+    def until(self, done: Callable[[], bool]) -> None:
+        """Wait for something, while servos and robot run."""
         tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
         while not done():
             said = self._said.read_text() if self._said.exists() else ""

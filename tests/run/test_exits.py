@@ -1,4 +1,4 @@
-"""Ways out of a run in which more than one thing goes wrong; judged by the ledger, and by who is left."""
+"""Ways out of a run in which more than one thing goes wrong; judged by ledger and processes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def guardians_word(run: Running) -> str:
 
 
 def test_a_second_interrupt_cuts_torque_at_once(start, tmp_path, all_limp, wait_for):
-    """At one cycle in two seconds the first interrupt is obeyed too late for anybody's patience."""
+    """At one cycle in two seconds the first interrupt is obeyed too late to be waited for."""
     robot = tmp_path / "slow.yaml"
     robot.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 0.5"))
     run = start(robot=robot)

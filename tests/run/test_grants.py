@@ -96,7 +96,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 @pytest.mark.parametrize("before", [(), (sys.executable, "-c", WITHOUT_RIGHTS)], ids=["as is", "no rights"])
 def test_a_run_reports_what_it_was_granted(start, tmp_path, before):
-    """Once with the rights of whoever runs the tests, once without capabilities and limits."""
+    """Once with the rights of the user of the tests, once without capabilities and limits."""
     robot = tmp_path / "wisher.yaml"
     robot.write_text(ROBOT)
     run = start("--duration", "0.2", robot=robot, before=before)

@@ -1,4 +1,4 @@
-"""A servo that stops answering holds its own controllers, nobody else; who takes over from a controller."""
+"""A servo that stops answering holds its own controllers, no others; what takes over from a controller."""
 
 from __future__ import annotations
 
@@ -110,7 +110,9 @@ def test_a_controller_goes_on_slowly_when_its_servo_answers_again(built, acts):
     steps = [abs(angle - before) for (_, before), (_, angle) in itertools.pairwise(slow)]
     assert max(steps) <= 1.5 * 0.02 + TICK
     eased = [angle for t, angle in goals(robot, 9) if BACK_NS < t < BACK_NS + 900_000_000]
-    assert max(abs(b - a) for a, b in itertools.pairwise(eased)) > 1.5 * 0.02 + TICK, "nobody slowed yaw down"
+    assert max(abs(b - a) for a, b in itertools.pairwise(eased)) > 1.5 * 0.02 + TICK, (
+        "yaw was not slowed down"
+    )
 
 
 def test_two_missed_replies_hold_no_joint(built, acts, tmp_path):

@@ -1,4 +1,4 @@
-"""The name of a log is taken before anybody writes: two runs in one second, and directories that refuse."""
+"""A log's name is taken before anything is written: two runs in one second, and directories that refuse."""
 
 from __future__ import annotations
 

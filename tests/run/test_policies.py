@@ -58,7 +58,7 @@ def writes(robot: VirtualRobot) -> Iterator[tuple[int, int, int, bytes]]:
 
 
 def torque(robot: VirtualRobot) -> dict[int, bool]:
-    """Return who has torque at the end of the wire's story."""
+    """Return which servos have torque at the end, by the ledger."""
     state = {3: False, 7: False, 9: False}
     for _, servo, address, data in writes(robot):
         if address == TORQUE_ENABLE:

@@ -1,8 +1,8 @@
 """Campaign: the adapter of one of two buses is pulled and comes back under another name, again and again.
 
 Everything is real but the servos: processes, pseudo-terminals, a link to each as udev makes it, time. Judged
-by the simulated buses' ledger: the other bus goes on, whoever is back is read again, the log has every byte,
-and everybody ends limp: by the loop, by the guardian when the loop is killed, or by the terminal's process
+by the simulated buses' ledger: the other bus goes on, one that is back is read again, the log has all bytes,
+and all servos end limp: by the loop, by the guardian when the loop is killed, or by the terminal's process
 when both are.
 
 CI pulls 2 times from a fixed seed. The full campaign before a release:
@@ -34,8 +34,8 @@ from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 A_RUN = 10
-ENDS = {"loop": ("loop_process",), "both": ("guardian", "loop_process"), "nobody": ()}
-"""Who is killed at the end; without a loop and a guardian the terminal's process has the last hand."""
+ENDS = {"loop": ("loop_process",), "both": ("guardian", "loop_process"), "none": ()}
+"""What is killed at the end; without a loop and a guardian the terminal's process has the last hand."""
 ROBOT = """\
 name: pulled
 arguments:
@@ -143,7 +143,7 @@ def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  
         wait_for(lambda name=name, count=count: len(servos.of(name, "in")) > count + 20, f"more on {name}")
     pids = [run.child(f"dxlrun.run.{victim}") for victim in ENDS[killed]]
     for pid in pids:
-        os.kill(pid, signal.SIGSTOP)  # nobody sees another one die
+        os.kill(pid, signal.SIGSTOP)  # neither sees the other one die
     for pid in reversed(pids):
         os.kill(pid, signal.SIGKILL)
     if not pids:
@@ -221,7 +221,7 @@ def the_log_is_the_wire(run: Any, servos: Servos, drawn: list[tuple[str, int, in
         told = b"".join(entry.data for entry in servos.of(name, "out"))
         heard = [packet.data for packet in packets if packet.kind != PacketKind.INSTRUCTION]
         at = 0
-        for each in heard:  # in order; what came while nobody had the line open is between
+        for each in heard:  # in order; what came while the line was closed is between
             at = told.index(each, at) + len(each)
 
 

@@ -52,8 +52,8 @@ def calibrated(
     """Calibrate a robot; return the exit code. Where it raises an error, the file is as it was."""
     from dxlrun.compile.robot import compile_files
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
-    from dxlrun_hand.dialogue import yes
-    from dxlrun_hand.lines import ending_with, opened_lines
+    from dxlrun_hand.dialogue import ending_with, yes
+    from dxlrun_hand.lines import opened_lines
     from dxlrun_hand.robot_text import RobotText
 
     plan, robot = result.plan, Path(result.plan.source_file)

@@ -14,8 +14,7 @@ from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
     from dxlrun.plan.bus_plan import BusPlan
-    from dxlrun_hand.lines import Opened
-    from dxlrun_hand.port_search import Devices
+    from dxlrun_hand.lines import Devices, Opened
     from dxlrun_hand.servo_setup import SetUp
 
 
@@ -62,7 +61,8 @@ def set_up(
     task: SetUp, opened: Opened, devices: Devices, words: Sequence[str] = (), *, search: bool = False
 ) -> int:
     """Set the servos of a robot up; return the exit code. Raises InputError, PortError."""
-    from dxlrun_hand.lines import chosen_names, ending_with, opened_lines
+    from dxlrun_hand.dialogue import ending_with
+    from dxlrun_hand.lines import chosen_names, opened_lines
 
     servos = [servo.own_name for plan in task.plans for servo in plan.servos]
     moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))  # joints and transmissions
@@ -91,7 +91,7 @@ def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     """Return the port of a bus: that of the file where it is there, else the one that is plugged in."""
     from dxlrun.description.bus import SIMULATED
     from dxlrun_hand.dialogue import yes
-    from dxlrun_hand.port_search import find_port
+    from dxlrun_hand.lines import find_port
     from dxlrun_hand.robot_text import RobotText
 
     robot, dialogue = task.description.path, task.dialogue
