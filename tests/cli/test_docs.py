@@ -72,6 +72,7 @@ TESTS = {
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/lab/tracking/test_command.py",),
+    "recipes.md": ("tests/cli/test_recipes.py", "tests/robots/test_stand_up.py"),
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
     "sensors.md": ("tests/sensors/test_page.py",),
