@@ -8,7 +8,8 @@ without growing memory, and scipy takes two seconds to import; the tests compare
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from itertools import pairwise
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,16 @@ LINEAR, CUBIC, QUINTIC = 2, 4, 6
 DECELERATION: Final = 20.0
 """rad/s^2, of joints that have no limit of their own: an XM430 is at rest from its top speed in 0.25 s."""
 
+START_IN: Final = 3
+"""Where `start_in` is in the flat array of a trajectory, behind the numbers of points, joints and
+coefficients."""
 _HEAD = 4
+_TRIES = 12
+"""In which a bridge becomes so long that it is not too fast."""
+_BETWEEN = 1.01
+"""Speeds between those that are looked at are higher by less than this factor."""
+_SHARES = np.linspace(0, 1, 17)[:, None] ** np.arange(5) * np.arange(1, 6)
+"""What the coefficients of a quintic piece count for its speed, at so many shares of its time."""
 
 
 class SplineSample:
@@ -79,24 +89,63 @@ def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -
     acceleration *= 2.0
 
 
-def flatten(order: int, times: Floats, points: Floats, start_in: float) -> Floats:
+def smooth_velocities(times: Floats, positions: Floats) -> Floats:
+    """Return velocities at points with which cubic pieces overshoot none of them, shape (points, joints).
+
+    F. N. Fritsch, J. Butland, "A method for constructing local monotone piecewise cubic interpolants", SIAM
+    Journal on Scientific and Statistical Computing 5, 1984; at both ends the three-point formula of C. Moler,
+    Numerical Computing with MATLAB (2004), section 3.6. `times` in s, growing, shape (points,).
+    """
+    gaps = np.diff(times)[:, None]
+    slopes = np.diff(positions, axis=0) / gaps
+    if len(times) < 3:
+        return np.resize(slopes, positions.shape) if len(slopes) else np.zeros_like(positions)
+    velocities = np.zeros_like(positions)
+    before, after, gap, next_gap = slopes[:-1], slopes[1:], gaps[:-1], gaps[1:]
+    first, second = 2.0 * next_gap + gap, next_gap + 2.0 * gap
+    grows = before * after > 0
+    weighed = first * after + second * before
+    np.divide((first + second) * before * after, weighed, out=velocities[1:-1], where=grows)
+    velocities[0] = _end_velocity(gaps[0], gaps[1], slopes[0], slopes[1])
+    velocities[-1] = _end_velocity(gaps[-1], gaps[-2], slopes[-1], slopes[-2])
+    return velocities
+
+
+def _end_velocity(gap: Floats, next_gap: Floats, slope: Floats, next_slope: Floats) -> Floats:
+    velocity = ((2.0 * gap + next_gap) * slope - gap * next_slope) / (gap + next_gap)
+    velocity = np.where(velocity * slope > 0, velocity, 0.0)
+    bends = (slope * next_slope < 0) & (np.abs(velocity) > 3.0 * np.abs(slope))
+    return np.where(bends, 3.0 * slope, velocity)
+
+
+def flatten(orders: Sequence[int], times: Floats, points: Floats, start_in: float) -> Floats:
     """Return a trajectory as the one flat array that `Trajectory.load` takes.
 
     `times` in s, shape (points,), growing; `points` has the shape (points, 3, joints): position, velocity,
-    acceleration; `start_in` in s.
+    acceleration; `start_in` in s. Each point has its order, by what is given of it; a piece has the lower one
+    of its two ends.
     """
     count, _, joints = points.shape
-    pieces = np.empty((count - 1, order, joints))
-    for index in range(count - 1):
-        solve(order, float(times[index + 1] - times[index]), points[index], points[index + 1], pieces[index])
+    of_pieces = [min(pair) for pair in pairwise(orders)]
+    order = max(of_pieces, default=orders[0])
+    pieces = np.zeros((count - 1, order, joints))
+    for index, own in enumerate(of_pieces):
+        gap = float(times[index + 1] - times[index])
+        solve(own, gap, points[index], points[index + 1], pieces[index, :own])
     head = np.array([count, joints, order, start_in])
     return np.concatenate([head, times, points[0].ravel(), points[-1].ravel(), pieces.ravel()])
+
+
+def flat_size(data: Floats) -> int:
+    """Return how many numbers of a flat array are those of its trajectory."""
+    count, joints, order = map(int, data[:START_IN].tolist())
+    return _HEAD + count + 6 * joints + (count - 1) * order * joints
 
 
 class Trajectory:
     """A trajectory that is being played: a bridge from where the joints are to its first point, then pieces.
 
-    `load` takes views of the flat array, so that nothing grows in the loop.
+    `load` and `join` take views of the flat array, so that nothing grows in the loop.
     """
 
     def __init__(self, joints: int) -> None:
@@ -110,35 +159,71 @@ class Trajectory:
         self._now: tuple[Floats, ...] = ()
         """Coefficients of the piece that is played, from `_begin_s` to `_end_s`, in time of the points."""
         self._begin_s = self._end_s = 0.0
+        self._tail = Stop(joints)
+        self._tail_s = 0.0
+        """When the joints begin to come to rest behind the last point."""
+        self._joined = SplineSample(joints)
         self.duration_s = 0.0
-        """From `load` to the last point, s."""
+        """From `load` until all are at rest, s."""
 
-    def load(self, data: Floats, now: SplineSample) -> Floats:
+    def load(self, data: Floats, now: SplineSample, waited_s: float = 0.0) -> None:
         """Begin a flat trajectory from the sample `now`; time counts from here.
 
         From rest, the bridge is a piece as the others. From a motion it is quintic, whatever they are: it
-        keeps velocity and acceleration at both its ends. Returns what `data` has beyond the trajectory.
+        keeps velocity and acceleration at both its ends. `waited_s` of the time until its start have passed.
         """
-        count, joints, order = int(data[0]), int(data[1]), int(data[2])
-        ends = _HEAD + count
-        body = ends + 6 * joints
-        end = body + (count - 1) * order * joints
-        self._start_in = float(data[3])
-        self._times = data[_HEAD:ends]
-        self._first = data[ends : ends + 3 * joints].reshape(3, joints)
-        self._last = data[ends + 3 * joints : body].reshape(3, joints)
-        self._pieces = data[body:end].reshape(count - 1, order, joints)
-        self._begin_s = self._end_s = 0.0
+        order = self._take(data, float(data[START_IN]) - waited_s)
         self.bridge_s = self._start_in + float(self._times[0])
-        self.duration_s = self._start_in + float(self._times[-1])
-        self._bridge.fill(0.0)
+        self.duration_s = self._tail_s = self._start_in + float(self._times[-1])
         if self.bridge_s > 0:
             start = (now.position, now.velocity, now.acceleration)
             if now.velocity.any() or now.acceleration.any():
                 solve(QUINTIC, self.bridge_s, start, self._beginning(order), self._bridge)
             else:
                 solve(order, self.bridge_s, start, self._first, self._bridge[:order])
-        return data[end:]
+
+    def join(self, data: Floats, now: SplineSample, late_s: float, blend_s: float, limits: Limits) -> bool:
+        """Begin a flat trajectory from the sample `now`, in its middle: `late_s` of its points' time is over.
+
+        A quintic bridge passes into it in `blend_s`, or so much later that the way there is not too fast.
+        Behind the last point the joints come to rest. Returns False where all of its points are in the past.
+        """
+        self._take(data, -late_s)
+        joined, end_s = self._joined, float(self._times[-1]) - late_s
+        if end_s <= 0:
+            return False
+        bridge_s, haste = max(blend_s, float(self._times[0]) - late_s), 1.0
+        for _ in range(_TRIES):
+            bridge_s *= haste
+            if bridge_s < end_s:
+                self._sample_points(bridge_s, joined)
+            else:
+                joined.rest_at(self._last[0])
+            solve(QUINTIC, bridge_s, now.rows, joined.rows, self._bridge)
+            speeds = np.abs(_SHARES @ (self._bridge[1:] * bridge_s ** np.arange(5.0)[:, None]))
+            haste = _BETWEEN * float((speeds / limits.speed).max())
+            if haste <= 1.0:
+                break
+        self.bridge_s, self._tail_s = bridge_s, max(end_s, bridge_s)
+        if bridge_s < end_s:
+            self._sample_points(end_s, joined)
+        self._tail.load(joined, limits.deceleration, limits.lower, limits.upper)
+        self.duration_s = self._tail_s + self._tail.duration_s
+        return True
+
+    def _take(self, data: Floats, start_in: float) -> int:
+        """Take the parts of a flat array; return the order of its pieces."""
+        count, joints, order = map(int, data[:START_IN].tolist())
+        ends = _HEAD + count
+        body, end = ends + 6 * joints, flat_size(data)
+        self._start_in = start_in
+        self._times = data[_HEAD:ends]
+        self._first = data[ends : ends + 3 * joints].reshape(3, joints)
+        self._last = data[ends + 3 * joints : body].reshape(3, joints)
+        self._pieces = data[body:end].reshape(count - 1, order, joints)
+        self._begin_s = self._end_s = 0.0
+        self._bridge.fill(0.0)
+        return order
 
     def _beginning(self, order: int) -> tuple[Floats, Floats, Floats]:
         """Return position, velocity and acceleration with which the first piece begins, or what it has."""
@@ -154,23 +239,39 @@ class Trajectory:
         return way
 
     def sample(self, t: float, sample: SplineSample) -> None:
-        """Write the desired state `t` s after `load`; after the end: the last position, at rest."""
-        if t >= self.duration_s:
-            sample.rest_at(self._last[0])
-        else:
-            piece, t = self._piece(t)
-            evaluate(piece, t, sample)
-
-    def _piece(self, t: float) -> tuple[Sequence[Floats] | Floats, float]:
-        """Return the piece that is played `t` s after `load`, and the time in it."""
+        """Write the desired state `t` s after `load`; after the end: at rest."""
         if t < self.bridge_s:
-            return self._bridge, max(t, 0.0)
+            evaluate(self._bridge, max(t, 0.0), sample)
+        elif t < self._tail_s:
+            self._sample_points(t, sample)
+        elif t < self.duration_s:
+            self._tail.sample(t - self._tail_s, sample)
+        else:
+            sample.rest_at(self._last[0] if self._tail_s == self.duration_s else self._tail.end)
+
+    def _sample_points(self, t: float, sample: SplineSample) -> None:
+        """Write the state on the pieces, or at the only point, `t` s after `load`."""
+        if not len(self._pieces):
+            np.copyto(sample.rows, self._first)
+            return
         t -= self._start_in
         if not self._begin_s <= t < self._end_s:
             index = max(min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1, 0)
             self._begin_s, self._end_s = float(self._times[index]), float(self._times[index + 1])
             self._now = tuple(self._pieces[index])
-        return self._now, t - self._begin_s
+        evaluate(self._now, t - self._begin_s, sample)
+
+
+class Limits(NamedTuple):
+    """What joints keep when they pass into a trajectory and behind its end; shape (joints,) each."""
+
+    speed: Floats
+    """rad/s"""
+    deceleration: Floats
+    """rad/s^2"""
+    lower: Floats
+    upper: Floats
+    """rad"""
 
 
 class Stop:
@@ -182,7 +283,7 @@ class Stop:
     """
 
     def __init__(self, joints: int) -> None:
-        self._duration, self._end, self._pull = np.zeros((3, joints))
+        self._duration, self.end, self._pull = np.zeros((3, joints))
         self.duration_s = 0.0
         """From `load` until all are at rest, s."""
 
@@ -195,12 +296,12 @@ class Stop:
         self._duration = speed / needed
         # a joint that stops at once has none
         self._pull = np.where(self._duration > 0, np.copysign(needed, now.velocity), 0.0)
-        self._end = now.position + now.velocity * self._duration / 2.0
+        self.end = now.position + now.velocity * self._duration / 2.0
         self.duration_s = float(self._duration.max(initial=0.0))
 
     def sample(self, t: float, sample: SplineSample) -> None:
         """Write the state `t` s after `load` into `sample`."""
         left = np.maximum(self._duration - t, 0.0)
         np.multiply(self._pull, left, out=sample.velocity)
-        np.add(sample.velocity * left * -0.5, self._end, out=sample.position)
+        np.add(sample.velocity * left * -0.5, self.end, out=sample.position)
         np.negative(self._pull * np.sign(left), out=sample.acceleration)

@@ -90,6 +90,7 @@ class IlcController(JointTrajectoryController):
 
     Parameters = IlcParameters
     parameters: IlcParameters
+    Commands: ClassVar = {"trajectory": TrajectoryCommand}
     Topics: ClassVar = {"repetition": LearnedRepetition}
     keeps = True
 
@@ -101,6 +102,8 @@ class IlcController(JointTrajectoryController):
         data = super().prepare(kind, command, parameters)
         if not isinstance(command, TrajectoryCommand):
             return data
+        if command.splice:
+            raise ValueError("a motion that is learned begins by itself; take splice out")
         # neither when it begins nor when it is given up is part of a motion: `dxlrun play` leads joints to it
         motion = command.model_copy(update={"start_in": 0.0, "timeout": None})
         digest = hashlib.sha256(super().prepare(kind, motion, parameters).tobytes())
@@ -278,7 +281,7 @@ class IlcController(JointTrajectoryController):
         repetition, desired = self._repetition, self._desired.position
         judged = repetition.rows < self._judged
         # joints that are not of this motion count as followed
-        measured = np.where(self._resting, desired, self.context.states.position)
+        measured = np.where(self._unmoved, desired, self.context.states.position)
         repetition.record(desired, measured, self._correction, judged)
         if judged:
             self._largest = max(self._largest, float(np.abs(self._correction).max()))

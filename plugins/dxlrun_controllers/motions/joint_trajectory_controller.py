@@ -36,13 +36,23 @@ from dxlrun_controllers.joints import (
     take_where_heard,
 )
 from dxlrun_controllers.laws.pid import feed_velocities_forward
-from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop, Trajectory
+from dxlrun_controllers.laws.spline import DECELERATION, START_IN, Limits, SplineSample, flat_size
 from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
-from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand, flat_trajectory
+from dxlrun_controllers.laws.tracks import Track, Tracks
+from dxlrun_controllers.motions.trajectory_command import (
+    SPLICED,
+    ChunkCommand,
+    ChunkHead,
+    TrajectoryCommand,
+    flat_chunk,
+    flat_trajectory,
+)
 
 SPEED_SLOPE: Final = 2.0
 """1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
 FEEDBACK_NS: Final = 100_000_000
+_LEFT: Final = 3
+"""Periods without an update: the stream of chunks has ended, and the joints are held at their goals."""
 _STILL: Final = 1e-3
 """A speed of the trajectory so near to 0 is none: its time stands still."""
 
@@ -99,14 +109,15 @@ class _Phase(Enum):
 
 
 class JointTrajectoryController(Controller[TrajectoryParameters]):
-    """Plays one trajectory at a time; a new one begins at the desired state of then, without a jump.
+    """Plays one goal at a time; a new one begins at the desired state of then, without a jump, and leaves the
+    joints that it does not name on their way.
 
     Time decides the desired state, never the number of updates: a late cycle shortens nothing. Goals,
     tolerances and partial joints as in joint_trajectory_controller of ros2_controllers (control.ros.org).
     """
 
     Parameters = TrajectoryParameters
-    Commands: ClassVar = {"trajectory": TrajectoryCommand}
+    Commands: ClassVar = {"trajectory": TrajectoryCommand, "chunk": ChunkCommand}
     Goals = frozenset({"trajectory"})
 
     @classmethod
@@ -122,28 +133,34 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
         Raises ValueError for a wrong size, unknown joints, or times that do not grow.
         """
-        if not isinstance(command, TrajectoryCommand):
-            return super().prepare(kind, command, parameters)
-        return flat_trajectory(command, parameters.joints)
+        if isinstance(command, ChunkCommand):
+            return flat_chunk(command, parameters.joints)
+        if isinstance(command, TrajectoryCommand):
+            return flat_trajectory(command, parameters.joints)
+        return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
         super().on_configure(context)
         joints, limits, parameters = context.joints, context.limits, self.parameters
         count = len(joints)
-        self._desired, self._path, self._others = (SplineSample(count) for _ in range(3))
-        self._trajectory = Trajectory(count)
-        self._stop = Stop(count)
+        self._tracks = Tracks(count)
+        self._desired, self._path = self._tracks.desired, SplineSample(count)
+        self._trajectory = self._tracks.free().trajectory
+        """What was begun last."""
         self._error = np.zeros(count)
-        self._moved, self._resting = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        """Joints of the goal, and all others: these come to rest by `_stop`."""
-        self._some_rest = self._rest_still = False
-        self._unknown = False
+        self._moved, self._unmoved = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        """Joints of what was begun last, and all others."""
+        self._spliced: NDArray[np.float64] | None = None
+        """A trajectory whose start the joints wait for on the way of another one."""
+        self._anchor_ns: int | None = None
+        """When the clock of a stream of chunks was 0; None: there is no stream."""
+        self._moves = self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
-        self._start_ns = self._base_ns = self._stop_ns = self._end_ns = self._feedback_ns = 0
+        self._start_ns = self._base_ns = self._stop_ns = self._end_ns = self._feedback_ns = self._now_ns = 0
         self._timeout_ns = np.inf
-        self._base_s = 0.0
+        self._base_s = self._splice_s = 0.0
         self._speed = self._rate = parameters.speed
         self._slope = 0.0
         """The speed that is wanted; that of now, and how fast it changes, 1/s."""
@@ -152,9 +169,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._checks_path = parameters.tolerances.path is not None
         self._lower, self._upper = limits.lower, limits.upper
         own = row_of(parameters.deceleration, joints, np.nan)
-        self._deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
-        speed = finite_or(limits.velocity, np.inf)
-        self._speed_limit = speed
+        deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
+        speed = self._speed_limit = finite_or(limits.velocity, np.inf)
+        self._limits = Limits(speed, deceleration, limits.lower, limits.upper)
         self._closing = np.minimum(speed, CLOSING_SPEED)
         self._interface = parameters.command_interface
         self._tracking: Tracking | None = None
@@ -166,7 +183,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def on_parameters(self, time_ns: int) -> None:
         """Take the gains; the speed is reached with SPEED_SLOPE."""
-        if self._phase is _Phase.MOVING:
+        if self._tracks.playing:
             self._base_s, self._base_ns = self._warped(time_ns), time_ns
         self._speed = self.parameters.speed
         if self._tracking is not None and self.parameters.gains is not None:
@@ -175,7 +192,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""
         commands, states = self.context.commands, self.context.states
-        self._phase, self._goal, self._some_rest = _Phase.RESTING, None, False
+        self._phase, self._goal, self._spliced, self._anchor_ns = _Phase.RESTING, None, None, None
+        self._tracks.rest()
         if self._tracking is None:
             hold(self.context)
             self._desired.rest_at(commands.position)
@@ -193,29 +211,54 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # Goals
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin a trajectory from the desired state."""
-        self._goal = None
-        if self._phase is not _Phase.MOVING:
-            still = self._phase is not _Phase.STOPPING
-            self._rate = self._speed if still or self._speed > _STILL else 1.0
-            self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
-        self._know_where(time_ns)
+        """Begin a trajectory from the desired state, or splice it into the one that is played."""
+        self._goal = self._spliced = None
+        self._know_begin(time_ns)
+        self._anchor_ns = None
         if ends_unheard(goal, self._desired.position, self.context.joints):
             return
-        self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
-        more = self._trajectory.load(data, self._path)
-        self._moved = more[1 : 1 + len(self._moved)] != 0
-        self._resting = ~self._moved
-        self._timeout_ns = float(more[0]) * 1e9
-        self._start_ns = self._base_ns = self._stop_ns = time_ns
-        if self._refused_for_haste(goal):
-            self._phase, self._some_rest = _Phase.STOPPING, False
-            return
-        self._some_rest, self._rest_still = bool(self._resting.any()), False
-        self._goal = goal
-        self._feedback_ns = time_ns + FEEDBACK_NS
-        self._base_s = 0.0
+        self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
         self._phase = _Phase.MOVING
+        if self._tracks.playing and (data[-len(self._moved) :] == SPLICED).any():
+            self._spliced, self._splice_s = data, self._warped(time_ns) + float(data[START_IN])
+        else:
+            self._begin(data, time_ns, self._warped(time_ns))
+
+    def _begin(
+        self, data: NDArray[np.float64], time_ns: int, clock_s: float, *, waited_s: float = 0.0
+    ) -> None:
+        """Let the joints of a trajectory follow it, which begins `clock_s` after the one before did."""
+        since_s, more = self._warped(time_ns) - clock_s, data[flat_size(data) :]
+        track, moved = self._tracks.free(), more[1 : 1 + len(self._moved)] != 0
+        track.trajectory.load(data, self._path_of(moved), waited_s)
+        self._timeout_ns = float(more[0]) * 1e9
+        self._take(track, moved)
+        if self._refused_for_haste():
+            self._brake(time_ns)
+        else:
+            self._tracks.follow(track, moved, clock_s)
+            self._base_ns, self._base_s = time_ns, since_s
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Pass into a chunk of positions; not where all of it is past, or a joint has not answered yet."""
+        self._know_begin(time_ns)
+        if np.isnan(self._desired.position).any():
+            return
+        head = ChunkHead(*data[: len(ChunkHead._fields)].tolist())
+        sent_ns = time_ns - round(head.now * 1e9)
+        self._anchor_ns = sent_ns if self._anchor_ns is None else min(self._anchor_ns, sent_ns)
+        late_s, blend_s = (sent_ns - self._anchor_ns) * 1e-9, max(head.blend, self.context.period_ns * 1e-9)
+        track, moved = self._tracks.free(), data[-len(self._moved) :] != 0
+        begin = self._path_of(moved)
+        if track.trajectory.join(data[len(head) :], begin, late_s, blend_s, self._limits):
+            self._end(Outcome.PREEMPTED, time_ns, "a chunk of positions took its place")
+            self._tracks.follow(track, moved, self._warped(time_ns))
+            self._take(track, moved)
+            self._base_ns, self._base_s = time_ns, 0.0
+            self._spliced, self._phase = None, _Phase.MOVING
+
+    def _take(self, track: Track, moved: NDArray[np.bool_]) -> None:
+        self._trajectory, self._moved, self._unmoved = track.trajectory, moved, ~moved
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest from their desired velocity; the goal ends when they are."""
@@ -226,24 +269,38 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """True while a trajectory is played."""
         return self._phase is _Phase.MOVING
 
+    def _know_begin(self, time_ns: int) -> None:
+        """Set the state from which something new begins now."""
+        if self._anchor_ns is not None and time_ns - self._now_ns > _LEFT * self.context.period_ns:
+            self._anchor_ns, self._phase = None, _Phase.RESTING
+            self._tracks.rest()
+            held = self.context.goals if self._tracking is None else self.context.states
+            self._desired.rest_at(finite_or(held.position, self._desired.position))
+        if not self._tracks.playing:
+            self._rate = 1.0 if self._tracks.moving and self._speed <= _STILL else self._speed
+            self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
+            self._base_ns, self._base_s = time_ns, 0.0
+        self._know_where(time_ns)
+
     def _know_where(self, time_ns: int) -> None:
-        """Set the desired state of now, and in `_path` the same with the derivatives of the path."""
-        desired, path = self._desired, self._path
+        """Set the desired state of now."""
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
-        if self._phase is _Phase.MOVING:
+        if self._tracks.moving:
             self._sample(time_ns)
-        elif self._phase is _Phase.STOPPING:
-            self._stop.sample((time_ns - self._stop_ns) * 1e-9, desired)
-        if self._some_rest:
-            self._bring_others_to_rest(time_ns)
+
+    def _path_of(self, moved: NDArray[np.bool_]) -> SplineSample:
+        """Return the desired state with the derivatives of the path; zeros for joints that are not moved."""
+        desired, path = self._desired, self._path
         path.rest_at(desired.position)
         if self._rate > _STILL:
             np.divide(desired.velocity, self._rate, out=path.velocity)
             slowing = path.velocity * self._slope
             np.divide(desired.acceleration - slowing, self._rate**2, out=path.acceleration)
+        path.rows *= moved
+        return path
 
-    def _refused_for_haste(self, goal: Goal) -> bool:
+    def _refused_for_haste(self) -> bool:
         """Abort a goal whose first point is too far away for its time: only now the way there is known.
 
         A first point at time 0 is to be reached within a period.
@@ -259,7 +316,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             f"{way[row] / time_s:.4g} a second, more than its limit of {limit:.4g}: give the point "
             f"{math.ceil(1e3 * way[row] / limit) * 1e-3:.4g} s or more, as its time or by start_in"
         )
-        goal.end(Outcome.ABORTED, text, joint, float(way[row]))
+        goal, self._goal = self._goal, None
+        if goal is not None:
+            goal.end(Outcome.ABORTED, text, joint, float(way[row]))
         return True
 
     def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
@@ -279,43 +338,53 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the trajectory's state at `time_ns`; hold when there is none."""
+        self._now_ns = time_ns
+        if self._spliced is not None:
+            self._splice(self._spliced, time_ns)
+        elapsed = self._sample(time_ns) if self._tracks.moving else 0.0
         if self._phase is _Phase.MOVING:
-            self._move(time_ns)
+            self._move(time_ns, elapsed)
         elif self._phase is _Phase.STOPPING:
             self._come_to_rest(time_ns)
         elif self._phase is _Phase.SETTLING:
             self._settle(time_ns)
         elif self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
-        if self._some_rest:
-            self._bring_others_to_rest(time_ns)
         self._command(period_ns)
 
-    def _move(self, time_ns: int) -> None:
-        elapsed = self._sample(time_ns)
-        if elapsed >= self._trajectory.duration_s:
+    def _splice(self, data: NDArray[np.float64], time_ns: int) -> None:
+        """Begin the trajectory that waits for its start, when that has come, from the state of then."""
+        if self._warped(time_ns) >= self._splice_s:
+            self._spliced = None
+            self._sample_at(self._splice_s, time_ns)
+            self._begin(data, time_ns, self._splice_s, waited_s=float(data[START_IN]))
+
+    def _move(self, time_ns: int, elapsed: float) -> None:
+        if self._spliced is None and elapsed >= self._trajectory.duration_s:
             self._phase, self._end_ns = _Phase.SETTLING, time_ns
-            self._close_in()
             self._settle(time_ns)
+        elif self._goal is None:
+            return
         elif self._checks_path and (row := self._worst(self._path_tolerance, silent=0.0)) >= 0:
             self._end(Outcome.ABORTED, time_ns, f"{self._off(row)}, stopping", row)
             self._stop_from(time_ns)
         elif time_ns - self._start_ns > self._timeout_ns:
             self._time_out(time_ns)
             self._stop_from(time_ns)
-        elif time_ns >= self._feedback_ns and self._goal is not None:
+        elif time_ns >= self._feedback_ns and self._spliced is None:
             self._feedback_ns = time_ns + FEEDBACK_NS
             self._measure(silent=0.0)
             self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
     def _sample(self, time_ns: int) -> float:
-        """Set the desired state by the trajectory; return how far it is, s."""
-        desired, elapsed = self._desired, self._warped(time_ns)
-        self._trajectory.sample(elapsed, desired)
-        desired.acceleration *= self._rate**2
-        desired.acceleration += desired.velocity * self._slope
-        desired.velocity *= self._rate
+        """Set the desired state of now; return how long the newest trajectory is played, s."""
+        elapsed = self._warped(time_ns) if self._tracks.playing else self._base_s
+        self._sample_at(elapsed, time_ns)
         return elapsed
+
+    def _sample_at(self, elapsed: float, time_ns: int) -> None:
+        self._tracks.sample(elapsed, self._rate, self._slope, (time_ns - self._stop_ns) * 1e-9)
+        self._moves = True
 
     def _warped(self, time_ns: int) -> float:
         """Return the trajectory's time, s: it goes at `speed`, toward which it changes with SPEED_SLOPE."""
@@ -355,28 +424,19 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _stop_from(self, time_ns: int) -> None:
         """Let all joints come to rest from their desired velocity."""
         self._know_where(time_ns)
-        self._some_rest = False
-        self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
-        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
+        self._brake(time_ns)
+        self._sample(time_ns)
         self._come_to_rest(time_ns)
 
-    def _come_to_rest(self, time_ns: int) -> None:
-        elapsed = (time_ns - self._stop_ns) * 1e-9
-        self._stop.sample(elapsed, self._desired)
-        if elapsed >= self._stop.duration_s:
-            self._phase = _Phase.RESTING
-            self._close_in()
-            self._end(Outcome.CANCELLED, time_ns)  # any other end came before the stop
+    def _brake(self, time_ns: int) -> None:
+        self._spliced = None
+        self._tracks.come_to_rest(self._limits)
+        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
 
-    def _bring_others_to_rest(self, time_ns: int) -> None:
-        """Set the desired state of the joints that the goal does not move."""
-        others, elapsed = self._others, (time_ns - self._stop_ns) * 1e-9
-        if not self._rest_still:
-            self._stop.sample(elapsed, others)
-            self._rest_still = elapsed >= self._stop.duration_s
-        np.copyto(self._desired.rows, others.rows, where=self._resting)
-        if self._rest_still and self._phase is _Phase.RESTING:
-            self._some_rest = False
+    def _come_to_rest(self, time_ns: int) -> None:
+        if not self._tracks.moving:
+            self._phase = _Phase.RESTING
+            self._end(Outcome.CANCELLED, time_ns)  # any other end came before the stop
 
     # Commands
 
@@ -390,14 +450,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return
         if not self._to_servos:
             np.copyto(commands.velocity, desired.velocity)
-        elif self._phase in (_Phase.MOVING, _Phase.STOPPING):
+        elif self._moves:
             np.abs(desired.velocity, out=commands.velocity)
-            if self._some_rest and self._rest_still:
-                np.copyto(commands.velocity, self._closing, where=self._resting)
-
-    def _close_in(self) -> None:
-        if self._interface == "posvel" and self._to_servos:
-            np.copyto(self.context.commands.velocity, self._closing)
+            np.copyto(commands.velocity, self._closing, where=self._tracks.still)
+        self._moves = False
 
     # How far off
 
@@ -405,8 +461,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """Set how far each joint of the goal is off, rad; `silent` for one without a reply."""
         states = self.context.states
         self._error = np.where(states.valid, np.abs(states.position - self._desired.position), silent)
-        if self._some_rest:
-            self._error[self._resting] = 0.0
+        np.copyto(self._error, 0.0, where=self._unmoved)
 
     def _worst(self, tolerance: Floats, silent: float) -> int:
         """Return the row of the joint that is farthest off of those beyond their tolerance; -1: none is."""

@@ -1,16 +1,18 @@
-"""Trajectories as they are commanded: points with times, and the flat array that the loop plays."""
+"""Trajectories and chunks of positions as they are commanded, and the flat arrays that the loop plays."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter
 
 from dxlrun import CommandModel, Duration, Floats
 from dxlrun_controllers.joints import check_size
-from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, flatten
+from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, flatten, smooth_velocities
 
+SPLICED: Final = 2.0
+"""Behind a flat trajectory, of the joints that it moves when it is spliced; else 1, and 0 of all others."""
 _DURATION: TypeAdapter[int] = TypeAdapter(Duration)
 
 
@@ -36,26 +38,65 @@ class TrajectoryPoint(CommandModel):
 
 
 class TrajectoryCommand(CommandModel):
-    """A trajectory: linear when only positions are given, cubic with velocities, quintic with accelerations.
+    """A trajectory: from point to point linear where only positions are given, cubic where both have
+    velocities, quintic where both have accelerations too.
 
-    What only some points give is not used. The joints go from where they are to the first point in
-    `start_in` and the first point's time; when both are 0, within a period. A goal for which that is too fast
-    is aborted.
+    The joints go from where they are to the first point in `start_in` and the first point's time; when both
+    are 0, within a period. A goal for which that is too fast is aborted.
     """
 
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
     start_in: Seconds = 0.0
     """s until the trajectory's start, from the moment at which the command is taken"""
     joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """The joints that the points name, in their order; left out: all. The others come to rest and hold."""
+    """The joints that the points name, in their order; left out: all. The others go on with what they do."""
     timeout: Annotated[Seconds, Field(gt=0)] | None = None
     """s after which the goal is missed if it was not reached, however slow it was made; left out: none"""
+    splice: bool = False
+    """For `start_in` the joints go on with the trajectory that they play, and leave it then with the
+    position, velocity and acceleration that they have."""
 
 
-def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...]) -> Floats:
-    """Return the command as a flat array: splines of all joints, time-out (s), and which joints it moves (1).
+class ChunkCommand(CommandModel):
+    """The next positions of a stream, such as those of a policy: they replace all that was to come.
 
-    Raises ValueError for a wrong size, unknown joints, or times that do not grow.
+    Where points have no velocities, all get some with which the way between two points stays between them.
+    The joints pass into the chunk from the state in which they are, and behind its end they come to rest.
+    """
+
+    points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
+    """Their times are those of the sender's clock, whichever it is, s; what is past is left out."""
+    now: float
+    """What the sender's clock shows when this is sent, s"""
+    joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """As of a trajectory"""
+    blend: Annotated[Seconds, Field(le=10)] = 0.1
+    """s in which the joints pass into the chunk, at least"""
+
+
+class ChunkHead(NamedTuple):
+    """What stands before the flat array of a chunk."""
+
+    now: float
+    blend: float
+
+
+def flat_chunk(command: ChunkCommand, joints: tuple[str, ...]) -> Floats:
+    """Return a chunk as a flat array: its head, and its trajectory with times from `now` on.
+
+    Raises ValueError as `flat_trajectory` does.
+    """
+    points = tuple(point.model_copy(update={"time": point.time - command.now}) for point in command.points)
+    whole = TrajectoryCommand.model_construct(points=points, start_in=0.0, joints=command.joints)
+    head = ChunkHead(command.now, command.blend)
+    return np.concatenate([head, flat_trajectory(whole, joints, smooth=True)])
+
+
+def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...], *, smooth: bool = False) -> Floats:
+    """Return the command as a flat array: splines of all joints, time-out (s), and which joints it moves.
+
+    `smooth`: velocities that not all points have are chosen. Raises ValueError for a wrong size, unknown
+    joints, or times that do not grow.
     """
     times = np.array([point.time for point in command.points])
     stalled = np.flatnonzero(np.diff(times) <= 0)
@@ -68,24 +109,27 @@ def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...]) -> Floa
     named = joints if command.joints is None else command.joints
     columns = _columns(named, joints)
     points = np.zeros((len(times), 3, len(joints)))
-    given = [True, True]
+    orders = []
     for index, point in enumerate(command.points):
         check_size(f"positions in point {index + 1}", len(point.positions), named)
         points[index, 0, columns] = point.positions
+        given = 1
         for derivative, (what, values) in enumerate(
-            (("velocities", point.velocities), ("accelerations", point.accelerations))
+            (("velocities", point.velocities), ("accelerations", point.accelerations)), 1
         ):
             if values is None:
-                given[derivative] = False
                 continue
             check_size(f"{what} in point {index + 1}", len(values), named)
-            points[index, derivative + 1, columns] = values
-    velocities, accelerations = given
-    order = LINEAR if not velocities else QUINTIC if accelerations else CUBIC
+            points[index, derivative, columns] = values
+            given += given == derivative
+        orders.append((LINEAR, CUBIC, QUINTIC)[given - 1])
+    if smooth and LINEAR in orders:
+        points[:, 1] = smooth_velocities(times, points[:, 0])
+        orders = [CUBIC] * len(times)
     moved = np.zeros(len(joints))
-    moved[columns] = 1.0
+    moved[columns] = SPLICED if command.splice else 1.0
     timeout = np.inf if command.timeout is None else command.timeout
-    return np.concatenate([flatten(order, times, points, command.start_in), [timeout], moved])
+    return np.concatenate([flatten(orders, times, points, command.start_in), [timeout], moved])
 
 
 def _columns(named: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:

@@ -260,14 +260,181 @@ def test_joints_that_a_goal_does_not_name_hold():
     assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.5))]  # of before
 
 
-def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_limit():
-    robot = moving(TWO | {"deceleration": {"a": "2 rad/s^2"}}, to=(1.3, 0.8), into=LOWER)
+def test_joints_that_a_goal_does_not_name_go_on_with_theirs_until_a_cancel_stops_all():
+    robot = moving(TWO | POSVEL | {"deceleration": "2 rad/s^2"}, to=(1.3, 0.8))
+    robot.update(0.4)
+    robot.send(0.5, "trajectory", joints=["b"], points=one(0.3, time=0.2))
+    np.testing.assert_allclose(robot.update(0.7), [1.0, 0.3])
+    assert robot.goal.ended == [(Outcome.REACHED, "after 0.200 s", "b", pytest.approx(0.1))]
+    np.testing.assert_allclose(robot.commands.velocity, [1.0, CLOSING_SPEED])
+    robot.send(0.8, "trajectory", joints=["b"], points=one(-0.7))
+    np.testing.assert_allclose(robot.update(0.9)[0], 1.2)
+    robot.cancel(0.9)
+    np.testing.assert_allclose(seen(robot, (1.0, 1.4, 3.0))[:, 0], [1.29, 1.45, 1.45])
+    assert outcomes(robot) == [Outcome.CANCELLED]
+
+
+ways = st.lists(
+    st.tuples(st.sampled_from("abc"), st.floats(0.05, 0.6), st.floats(-1, 1), st.booleans()), max_size=9
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(goals=ways, speed=st.sampled_from([1.0, 0.6]), gap=st.sampled_from([0.1, 0.23]))
+def test_each_joint_moves_as_if_its_goals_were_all_there_are(goals, speed, gap):
+    keys = POSVEL | {"speed": speed}
+    whole = started({"joints": list("abc")} | keys, into=LOWER)
+    alone = {joint: started({"joints": [joint]} | keys, into=LOWER, present=0.3) for joint in "ac"}
+    alone["b"] = started({"joints": ["b"]} | keys, into=LOWER, present=-0.2)
+    for index, (joint, time, to, splice) in enumerate(goals):
+        point = {"time": time, "positions": [to], "velocities": [0.5 * to]}
+        for robot in (whole, alone[joint]):
+            robot.send(index * gap, "trajectory", joints=[joint], points=[point], start_in=0.1 * splice)
+        for at in index * gap + np.linspace(0, gap, 4):
+            expected = [alone[name].update(at)[0] for name in "abc"]
+            np.testing.assert_allclose(whole.update(at), expected, atol=1e-9)
+            speeds = [alone[name].commands.velocity[0] for name in "abc"]
+            np.testing.assert_allclose(whole.commands.velocity, speeds, atol=1e-8)
+
+
+@pytest.mark.parametrize("joints", [["a"], ["a", "b"]])
+def test_a_spliced_trajectory_leaves_the_one_before_where_it_starts(joints):
+    robot = moving(TWO | POSVEL, to=(1.3, 0.8), into=LOWER)
+    robot.update(0.2)
+    to = [-0.4, 0.5][: len(joints)]
+    robot.send(0.2, "trajectory", joints=joints, points=one(*to, time=0.5), start_in=0.4, splice=True)
+    path, speed = observed(robot, 0.2, 1.5)
+    np.testing.assert_allclose(path[:400, 0], np.linspace(0.5, 0.9, 400, endpoint=False))
+    np.testing.assert_allclose(path[900], [-0.4, 0.5 if len(joints) == 2 else 0.8], atol=1e-9)
+    assert np.abs(np.diff(speed[:, 0])).max() < 0.1  # of a quintic: some 80 rad/s^2
+    assert outcomes(robot) == [Outcome.REACHED]
+    assert robot.goal.ended[0][1] == "after 0.900 s"
+
+
+def test_a_splice_where_nothing_is_played_begins_at_once_and_one_that_is_too_fast_stops():
+    robot = started(ONE, limits={"velocity": 2.0})
+    robot.send(0.0, "trajectory", points=one(1.3), start_in=1.0, splice=True)
+    np.testing.assert_allclose(seen(robot, (1.0, 2.0))[:, 0], [0.8, 1.3])
+    robot.send(2.0, "trajectory", points=one(0.3))
+    robot.send(2.1, "trajectory", points=one(1.3, time=0.1), start_in=0.4, splice=True)
+    np.testing.assert_allclose(seen(robot, (2.4, 2.5, 3.0))[:, 0], [0.9, 0.8, 0.8 - 1 / 2 / DECELERATION])
+    outcome, told, *_ = robot.goal.ended[0]
+    assert outcome is Outcome.ABORTED
+    assert told.startswith("joint a has 0.5 to go to the first point in 0.1 s, at 5 a second")
+
+
+def test_a_cancel_before_its_start_ends_a_spliced_trajectory():
+    robot = moving()
+    robot.send(0.2, "trajectory", points=one(-1.0), start_in=0.5, splice=True)
+    robot.update(0.4)
+    robot.cancel(0.4)
+    np.testing.assert_allclose(seen(robot, (0.6, 3.0))[:, 0], 0.7 + 1 / 2 / DECELERATION)
+    assert outcomes(robot) == [Outcome.CANCELLED]
+
+
+# Chunks
+
+
+def chunk(robot, at, times, positions, now=None, **more):
+    points = [
+        {"time": float(time), "positions": np.atleast_1d(row).tolist()}
+        for time, row in zip(times, positions, strict=True)
+    ]
+    robot.send(at, "chunk", points=points, now=at if now is None else now, **more)
+
+
+def wave(t):
+    return 0.3 + 0.4 * np.sin(2 * np.asarray(t))
+
+
+def test_chunks_of_a_policy_are_followed_smoothly_whenever_they_come():
+    random = np.random.default_rng(5)
+    robot = started(ONE | POSVEL, into=LOWER, limits={"velocity": 2.0})
+    begun = np.arange(0.0, 6.0, 0.3)
+    due = begun + random.uniform(0.01, 0.25, len(begun))
+    path, speed = [], []
+    for at in np.arange(1, 600) * 0.01:
+        while len(due) and due[0] <= at:
+            times = 100.0 + begun[0] + 0.05 * np.arange(20)  # some of it is past when it comes
+            chunk(robot, at, times, wave(times - 100.0), now=100.0 + at)
+            begun, due = begun[1:], due[1:]
+        path.append((at, robot.update(at)[0]))
+        speed.append(robot.commands.velocity[0])
+    times, found = np.array(path).T
+    assert np.abs(found - wave(times))[times > 0.5].max() < 0.01
+    assert np.abs(np.diff(speed))[60:].max() < 0.1
+    assert np.abs(speed).max() <= 2.0
+    assert np.abs(speed)[60:].max() < 1.0
+
+
+def test_points_that_are_past_are_left_out_and_a_chunk_that_is_past_changes_nothing():
+    robot = started(ONE)
+    chunk(robot, 5.0, [7.0, 7.8, 8.0], [0.5, 0.9, 0.9], now=7.5)  # the clock of its sender is 2.5 s ahead
+    np.testing.assert_allclose(seen(robot, (5.5, 6.0))[:, 0], 0.9)
+    late = {"now": 8.4, "blend": 0}  # by 0.1 s
+    chunk(robot, 6.0, [8.0, 9.5, 9.9, 10.0], [-9.0, 0.5, 0.6, 0.6], **late)
+    np.testing.assert_allclose(seen(robot, (7.0, 7.4, 7.5))[:, 0], [0.5, 0.6, 0.6])
+    chunk(robot, 8.0, [10.0, 10.4], [3.0, 3.0], now=10.4)
+    np.testing.assert_allclose(seen(robot, (8.0, 9.0))[:, 0], 0.6)
+
+
+def test_behind_its_end_a_chunk_brings_its_joints_to_rest_inside_of_their_limits():
+    limits = {"upper": [1.4, 9.0]}
+    robot = started(TWO | POSVEL | {"deceleration": "2 rad/s^2"}, into=LOWER, limits=limits, present=0.0)
+    times = np.linspace(0, 1, 11)
+    chunk(robot, 0.0, times, np.column_stack([times, times]))
+    path, speed = observed(robot, 0.0, 3.0)
+    np.testing.assert_allclose(path[1000], [1.0, 1.0])
+    np.testing.assert_allclose(path[-1], [1.25, 1.25])
+    np.testing.assert_allclose(speed[[1000, 1250, -1], 0], [1.0, 0.5, 0.0], atol=1e-9)
+    assert (np.abs(np.diff(speed[1000:], axis=0)) < 2.1e-3).all()
+    chunk(robot, 4.0, 4 + times[:2], [[1.3, 1.3], [1.39, 1.3]])
+    path, _ = observed(robot, 4.0, 3.0)
+    assert path.max() <= 1.4 + 1e-9
+
+
+def test_the_way_into_a_chunk_is_no_faster_than_the_joint_may_go():
+    robot = started(ONE | POSVEL, into=LOWER, limits={"velocity": 1.5}, present=0.0)
+    chunk(robot, 0.0, [0.0, 0.1, 5.0], [2.0, 2.0, 2.0])
+    path, speed = observed(robot, 0.0, 5.0)
+    assert 1.4 < speed.max() <= 1.5 + 1e-9
+    np.testing.assert_allclose(path[[2600, -1], 0], 2.0)
+    chunk(robot, 6.0, [6.1, 6.2], [0.0, 0.0])  # that is over before the joint can be there
+    path, speed = observed(robot, 6.0, 3.0)
+    assert np.abs(speed).max() <= 1.5 + 1e-9
+    np.testing.assert_allclose(path[-1], 0.0)
+
+
+def test_a_chunk_takes_the_place_of_a_goal_for_its_joints_and_a_goal_that_of_a_chunk():
+    robot = moving(TWO, to=(1.3, 0.8))
     robot.update(0.5)
-    robot.send(0.5, "trajectory", joints=["b"], points=one(0.8, time=0.2))
-    path = seen(robot, 0.5 + np.arange(1000) * 1e-3)[:, 0]
-    t = np.minimum(np.arange(1000) * 1e-3, 0.5)
-    np.testing.assert_allclose(path, 0.8 + t - t**2)
-    np.testing.assert_allclose(robot.update(3.0), [1.05, 0.8])
+    chunk(robot, 0.5, [0.7, 0.8], [0.3, 0.3], joints=["b"])
+    told = "after 0.500 s, a chunk of positions took its place"
+    assert robot.goal.ended == [(Outcome.PREEMPTED, told, "a", pytest.approx(0, abs=1e-9))]
+    np.testing.assert_allclose(seen(robot, (0.8, 1.0, 2.0)), [[1.1, 0.3], [1.3, 0.3], [1.3, 0.3]])
+    chunk(robot, 2.0, [3.0], [[0.0, 0.0]])
+    robot.send(2.5, "trajectory", points=one(1.0, 1.0))
+    np.testing.assert_allclose(robot.update(3.5), [1.0, 1.0])
+    assert outcomes(robot) == [Outcome.REACHED]
+
+
+def test_after_the_joints_were_held_a_chunk_begins_where_they_are():
+    robot = started(ONE | POSVEL, into=LOWER)
+    chunk(robot, 0.0, [1.0, 9.0], [1.3, 9.3])
+    held = robot.update(0.5)
+    chunk(robot, 2.0, [2.5, 3.0], [0.0, 0.0], now=2.2)  # as no chunk came it was not updated for 1.5 s
+    np.testing.assert_allclose(robot.update(2.0), held)
+    assert robot.commands.velocity[0] == 0.0
+    np.testing.assert_allclose(robot.update(3.0), 0.0, atol=1e-9)
+
+
+def test_a_chunk_for_a_joint_that_never_answered_is_left_out():
+    robot = Stage(JointTrajectoryController, TWO)
+    robot.sent.position[1] = robot.states.position[1] = np.nan
+    robot.activate()
+    chunk(robot, 0.0, [0.5], [[1.0, 1.0]])
+    assert np.isnan(robot.update(0.5, follow=False)[1])
+    np.testing.assert_allclose(robot.update(0.6, follow=False)[0], 0.3)
 
 
 def test_only_joints_of_the_goal_are_judged():

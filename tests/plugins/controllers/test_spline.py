@@ -14,6 +14,7 @@ from dxlrun_controllers.laws.spline import (
     Trajectory,
     evaluate,
     flatten,
+    smooth_velocities,
     solve,
 )
 
@@ -55,9 +56,26 @@ def test_a_cubic_piece_is_scipys(start, end, duration, share):
     assert found.acceleration[0] == pytest.approx(float(theirs(at, 2)), abs=1e-10 * scale / duration**2)
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    gaps=st.lists(st.floats(0.01, 1), min_size=1, max_size=8),
+    heights=st.lists(st.integers(-9, 9), min_size=9, max_size=9),
+)
+def test_smooth_velocities_are_those_of_scipys_pchip_interpolator(gaps, heights):
+    from scipy.interpolate import PchipInterpolator
+
+    times = np.cumsum([0.0, *gaps])
+    positions = np.array(heights[: len(times)], dtype=float)[:, None]
+    theirs = PchipInterpolator(times, positions)(times, 1)
+    scale = max(1.0, float(np.abs(theirs).max()))
+    np.testing.assert_allclose(smooth_velocities(times, positions), theirs, atol=1e-9 * scale)
+
+
 def loaded(order, times, points, start_in=0.0, now=None):
     trajectory = Trajectory(points.shape[2])
-    trajectory.load(flatten(order, times, points, start_in), now or SplineSample(points.shape[2]))
+    trajectory.load(
+        flatten([order] * len(times), times, points, start_in), now or SplineSample(points.shape[2])
+    )
     return trajectory
 
 
@@ -86,6 +104,16 @@ def test_a_whole_trajectory_is_scipys_between_its_points(order):
     np.testing.assert_allclose(found[:, 0], theirs, atol=1e-12)
 
 
+def test_each_piece_is_by_what_both_its_points_give():
+    times, points = np.array([0.0, 1.0, 2.0, 3.0]), np.zeros((4, 3, 1))
+    points[:, 0, 0] = 0.0, 1.0, 2.0, 0.0
+    points[2:, 1, 0] = 0.5, 0.0
+    trajectory = Trajectory(1)
+    trajectory.load(flatten([LINEAR, LINEAR, CUBIC, CUBIC], times, points, 0.0), SplineSample(1))
+    found = sampled(trajectory, [0.5, 1.5, 2.0, 2.5], 1)[:, :2, 0]
+    np.testing.assert_allclose(found, [[0.5, 1.0], [1.5, 1.0], [2.0, 0.5], [1.0625, -3.125]])
+
+
 @pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
 @pytest.mark.parametrize("start_in", [0.0, 0.7])
 def test_the_bridge_leads_from_now_to_the_first_point(order, start_in):
@@ -112,7 +140,7 @@ def test_a_trajectory_that_is_loaded_over_another_begins_with_its_own_pieces():
     times, played = np.array([0.0, 1.0, 2.0]), Trajectory(1)
     for height in (1.0, 5.0):
         points = height * np.array([[[0.0], [0.0], [0.0]], [[1.0], [0.0], [0.0]], [[3.0], [0.0], [0.0]]])
-        played.load(flatten(LINEAR, times, points, 0.0), SplineSample(1))
+        played.load(flatten([LINEAR] * 3, times, points, 0.0), SplineSample(1))
         assert sampled(played, [0.5], 1)[0, 0, 0] == height / 2
 
 
