@@ -33,7 +33,7 @@ from dxlrun.channels.mailbox import Mailbox, MailboxWriter
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RingWriter, create
 from dxlrun.clock import MonotonicClock
-from dxlrun.compile.simulation import simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
@@ -84,7 +84,7 @@ def simulated(plan: Plan) -> Iterator[list[SerialPort]]:
     """Run the simulated servos of a plan, and open their lines."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        SimulatedServos(simulated_buses(plan), -1, Path(folder, "ledger.jsonl")) as servos,
+        SimulatedServos(simulation_of(plan).buses, -1, Path(folder, "ledger.jsonl")) as servos,
     ):
         descriptors = [os.open(path, os.O_RDWR | os.O_NOCTTY) for path in servos.ports]
         for descriptor in descriptors:

@@ -12,7 +12,7 @@ from tests.kit.robots import compile_text, problems_in
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.cli.app import run_tokens
-from dxlrun.compile.simulation import simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError
@@ -89,7 +89,7 @@ def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo() -> None:
     assert from_json(to_json(plan)) == plan
     assert [joint.motor for joint in plan.loop.joints] == [MOTOR, None]
     assert plan.included == {"shoulder.yaml": motor_text(MOTOR, {})}
-    shoulder, elbow = simulated_buses(plan)[0].servos
+    shoulder, elbow = simulation_of(plan).buses[0].servos
     assert shoulder.motor == MOTOR
     # the joint's 0.5 rad are the servo's 180 deg - 0.5 rad
     assert shoulder.load == Load(0.004, 0.0, 0.2, pytest.approx(math.pi - 0.5))

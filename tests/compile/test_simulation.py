@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
@@ -40,7 +40,7 @@ def test_what_a_servo_moves_reaches_the_simulated_servo() -> None:
     text = _joint(
         SIMULATED, "{inertia: 0.01 kg m^2, friction: 50 mNm, gravity: 0.3 Nm, gravity_angle: 90 deg}"
     )
-    (bus,) = simulated_buses(compile_text(text).plan)
+    (bus,) = simulation_of(compile_text(text).plan).buses
     # the joint's +90 deg are the servo's 60 deg - 90 deg
     assert bus.servos[0].load == Load(0.01, 0.05, 0.3, pytest.approx(math.radians(-30)))
     assert bus.servos[1].load == Load()
@@ -48,13 +48,13 @@ def test_what_a_servo_moves_reaches_the_simulated_servo() -> None:
 
 def test_how_slow_a_servo_is_reaches_the_simulated_servo() -> None:
     plan = compile_text(_joint(SIMULATED, "{response_delay: 20 ms, write_time: 1 ms}")).plan
-    (bus,) = simulated_buses(from_json(to_json(plan)))
+    (bus,) = simulation_of(from_json(to_json(plan))).buses
     assert bus.servos[0].times == ServoTimes(20_000_000, 1_000_000)
     assert bus.servos[1].times == ServoTimes()
 
 
 def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said() -> None:
-    (bus,) = simulated_buses(compile_text(_joint(SIMULATED, "{gravity: 0.3 Nm}")).plan)
+    (bus,) = simulation_of(compile_text(_joint(SIMULATED, "{gravity: 0.3 Nm}")).plan).buses
     assert bus.servos[0].load == Load(gravity=0.3, gravity_angle=pytest.approx(math.radians(60)))
 
 
@@ -62,7 +62,7 @@ def test_a_load_is_felt_through_the_ratio_of_its_joint() -> None:
     told = "{inertia: 0.02 kg m^2, friction: 50 mNm, gravity: 0.4 Nm, gravity_angle: 30 deg}"
     plan = compile_text(_joint(SIMULATED, told)).plan
     geared = replace(plan.buses[0].servos[0], ratio=0.25)
-    (bus,) = simulated_buses(replace(plan, buses=(replace(plan.buses[0], servos=(geared,)),)))
+    (bus,) = simulation_of(replace(plan, buses=(replace(plan.buses[0], servos=(geared,)),))).buses
     # direction is -1: 30 deg of the joint are 120 deg of the servo, on the other side of its 60 deg
     down = pytest.approx(math.radians(60 - 120))
     assert bus.servos[0].load == Load(0.02 / 16, 0.0125, 0.1, down, turns=0.25)
@@ -78,7 +78,7 @@ def test_a_linear_joint_has_a_mass_and_forces() -> None:
     plan = compile_text(slide).plan
     assert plan.simulation.loads["left_arm_joint"] == Load(0.2, 2.0, steady=1.5)
     ratio = 0.0628 / math.tau
-    (bus,) = simulated_buses(plan)
+    (bus,) = simulation_of(plan).buses
     expected = Load(
         pytest.approx(0.2 * ratio**2), pytest.approx(2 * ratio), steady=pytest.approx(-1.5 * ratio)
     )
@@ -110,7 +110,7 @@ def test_servos_that_share_joints_are_simulated_together() -> None:
 
 def test_how_the_adapter_behaves_reaches_the_simulated_bus() -> None:
     plan = compile_text(_bus(SIMULATED, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
-    (bus,) = simulated_buses(plan)
+    (bus,) = simulation_of(plan).buses
     assert bus.adapter == AdapterConfig(latency_timer_ns=4_000_000, split="byte", echo=True)
     assert bus.adapter.absent == "silent"
 
@@ -128,7 +128,7 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(monkeypatch: pytest.Mon
     compiled = compile_text(_joint(told, "{gravity: 90 Nm}") + "simulation: {physics: mujoco}\n")
     (bus,) = compiled.plan.buses
     assert bus.latency_ns == 1_000_000
-    assert simulated_buses(compiled.plan) == ()
+    assert not compiled.plan.simulated
     assert [each.what for each in compiled.warnings if "physics: mujoco" in each.what] == [
         "with physics: mujoco the URDF defines the gravity of left_arm_joint",
         "physics: mujoco moves the bodies of a URDF, and the file names none",
@@ -170,7 +170,7 @@ def _with_bodies(text: str, urdf: str = URDF) -> str:
 
 
 def test_without_a_word_each_joint_moves_by_itself() -> None:
-    assert simulated_bodies(compile_text(SIMULATED).plan) is None
+    assert simulation_of(compile_text(SIMULATED).plan).bodies is None
 
 
 def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
@@ -178,8 +178,8 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
     two = SIMULATED.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
     two = two.replace("bus: main\n    id: 1", "bus: second\n    id: 1", 1)
     plan = compile_text(_with_bodies(two)).plan
-    assert [each.servo_id for bus in simulated_buses(plan) for each in bus.servos] == [2, 1]
-    assert simulated_bodies(plan) == UrdfBodies(
+    assert [each.servo_id for bus in simulation_of(plan).buses for each in bus.servos] == [2, 1]
+    assert simulation_of(plan).bodies == UrdfBodies(
         URDF,
         (
             UrdfJoint("right_arm_joint", pytest.approx(math.radians(240)), 1),
@@ -193,13 +193,13 @@ def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
         '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'
     )
     with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
-        simulated_bodies(compile_text(_with_bodies(SIMULATED, loose)).plan)
+        simulation_of(compile_text(_with_bodies(SIMULATED, loose)).plan)
 
 
 def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all() -> None:
     plan = compile_text(PAIR + "simulation: {physics: mujoco}\n").plan
     with pytest.raises(InputError, match=r"the file names none; write `model: \{urdf: \.\.\.\}`"):
-        simulated_bodies(plan)
+        simulation_of(plan)
 
 
 def test_with_mujoco_the_urdf_says_what_a_joint_moves() -> None:

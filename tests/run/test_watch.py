@@ -21,7 +21,7 @@ from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.compile.robot import compile_robot
-from dxlrun.compile.simulation import simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.exchange import bus
@@ -246,7 +246,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
         pulse()
 
     clock, ledger = VirtualClock(), Ledger()
-    buses = [SimulatedBus(config, ledger, 0) for config in simulated_buses(plan)]
+    buses = [SimulatedBus(config, ledger, 0) for config in simulation_of(plan).buses]
     events = EventRing(Handover(lambda kind, payload: None), clock)
     hardware = DynamixelHardware(
         plan.buses,

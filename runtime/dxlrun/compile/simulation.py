@@ -221,63 +221,49 @@ def _check_physics(file: RobotFile) -> None:
 
 
 def simulation_of(plan: Plan) -> SimulationConfig:
-    """Return the simulated lines of a plan, and what their servos move together.
+    """Return the simulated lines of a plan, each servo at its reference (q = 0), and what they move together.
 
     Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
     user sees it, and not in the process of the simulated buses.
     """
-    on_links = plan.urdf is not None and any(one.link for one in plan.simulation.devices.values())
+    sensed, bodies = _bodies(plan), None
+    if plan.simulation.physics != "independent":
+        if sensed is None:
+            raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+        from dxlrun.simulation.motion.mechanics import plant_of  # not above: no check needs it
+
+        bodies = sensed.bodies
+        plant_of(bodies, sensed.couplings)
     return SimulationConfig(
-        simulated_buses(plan),
-        bodies=simulated_bodies(plan),
-        couplings=simulated_couplings(plan),
-        sensed=_sensed_bodies(plan) if on_links else None,
+        tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED),
+        bodies=bodies,
+        couplings=_couplings(plan),
+        sensed=sensed if any(one.link for one in plan.simulation.devices.values()) else None,
     )
-
-
-def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
-    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
-    return tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED)
-
-
-def simulated_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies that the servos of `simulated_buses` move; None: no bodies. Raises InputError."""
-    if plan.simulation.physics == "independent":
-        return None
-    if plan.urdf is None:
-        raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
-    bodies = _bodies(plan, plan.urdf)
-    from dxlrun.simulation.motion.mechanics import plant_of  # not above: no check needs it
-
-    plant_of(bodies, simulated_couplings(plan))
-    return bodies
 
 
 def sensed_bodies(plan: Plan) -> SensedBodies | None:
     """Return the bodies whose motion simulated sensors sense, whatever moves them; None: none does."""
-    return _sensed_bodies(plan) if any(one.links for one in plan.loop.sensors) else None
+    return _bodies(plan) if any(one.links for one in plan.loop.sensors) else None
 
 
-def _sensed_bodies(plan: Plan) -> SensedBodies | None:
-    """Return the bodies of the robot's URDF; None: it has none."""
+def _bodies(plan: Plan) -> SensedBodies | None:
+    """Return the bodies of the robot's URDF, and how simulated servos move them; None: it has none."""
     if plan.urdf is None:
         return None
-    return SensedBodies(_bodies(plan, plan.urdf), simulated_couplings(plan))
-
-
-def _bodies(plan: Plan, urdf: str) -> UrdfBodies:
-    coupled = {servo.index for one in simulated_couplings(plan) for servo in one.servos}
+    couplings = _couplings(plan)
+    coupled = {servo.index for one in couplings for servo in one.servos}
     joints = (
         None
         if index in coupled
         else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, servo.linear)
         for index, servo in enumerate(_simulated_servos(plan))
     )
-    return UrdfBodies(urdf, tuple(joints))
+    return SensedBodies(UrdfBodies(plan.urdf, tuple(joints)), couplings)
 
 
-def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:
-    """Return which of the servos of `simulated_buses` share joints.
+def _couplings(plan: Plan) -> tuple[Coupling, ...]:
+    """Return which of the simulated servos share joints.
 
     One with a servo on a real port is left out: what that one does cannot be simulated.
     """
@@ -305,7 +291,7 @@ def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:
 
 
 def _simulated_servos(plan: Plan) -> list[ServoPlan]:
-    """Return the servos of `simulated_buses`, in the order in which they are added to a simulation."""
+    """Return the simulated servos, in the order in which they are added to a simulation."""
     return [servo for bus in plan.buses if bus.port == SIMULATED for servo in bus.servos]
 
 

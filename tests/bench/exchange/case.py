@@ -9,7 +9,7 @@ from pathlib import Path
 from msgspec import structs
 
 from dxlrun.compile.robot import compile_robot
-from dxlrun.compile.simulation import simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.description.reading import Description, read_robot
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.plan.simulation_plan import BusConfig
@@ -50,7 +50,7 @@ class Case:
 
     def simulated(self, name: str) -> BusConfig:
         """Return the bus with its servos, for a simulation, under a name."""
-        (bus,) = simulated_buses(self.plan(wire=True))
+        (bus,) = simulation_of(self.plan(wire=True)).buses
         return structs.replace(bus, name=name)
 
     def robot_file(self) -> str:

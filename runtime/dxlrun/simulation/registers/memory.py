@@ -65,23 +65,20 @@ class Memory:
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
         """Set every item but those of `keep` to its initial value, and those without one to 0."""
-        for item in self.table.items.values():
-            if item.name not in keep:
-                self[item.name] = self._initial(item)
+        self.reset(name for name in self.table.items if name not in keep)
         self["model_number"] = self.table.model_number
         self["firmware_version"] = self.firmware
 
     def restore_ram(self) -> None:
         """Set the items of the RAM area to what they are at power-up; the EEPROM area stays."""
-        for item in self.table.items.values():
-            if item.area == "RAM":
-                self[item.name] = self._initial(item)
+        self.reset(name for name, item in self.table.items.items() if item.area == "RAM")
 
     def reset(self, names: Iterable[str]) -> None:
         """Set some items to their initial values, those of them that the model has."""
         for name in names:
             if (item := self.table.items.get(name)) is not None:
-                self[name] = self._initial(item)
+                initial = max(0, item.minimum) if item.access == "RW" else 0
+                self[name] = initial if item.initial is None else item.initial
 
     def __contains__(self, name: str) -> bool:
         return name in self._values
@@ -242,12 +239,6 @@ class Memory:
             self._values.update(run.after)
         if not self._watchers.keys().isdisjoint(run.after):
             self._notify(run.after)
-
-    @staticmethod
-    def _initial(item: ControlItem) -> int:
-        if item.initial is not None:
-            return item.initial
-        return max(0, item.minimum) if item.access == "RW" else 0
 
 
 def signed(item: ControlItem, wire: int) -> int:

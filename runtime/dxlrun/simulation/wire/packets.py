@@ -83,6 +83,17 @@ ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
 """The writes of a list for each ID: place in the list, ID, address, data."""
 
 
+def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None:
+    """Return the writes of a sync write, whose list has ID and data of each; None: it has another form."""
+    if length == 0 or len(listed) % (length + 1):
+        return None
+    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
+    for start in range(0, len(listed), length + 1):
+        servo_id, data = listed[start], listed[start + 1 : start + 1 + length]
+        writes.setdefault(servo_id, []).append((start, servo_id, address, data))
+    return writes
+
+
 class Codec(NamedTuple):
     """A protocol's bytes: `protocol1.CODEC` and `protocol2.CODEC`; functions return None for a wrong form."""
 

@@ -12,6 +12,7 @@ from dxlrun.simulation.wire.packets import (
     InstructionPacket,
     ListedWrites,
     ReadEntry,
+    sync_writes,
 )
 
 HEADER = b"\xff\xff"
@@ -59,14 +60,7 @@ def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
     parameters = packet.parameters
     if packet.instruction != Instruction.SYNC_WRITE or len(parameters) < 2:
         return None
-    address, length = parameters[:2]
-    if not length or (len(parameters) - 2) % (length + 1):
-        return None
-    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
-    for start in range(2, len(parameters), length + 1):
-        servo_id, data = parameters[start], parameters[start + 1 : start + 1 + length]
-        writes.setdefault(servo_id, []).append((start, servo_id, address, data))
-    return writes
+    return sync_writes(parameters[2:], *parameters[:2])
 
 
 def _packet(data: bytes, end: int) -> InstructionPacket:

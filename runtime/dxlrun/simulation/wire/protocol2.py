@@ -19,6 +19,7 @@ from dxlrun.simulation.wire.packets import (
     ListedWrites,
     ReadEntry,
     ServoReply,
+    sync_writes,
 )
 
 HEADER = b"\xff\xff\xfd"
@@ -148,14 +149,8 @@ def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
 
 @lru_cache(maxsize=1)  # each servo of a line looks itself up
 def _sync_writes(parameters: bytes) -> ListedWrites | None:
-    address, length = _word(parameters, 0), _word(parameters, 2)
-    if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
-        return None
-    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
-    for start in range(4, len(parameters), length + 1):
-        servo_id, data = parameters[start], parameters[start + 1 : start + 1 + length]
-        writes.setdefault(servo_id, []).append((start, servo_id, address, data))
-    return writes
+    listed = parameters[4:]
+    return sync_writes(listed, _word(parameters, 0), _word(parameters, 2)) if listed else None
 
 
 @lru_cache(maxsize=1)
