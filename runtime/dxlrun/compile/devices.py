@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.joints.described_servos import described_servos
+from dxlrun.compile.joints.servos import check_bus
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
@@ -110,13 +112,7 @@ def check_source_names(
 def _check_place(file: RobotFile, name: str, device: Device) -> None:
     """Check bus and ID."""
     robot, marks = file.robot, file.marks
-    if device.bus not in robot.buses:
-        what = f"{name} is on bus {device.bus}, which is not defined"
-        file.error(marks.value("devices", name, "bus"), what, suggestion(device.bus, tuple(robot.buses)))
-    elif device.id > robot.buses[device.bus].highest_id:
-        what = f"ID {device.id} of {name} is not valid in Protocol 2.0"
-        fix = f"give it one from 0 to {robot.buses[device.bus].highest_id}"
-        file.error(marks.value("devices", name, "id"), what, fix)
+    check_bus(file, device, name, partial(marks.value, "devices", name), "ID")
     others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}
     for each, other in robot.devices.items():
         if each == name:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import msgspec
 
 from dxlrun.compile.graph import ControllerGraph
+from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.plan.bus_plan import BusPlan, DevicePlan, ServoPlan
@@ -68,11 +69,7 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
     unit, mode = joint.table.effort_unit, servos[first.name].start_mode.name
     return {
         "name": plan.name,
-        "bus": first.bus,
-        "id": first.id,
-        "model": first.model,
-        "reference": first.reference,
-        "direction": first.direction,
+        **_described(first),
         "lower": plan.lower,
         "upper": plan.upper,
         "position_source": _source(limits.position, plan.bounded),
@@ -86,7 +83,6 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
         "reach_upper": joint.reach.upper,
         "bounded": plan.bounded,
         "mode": mode.lower().replace("_", " ") + ("" if joint.described.torque else ", limp"),
-        "motor": first.motor,
         "linear": plan.linear,
         "servos": [_servo(servo, servos[servo.described.name]) for servo in joint.servos],
     }
@@ -96,19 +92,18 @@ def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:
     described = servo.described
     return {
         "joint": described.title,
-        "bus": described.bus,
-        "id": described.id,
-        "model": described.model,
-        "reference": described.reference,
-        "direction": described.direction,
+        **_described(described),
         "ratio": described.ratio,
         "linear": described.linear,
         "lower_tick": plan.lower_tick,
         "upper_tick": plan.upper_tick,
         "lower": plan.lower_tick * plan.rad_per_tick,
         "upper": plan.upper_tick * plan.rad_per_tick,
-        "motor": described.motor,
     }
+
+
+def _described(servo: DescribedServo) -> Row:
+    return {name: getattr(servo, name) for name in ("bus", "id", "model", "reference", "direction", "motor")}
 
 
 def _sensor(sensor: SensorPlan) -> Row:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from types import EllipsisType
 from typing import Annotated, TypeVar, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
 
 T = TypeVar("T")
@@ -68,12 +67,20 @@ def key(
     return field
 
 
-def with_parameters(entry: object, common: Collection[str]) -> object:
-    """Return an entry of a plug-in's type with all but the keys that each type has under `parameters`."""
-    if not isinstance(entry, dict):
-        return entry
-    own = {key: value for key, value in entry.items() if key in common}
-    return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
+class PlugInEntry(Form):
+    """An entry of a plug-in's type: the keys beside those that each type has are the type's parameters."""
+
+    parameters: dict[str, object] = Field(
+        default={}, description="All other keys of the entry; its type says which there are."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_parameters(cls, entry: object) -> object:
+        if not isinstance(entry, dict):
+            return entry
+        own = {key: value for key, value in entry.items() if key in cls.model_fields and key != "parameters"}
+        return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
 
 
 class ParametersModel(BaseModel):

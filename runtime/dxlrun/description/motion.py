@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import msgspec
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
-from dxlrun.description.problems import problems_of
+from dxlrun.description.problems import read_form
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
-from dxlrun.errors import InputError
 
 
 def _expression(value: object) -> object:
@@ -129,12 +128,4 @@ def motion_of(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescri
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
         fix = f"run it with `dxlrun {path}`, and give --play a motion file"
         raise refusal(grown.marks.value(), "this is a robot file, and no motion", fix)
-    problems = [*grown.problems]
-    try:
-        motion = Motion.model_validate(grown.data)
-    except ValidationError as error:
-        problems += problems_of(error, grown.marks, model=Motion, unknown=grown.unknown)
-        raise InputError(sorted(problems, key=lambda problem: problem.mark)) from None
-    if problems:
-        raise InputError(sorted(problems, key=lambda problem: problem.mark))
-    return MotionDescription(motion, grown.marks, path, text)
+    return MotionDescription(read_form(grown, Motion), grown.marks, path, text)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from types import UnionType
-from typing import Annotated, Union, get_args, get_origin
+from typing import Annotated, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-from dxlrun.description.document import KeyPath, Marks, plain_value, text_of
-from dxlrun.errors import Mark, Problem, suggestion
+from dxlrun.description.document import Grown, KeyPath, Marks, plain_value, text_of
+from dxlrun.errors import InputError, Mark, Problem, suggestion
+
+Form = TypeVar("Form", bound=BaseModel)
 
 
 def problems_of(
@@ -43,6 +45,18 @@ def _problems(
             found.setdefault(error.path, []).append(error)
     problems = [_merged(errors, marks) for errors in found.values()]
     return sorted(problems, key=lambda problem: problem.mark)
+
+
+def read_form(grown: Grown, model: type[Form]) -> Form:
+    """Return what a document says; raises InputError with all problems of its form."""
+    problems, form = [*grown.problems], None
+    try:
+        form = model.model_validate(grown.data)
+    except ValidationError as error:
+        problems += problems_of(error, grown.marks, model=model, unknown=grown.unknown)
+    if form is None or problems:
+        raise InputError(sorted(problems, key=lambda problem: problem.mark))
+    return form
 
 
 def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:

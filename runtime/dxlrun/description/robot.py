@@ -12,13 +12,12 @@ from pydantic import (
     Field,
     Tag,
     WithJsonSchema,
-    model_validator,
 )
 
 from dxlrun.description import units
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
-from dxlrun.description.form import Form, Name, key, refuse, with_parameters
+from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse
 from dxlrun.description.joints.joints import JointEntry
 from dxlrun.description.joints.mechanics import (
     Transmission,
@@ -179,10 +178,9 @@ class Policies(Form):
 
 
 _ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "items": {"type": "string"}}]}
-_COMMON_KEYS = ("type", "active", "rate", "fallback", "into")
 
 
-class ControllerEntry(Form):
+class ControllerEntry(PlugInEntry):
     """One controller; the keys beside type, active, rate, fallback and into are its own parameters."""
 
     type: str = key("Type that a plug-in offers.", "joint_group_position_controller", min_length=1)
@@ -198,14 +196,6 @@ class ControllerEntry(Form):
         "arm_pid",
         (),
     )
-    parameters: dict[str, object] = Field(
-        default={}, description="All other keys of the entry; the controller's type says which there are."
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _gather_parameters(cls, entry: object) -> object:
-        return with_parameters(entry, _COMMON_KEYS)
 
 
 class Recording(Form):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dxlrun.description import units
-from dxlrun.description.form import Form, key, with_parameters
+from dxlrun.description.form import PlugInEntry, key
 from dxlrun.description.units import Duration
 
-_COMMON_KEYS = ("type", "rate", "timeout", "on_lost")
 
-
-class SensorEntry(Form):
+class SensorEntry(PlugInEntry):
     """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
 
     type: str = key("Type that a plug-in offers.", "serial_imu", min_length=1)
@@ -26,11 +24,3 @@ class SensorEntry(Form):
     on_lost: Literal["continue", "stop"] = key(
         "When it brings nothing for that time; stop: the run ends by the policy on_fault.", "stop", "continue"
     )
-    parameters: dict[str, object] = Field(
-        default={}, description="All other keys of the entry; the sensor's type says which there are."
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _gather_parameters(cls, entry: object) -> object:
-        return with_parameters(entry, _COMMON_KEYS)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import msgspec
 
@@ -12,11 +13,12 @@ from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import RobotFile
+from dxlrun.description.devices import Device
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlrun.dynamixel.plan.mode_plan import mode_plans
-from dxlrun.errors import suggestion
+from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.bus_plan import RegisterValue
 
 AUTO = "auto"  # In place of a model: it is read from the servo
@@ -90,7 +92,7 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
     _unique_ids(file, described)
     compiled: dict[str, CompiledServo] = {}
     for servo in described:
-        known_bus = _known_bus(file, servo)
+        known_bus = check_bus(file, servo, servo.title, partial(servo.mark, file.marks), "servo ID")
         model = servo.model if servo.model != AUTO else models.get(servo.name)
         if model is None:
             model = _assumed_model(file, servo, described)
@@ -124,22 +126,18 @@ def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
             )
 
 
-def _known_bus(file: RobotFile, servo: DescribedServo) -> bool:
-    buses = file.robot.buses
-    if servo.bus in buses:
-        if servo.id > buses[servo.bus].highest_id:
-            file.error(
-                servo.mark(file.marks, "id"),
-                f"servo ID {servo.id} of {servo.title} is not valid in Protocol 2.0",
-                f"give it one from 0 to {buses[servo.bus].highest_id}",
-            )
-        return True
-    file.error(
-        servo.mark(file.marks, "bus"),
-        f"{servo.title} is on bus {servo.bus}, which is not defined",
-        suggestion(servo.bus, tuple(buses)),
-    )
-    return False
+def check_bus(
+    file: RobotFile, one: DescribedServo | Device, name: str, at: Callable[[str], Mark], called: str
+) -> bool:
+    """Check bus and ID of a servo or a device; return whether the bus is defined. `at`: places of keys."""
+    bus = file.robot.buses.get(one.bus)
+    if bus is None:
+        what = f"{name} is on bus {one.bus}, which is not defined"
+        file.error(at("bus"), what, suggestion(one.bus, tuple(file.robot.buses)))
+    elif one.id > bus.highest_id:
+        what = f"{called} {one.id} of {name} is not valid in Protocol 2.0"
+        file.error(at("id"), what, f"give it one from 0 to {bus.highest_id}")
+    return bus is not None
 
 
 def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:

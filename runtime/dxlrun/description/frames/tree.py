@@ -23,7 +23,7 @@ from dxlrun.description.frames.transform import (
     turn,
     unit,
 )
-from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint, read_urdf
+from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
 ODOM = "odom"  # The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)
@@ -95,9 +95,7 @@ class FrameTree:
             return "fixed"
         if joint.name in self.moved:
             return "servo"
-        while joint.name not in self.moved and joint.mimic is not None:
-            joint = self._joints[joint.mimic.joint]
-        return "mimic" if joint.name in self.moved else "nothing"
+        return "mimic" if leader(self._joints, joint, self.moved)[0].name in self.moved else "nothing"
 
     def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
         """Return the frames with the one that the IMU turns."""
@@ -119,11 +117,7 @@ class FrameTree:
 
         It rests at 0, or where its limits do not allow that, in their middle.
         """
-        joint, scale, offset = self._joints[name], 1.0, 0.0
-        while joint.name not in positions and joint.mimic is not None:
-            offset += scale * joint.mimic.offset
-            scale *= joint.mimic.multiplier
-            joint = self._joints[joint.mimic.joint]
+        joint, scale, offset = leader(self._joints, self._joints[name], positions)
         known = positions.get(joint.name)
         return scale * (rest(joint) if known is None else known) + offset
 

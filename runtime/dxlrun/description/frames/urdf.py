@@ -7,7 +7,7 @@ slide m; `rpy` turns about the parent's fixed x, then y, then z. Shapes and mass
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Literal, TypeAlias, cast, get_args
 from xml.parsers import expat
 
@@ -73,6 +73,18 @@ class Urdf(msgspec.Struct, frozen=True):
     def joint(self, name: str) -> UrdfJoint | None:
         """Return a joint by its name; None: there is none."""
         return next((joint for joint in self.joints if joint.name == name), None)
+
+
+def leader(
+    joints: Mapping[str, UrdfJoint], joint: UrdfJoint, known: Container[str]
+) -> tuple[UrdfJoint, float, float]:
+    """Return the joint that one follows, itself where known or mimicking none: q = scale * its q + offset."""
+    scale, offset = 1.0, 0.0
+    while joint.name not in known and joint.mimic is not None:
+        offset += scale * joint.mimic.offset
+        scale *= joint.mimic.multiplier
+        joint = joints[joint.mimic.joint]
+    return joint, scale, offset
 
 
 def read_urdf(text: str, file: str = "the URDF") -> Urdf:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from pydantic import AfterValidator, Field, ValidationError, create_model
+from pydantic import AfterValidator, Field, create_model
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.joints.motor import MotorModel
-from dxlrun.description.problems import problems_of
+from dxlrun.description.problems import read_form
 from dxlrun.description.units import (
     Angle,
     AngularVelocity,
@@ -26,7 +26,7 @@ from dxlrun.description.units import (
     ViscousFriction,
     Voltage,
 )
-from dxlrun.errors import InputError, Mark
+from dxlrun.errors import Mark
 
 _ESSENTIAL = ("voltage", "torque_constant", "resistance", "inertia")
 """Keys without any of which a file is something else."""
@@ -161,14 +161,7 @@ def read_motor(path: Path) -> MotorDescription:
     if not any(key in grown.data for key in _ESSENTIAL):
         what = f"this is no motor file: it has none of {', '.join(_ESSENTIAL)}"
         raise refusal(Mark(file), what, "name a file as `dxlrun identify` writes it")
-    problems = [*grown.problems]
-    try:
-        form = MotorForm.model_validate(grown.data)
-    except ValidationError as error:
-        problems += problems_of(error, grown.marks, model=MotorForm, unknown=grown.unknown)
-        raise InputError(sorted(problems, key=lambda problem: problem.mark)) from None
-    if problems:
-        raise InputError(sorted(problems, key=lambda problem: problem.mark))
+    form = read_form(grown, MotorForm)
     found = {name: float(value) for name, value in form.uncertainty if value is not None}
     if "delay" in found:
         found["delay"] *= 1e-9

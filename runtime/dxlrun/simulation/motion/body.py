@@ -110,25 +110,16 @@ class SimulatedBody:
         return chain
 
     def _step(self, joint: frames.UrdfJoint) -> _Step:
-        moving, scale, at = self._leader(joint)
+        moved, scale, at = frames.leader(self._joints, joint, self._names)
         return _Step(
             offset=joint.xyz,
             rotation=from_rpy(joint.rpy),
             axis=joint.axis,
             slides=joint.type == frames.SLIDING,
-            joint=moving,
+            joint=self._names.index(moved.name) if moved.name in self._names else -1,
             scale=scale,
             at=at,
         )
-
-    def _leader(self, joint: frames.UrdfJoint) -> tuple[int, float, float]:
-        """Return the joint that decides about the coordinate of one, and by which scale and offset."""
-        scale, at = 1.0, 0.0
-        while joint.name not in self._names and joint.mimic is not None:
-            at += scale * joint.mimic.offset
-            scale *= joint.mimic.multiplier
-            joint = self._joints[joint.mimic.joint]
-        return (self._names.index(joint.name) if joint.name in self._names else -1), scale, at
 
 
 def _moved(sensed: SensedBodies) -> tuple[tuple[str, ...], Floats, Floats]:
