@@ -32,8 +32,8 @@ STEER = {
     "unload",
     "stop",
 }
-ON_ROBOT = {"characterize", "identify", "teach"}
-DIALOGUES = {"setup", "calibrate", "teach"}
+ON_ROBOT = {"characterize", "identify", "teach", "teleop"}
+DIALOGUES = {"setup", "calibrate", "teach", "teleop"}
 EVERYWHERE = {"--debug", "--json", "--robot"}
 """Options that the page describes once."""
 Dxlrun = Callable[..., Any]

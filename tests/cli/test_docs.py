@@ -77,6 +77,7 @@ TESTS = {
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
     "sensors.md": ("tests/sensors/test_page.py",),
     "steering.md": ("tests/cli/test_steer.py",),
+    "teleoperation.md": ("tests/teleop/test_page.py", "tests/teleop/test_terminal.py"),
     "tools.md": ("tests/cli/test_docs.py",),
     "view.md": ("tests/view/test_command.py",),
 }

@@ -23,6 +23,7 @@ WITHOUT_JSON = (
     "setup",
     "calibrate",
     "teach",
+    "teleop",
     "echo",
     "examples",
     "missing",

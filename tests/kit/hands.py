@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import select
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable
@@ -178,3 +181,64 @@ class LiveRobot:
             assert self._run is None or self._run.poll() is None, said
             assert time.monotonic() < give_up, said
             tick.wait(0.05)
+
+
+class Screen:
+    """A command at a terminal; a context manager, which ends it."""
+
+    def __init__(self, directory: Path, *words: str) -> None:
+        self._master, slave = os.openpty()
+        command = [sys.executable, "-P", "-c", CODE, *words]
+        streams = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
+        # a session of its own, with this terminal: so Ctrl-C reaches it
+        take = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+        take += "os.execv(sys.argv[1], sys.argv[1:])"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", take, *command], cwd=directory, start_new_session=True, **streams
+        )
+        os.close(slave)
+        self.text = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._master)
+
+    def sees(self, words: str) -> None:
+        """Wait until the terminal shows words behind those that were waited for before."""
+        give_up = time.monotonic() + DEADLINE_S
+        while words not in self.text:
+            assert time.monotonic() < give_up, self.text
+            assert self._read() or words in self.text, self.text
+        self.text = self.text.partition(words)[2]
+
+    def types(self, text: str) -> None:
+        os.write(self._master, text.encode())
+
+    def kill(self) -> None:
+        """End it as no program can prevent."""
+        self._process.kill()
+
+    def echoes(self) -> bool:
+        """Return whether the terminal shows what is typed, line by line, as it did before."""
+        modes = termios.tcgetattr(self._master)[3]
+        return modes & (termios.ECHO | termios.ICANON) == termios.ECHO | termios.ICANON
+
+    def ended(self) -> int:
+        """Return the exit code; `text` has all that was shown until then."""
+        while self._read():
+            pass
+        return self._process.wait(DEADLINE_S)
+
+    def _read(self) -> bool:
+        if not select.select([self._master], [], [], DEADLINE_S)[0]:
+            return False
+        try:
+            data = os.read(self._master, 4096)
+        except OSError:  # its other end is closed
+            return False
+        self.text += data.decode(errors="replace")
+        return bool(data)

@@ -59,6 +59,7 @@ _PACKAGES = {
         *("replay", "convert", "bench", "latency", "characterize", "experiment"),
         *("sweep", "identify"),
     ),
+    "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),
 }
 """Verbs of this repository's packages, to name the package where it is not installed."""

@@ -1,0 +1,162 @@
+"""Banks: which axis moves what, by the controllers that are active in a running robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from enum import Enum, unique
+from typing import cast
+
+import msgspec
+from msgspec.structs import replace
+
+from dxlrun import RemoteRobot
+from dxlrun.cli.steering.steer import Row
+from dxlrun.errors import InputError, suggestion
+
+USUAL_SPEED = {"rad": 0.5, "m": 0.05}
+"""Of a joint at the end of its axis at factor 1: rad/s and m/s."""
+USUAL_TWIST = {"linear": 0.2, "angular": 1.0}
+"""Of a base likewise: m/s and rad/s, or what it stops from in BRAKING_S."""
+BRAKING_S = 0.2
+HORIZON_S = 0.1
+"""A joint of a trajectory controller is driven by trajectories of this length: each ends by itself."""
+_ROOM = 1.5
+"""A trajectory that makes up for what it is behind is faster than its axis by less than this factor."""
+_LEADING = 1.25
+"""So much faster than its goal moves a servo may be, to stay with it."""
+
+
+@unique
+class Form(Enum):
+    """What a command is made of, and whether an axis is the speed of its numbers, or these themselves."""
+
+    POSITIONS = frozenset({"positions"}), True
+    POSVEL = frozenset({"positions", "velocities"}), True
+    VELOCITIES = frozenset({"velocities"}), False
+    TWIST = frozenset({"linear", "angular"}), False
+    TRAJECTORY = frozenset({"points", "joints"}), True
+
+    def __init__(self, fields: frozenset[str], integrates: bool) -> None:
+        self.fields, self.integrates = fields, integrates
+
+    @classmethod
+    def of(cls, fields: Collection[str]) -> Form | None:
+        """Return the form of a command with these fields; None: it is not driven."""
+        if cls.TRAJECTORY.fields.issubset(fields):
+            return cls.TRAJECTORY
+        return next((form for form in cls if form.fields == set(fields)), None)
+
+
+class Slot(msgspec.Struct, frozen=True):
+    """A number of a command: the joint, or the field of a twist, that it is for."""
+
+    name: str
+    unit: str
+    """`rad` or `m`; speeds are these a second"""
+    speed: float
+    """At the end of an axis, at factor 1"""
+    most: float
+    """No factor makes it faster."""
+    lower: float = -math.inf
+    upper: float = math.inf
+
+
+class Bank(msgspec.Struct, frozen=True):
+    """A controller, and the numbers of its command that axes move together."""
+
+    controller: str
+    kind: str
+    form: Form
+    slots: tuple[Slot, ...]
+    """All numbers of the command, in its order."""
+    driven: tuple[int, ...]
+    """The slot that each axis moves."""
+    into: tuple[str, ...] = ()
+    """Controllers whose references it commands, instead of servos."""
+
+    def command(self, values: Sequence[float], factor: float) -> dict[str, object]:
+        """Return the command with these numbers, SI units."""
+        match self.form:
+            case Form.TWIST:
+                return {slot.name: value for slot, value in zip(self.slots, values, strict=True)}
+            case Form.VELOCITIES:
+                return {"velocities": values}
+            case Form.POSITIONS:
+                return {"positions": values}
+            case Form.POSVEL:
+                speeds = [_LEADING * min(slot.most, slot.speed * factor) for slot in self.slots]
+                return {"positions": values, "velocities": speeds}
+            case Form.TRAJECTORY:
+                ends = [values[index] for index in self.driven]
+                point = {"time": HORIZON_S, "positions": ends, "velocities": [0.0] * len(ends)}
+                return {"points": [point], "joints": [self.slots[index].name for index in self.driven]}
+
+
+def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank]:
+    """Return what can be driven by so many axes, in the order of `targets`: controllers, groups, joints.
+
+    Without targets it is all that active controllers take commands for. Raises InputError for another one.
+    """
+    info = cast("Row", robot.info())
+    active = [one for one in info["controllers"] if one["active"]]
+    other = {
+        lower for one in active for lower in one["into"]
+    }  # is commanded by another one, or follows joints
+    other |= {
+        one["name"] for one in active if any(read.split("/")[0] in info["units"] for read in one["reads"])
+    }
+    able = [one for one in active if one["name"] not in other]
+    whole = [bank for one in able if (bank := _bank(robot, one, info)) is not None]
+    own = {bank.controller: [(bank, index) for index in bank.driven] for bank in whole}
+    joints = {bank.slots[index].name: [(bank, index)] for places in own.values() for bank, index in places}
+    groups = {
+        name: [*(joints[one][0] for one in each if one in joints)] for name, each in info["groups"].items()
+    }
+    words = {name: places for name, places in (joints | groups | own).items() if places}
+    chosen: dict[str, dict[int, Bank]] = {}
+    for target in targets or own or ("its joints",):
+        if target not in words:
+            commands = "positions, velocities, twists or trajectories"
+            hint = suggestion(target, words, "`dxlrun switch --activate NAME` activates one")
+            raise InputError(f"no active controller of {robot.name} takes {commands} for {target}; {hint}")
+        for bank, index in words[target]:
+            chosen.setdefault(bank.controller, {})[index] = bank
+    return [
+        replace(bank, driven=tuple(driven)[first : first + axes])
+        for driven in chosen.values()
+        for first, bank in list(enumerate(driven.values()))[::axes]
+    ]
+
+
+def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
+    """Return a controller with all that it commands; None where that is not driven."""
+    for kind, schema in one["takes"].items():
+        if (form := Form.of(schema.get("properties", ()))) is not None:
+            twist = form is Form.TWIST
+            slots = _twist(robot, one) if twist else [_joint(joint, info, form) for joint in one["joints"]]
+            places = tuple(range(len(slots)))
+            return Bank(one["name"], kind, form, tuple(slots), places, tuple(one["into"]))
+    return None
+
+
+def _joint(name: str, info: Row, form: Form) -> Slot:
+    unit, limit = info["units"][name], info["speeds"][name]
+    most = math.inf if limit is None else limit / _ROOM if form.integrates else limit
+    return Slot(name, unit, min(USUAL_SPEED[unit], most), most, *info["limits"].get(name, ()))
+
+
+def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
+    """Return drive and turn of a base, at factor 1 as fast as its limits let it stop from in BRAKING_S."""
+    given, slots = robot.parameters(one["name"]), []
+    for field, unit in (("linear", "m"), ("angular", "rad")):
+        most, rise, sink, jerk = (
+            float(text.split()[0]) if isinstance(text := given.get(f"{field}.{limit}"), str) else math.inf
+            for limit in ("velocity", "acceleration", "deceleration", "jerk")
+        )
+        braking = rise if math.isinf(sink) else sink
+        # by a jerk limit the deceleration grows and shrinks for so long each
+        growth_s = 0.0 if math.isinf(jerk) else min(BRAKING_S / 2, braking / jerk)
+        stops_from = (min(braking, jerk * growth_s) if growth_s else braking) * (BRAKING_S - growth_s)
+        slots.append(Slot(field, unit, min(USUAL_TWIST[field], most, stops_from), most))
+    return slots

@@ -1,0 +1,69 @@
+"""`dxlrun teleop`: drive a running robot by hand."""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing, suppress
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, terminated_as_interrupted
+from dxlrun.cli.steering.steer import Chosen, robot_of
+from dxlrun.errors import InputError
+
+Targets = Annotated[str, Parameter(name="target", show_default=False)]
+"""Names of controllers, groups or joints."""
+
+
+def teleop(
+    *targets: Targets,
+    gamepad: Flag = False,
+    device: str | None = None,
+    speed: float = 1.0,
+    robot: str | None = None,
+    debug: Flag = False,
+) -> int:
+    """Drive a running robot by hand, from the keyboard or a gamepad.
+
+    It moves while a key, or the shoulder button of a gamepad, is held, and holds when that is released, the
+    gamepad is gone, or this program ends in any way.
+
+    Parameters
+    ----------
+    targets
+        What the axes move, in this order: joints, groups, controllers, such as a base. Without any: all that
+        active controllers take positions, velocities, twists or trajectories for.
+    gamepad
+        Drive with the gamepad that is plugged in.
+    device
+        Drive with this gamepad or keyboard, such as /dev/input/event5.
+    speed
+        How fast, as a factor: 0.5 is half as fast.
+    robot
+        Name of the robot, where several run.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.output.terminal import show
+    from dxlrun_teleop.bank import banks_of
+    from dxlrun_teleop.devices import chosen
+    from dxlrun_teleop.drive import FACTORS, PERIOD_S, Drive
+    from dxlrun_teleop.keyboard import TerminalKeyboard
+    from dxlrun_teleop.screen import screen
+    from dxlrun_teleop.source import Press, Source
+
+    lowest, highest = FACTORS
+    if not lowest <= speed <= highest:  # false for nan too
+        raise InputError(f"--speed {speed:g} is no factor from {lowest:g} to {highest:g}")
+    with robot_of(Chosen(robot), "teleop") as running:
+        source: Source = chosen(device) if gamepad or device else TerminalKeyboard()
+        with terminated_as_interrupted(), closing(source):
+            drive = Drive(running, banks_of(running, targets, len(source.axes)), speed)
+            with screen(running, drive, source) as draw, suppress(KeyboardInterrupt), closing(drive):
+                while Press.QUIT not in (given := source.read(now := time.monotonic())).presses:
+                    drive.step(given, now)
+                    draw(now)
+                    time.sleep(max(0.0, now + PERIOD_S - time.monotonic()))
+        show(f"{running.name} holds")
+    return 0

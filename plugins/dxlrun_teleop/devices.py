@@ -1,0 +1,169 @@
+"""Gamepads and keyboards as Linux' input devices, which report releases, too (extra `teleop`: evdev).
+
+Codes are those of linux/input-event-codes.h, a gamepad's after the kernel's Documentation/input/gamepad.rst.
+A device is asked for its state, so that no event can be missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from glob import glob
+from typing import Protocol
+
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun_teleop.keyboard import AXES
+from dxlrun_teleop.source import Given, Press
+
+EV_KEY, EV_ABS = 1, 3
+SHOULDERS = frozenset((0x136, 0x137))
+"""BTN_TL and BTN_TR: the dead-man's switch of a gamepad."""
+BUTTONS: Mapping[int, Press] = {0x130: Press.NEXT, 0x13B: Press.QUIT}
+"""BTN_SOUTH, BTN_START"""
+STICKS: Mapping[int, str] = {
+    1: "left stick up/down",
+    0: "left stick left/right",  # ABS_Y, ABS_X
+    4: "right stick up/down",
+    3: "right stick left/right",  # ABS_RY, ABS_RX
+    5: "right stick up/down",
+    2: "right stick left/right",  # ABS_RZ, ABS_Z: of some it is these
+    17: "pad up/down",
+    16: "pad left/right",  # ABS_HAT0Y, ABS_HAT0X
+}
+DEAD_ZONE = 0.1
+"""A stick that is so near to its middle is released; what is left is the whole axis."""
+KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER, 1: Press.QUIT}
+"""KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
+SIDES: Mapping[int, tuple[int, float]] = {
+    **{16 + axis: (axis, 1.0) for axis in range(8)},  # KEY_Q to KEY_I, as they lie on a US keyboard
+    **{30 + axis: (axis, -1.0) for axis in range(8)},  # KEY_A to KEY_K
+    103: (0, 1.0),
+    108: (0, -1.0),
+    105: (1, 1.0),
+    106: (1, -1.0),  # up, down, left, right
+}
+
+
+class Device(Protocol):
+    """What is used of evdev.InputDevice; OSError, or SystemError (evdev 1.6 to 2.0): it is gone."""
+
+    name: str
+    path: str
+
+    def capabilities(self, *, absinfo: bool) -> Mapping[int, Sequence[int]]:
+        """Return the codes that it has, by type of event."""
+
+    def active_keys(self) -> Sequence[int]:
+        """Return the codes of what is held down."""
+
+    def absinfo(self, axis_num: int) -> Sequence[int]:
+        """Return where an axis is, its ends, and more."""
+
+    def grab(self) -> None:
+        """Let no other program have what is typed."""
+
+    def close(self) -> None:
+        """Close it, and let others have it."""
+
+
+class Gamepad:
+    """Sticks and the pad of directions; a shoulder button that is held is the dead-man's switch."""
+
+    help = "shoulder button held: moves, released: holds; A: next controller; Start: end"
+    pressing = BUTTONS
+
+    def __init__(self, device: Device) -> None:
+        self._device, self._held = device, frozenset({*BUTTONS, *KEYS})  # what is held at first is no press
+        codes = {*device.capabilities(absinfo=False).get(EV_ABS, ())}
+        codes -= {5, 2} if 3 in codes else {code for code in codes & {5, 2} if self._axis(code)}  # triggers
+        self._codes = tuple(code for code in STICKS if code in codes)
+        self.axes = tuple(STICKS[code] for code in self._codes)
+
+    def read(self, now: float) -> Given:
+        """Return what is held at this moment. Raises DxlrunError when the device is gone."""
+        try:
+            held = frozenset(self._device.active_keys())
+            axes, enabled = self._driven(held)
+        except (OSError, SystemError) as error:
+            name = f"{self._device.name} ({self._device.path})"
+            raise DxlrunError(f"{name} is gone, the robot holds; plug it in, and start again") from error
+        fresh, self._held = held - self._held, held
+        return Given(axes, enabled, frozenset(self.pressing[key] for key in fresh & self.pressing.keys()))
+
+    def _driven(self, held: frozenset[int]) -> tuple[tuple[float, ...], bool]:
+        return tuple(map(self._axis, self._codes)), not SHOULDERS.isdisjoint(held)
+
+    def _axis(self, code: int) -> float:
+        """Return where a stick is: up and left are positive, as for a base that drives and turns."""
+        value, lowest, highest = self._device.absinfo(code)[:3]
+        way = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
+        beyond = min(max(0.0, abs(way) - DEAD_ZONE) / (1.0 - DEAD_ZONE), 1.0)
+        return beyond if way > 0 else -beyond
+
+    def close(self) -> None:
+        """Close the device."""
+        self._device.close()
+
+
+class KeyboardDevice(Gamepad):
+    """A keyboard of its own, whose keys no other program has meanwhile; each is its own dead-man's switch.
+
+    It is taken when all its keys are up: else another program would miss that one of them is released.
+    """
+
+    help = "held: moves, released: holds; Tab: next controller; = -: speed; Esc: end"
+    pressing = KEYS
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.axes, self._taken = AXES, False
+
+    def _driven(self, held: frozenset[int]) -> tuple[tuple[float, ...], bool]:
+        if not self._taken and not held:
+            self._device.grab()
+            self._taken = True
+        axes = [0.0] * len(AXES)
+        for axis, side in (SIDES[code] for code in held & SIDES.keys() if self._taken):
+            axes[axis] += side
+        return tuple(axes), any(axes)
+
+
+def source_of(device: Device) -> Gamepad | None:
+    """Return the source that a device can be: a gamepad, a keyboard, or none."""
+    codes = {kind: set(found) for kind, found in device.capabilities(absinfo=False).items()}
+    keys = codes.get(EV_KEY, set())
+    if codes.get(EV_ABS, set()) >= {0, 1} and not SHOULDERS.isdisjoint(keys):
+        return Gamepad(device)
+    return KeyboardDevice(device) if keys >= SIDES.keys() else None
+
+
+def chosen(path: str | None) -> Gamepad:
+    """Return the device of a path, without one the only gamepad, and close all others.
+
+    Raises InputError, with those that there are.
+    """
+    try:
+        from evdev import InputDevice
+    except ImportError:
+        raise InputError("gamepads need evdev; `pip install 'dxlrun[teleop]'` installs it") from None
+    devices: list[Device] = []
+    paths = sorted(glob("/dev/input/event*"))
+    for each in paths:
+        with suppress(OSError):  # most of them only for other users
+            devices.append(InputDevice(each))
+    able = {device.path: source for device in devices if (source := source_of(device)) is not None}
+    pads = [each for each, source in able.items() if type(source) is Gamepad]
+    wanted = [path] if path else pads
+    source = able.get(wanted[0]) if len(wanted) == 1 else None
+    for device in devices:
+        if source is None or device.path != wanted[0]:
+            device.close()
+    if source is not None:
+        return source
+    what = f"{path} is no gamepad or keyboard that can be read" if path else "no gamepad can be read"
+    what = "several gamepads are there, choose one by --device" if pads and not path else what
+    hint = (
+        "" if len(devices) == len(paths) else "; `sudo usermod -aG input $USER` and a new log-in show others"
+    )
+    listed = "".join(f"\n  {device.path}  {device.name}" for device in devices if device.path in able)
+    raise InputError(f"{what}; gamepads and keyboards{hint}:{listed or ' none'}")

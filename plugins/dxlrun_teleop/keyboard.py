@@ -1,0 +1,83 @@
+"""The keyboard behind a terminal: it reports that keys go down and repeat, never that they are released."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import sys
+import termios
+import tty
+
+from dxlrun.errors import InputError
+from dxlrun_teleop.source import Given, Press
+
+HELD_S = 0.13
+"""A key counts as held for so long after it was typed: above 92 ms, in which the Linux console repeats it
+(10.9 Hz, kbdrate(8)); desktops repeat faster."""
+POSITIVE, NEGATIVE = "qwertyui", "asdfghjk"
+"""A column of keys each axis: the upper one is its positive side."""
+_KEYS = {key: (axis, 1.0) for axis, key in enumerate(POSITIVE)} | {
+    key: (axis, -1.0) for axis, key in enumerate(NEGATIVE)
+}
+_ARROWS = {"A": (0, 1.0), "B": (0, -1.0), "D": (1, 1.0), "C": (1, -1.0)}
+"""Last letters of ESC [ A and the like: up, down, left, right."""
+_PRESSES = {"\t": Press.NEXT, "+": Press.FASTER, "=": Press.FASTER, "-": Press.SLOWER, "\x04": Press.QUIT}
+_TYPED = re.compile(r"\x1b[\[O](?:[\d;]*)([A-Za-z~])|(.)", re.DOTALL)
+_PART = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")
+"""The beginning of a sequence whose end comes later."""
+AXES = tuple(
+    f"{upper}/{lower}{also}"
+    for upper, lower, also in zip(
+        POSITIVE.upper(), NEGATIVE.upper(), (" Up/Down", " Left/Right", *[""] * 6), strict=True
+    )
+)
+
+
+class TerminalKeyboard:
+    """Keys that are typed at the terminal, which does not show them until it is closed.
+
+    A key is its own dead-man's switch: it counts as held until HELD_S after it was last typed. Until the
+    keyboard begins to repeat it (after 0.25 s to 0.66 s) a key is one short step.
+    """
+
+    axes = AXES
+    help = "held: moves, released: holds; Tab: next controller; + -: speed; Ctrl-C: end"
+
+    def __init__(self) -> None:
+        if not (sys.stdin.isatty() and sys.stdout.isatty()):
+            raise InputError(
+                "`dxlrun teleop` reads keys from a terminal, and this is none; start it in one, or give it "
+                "a device: --gamepad, or --device /dev/input/eventN"
+            )
+        self._input = sys.stdin.fileno()
+        self._before = termios.tcgetattr(self._input)
+        self._typed: dict[int, tuple[float, float]] = {}
+        """Axis -> its side, and when that key was typed last."""
+        self._rest = ""
+        tty.setcbreak(self._input, termios.TCSAFLUSH)
+
+    def close(self) -> None:
+        """Make the terminal what it was; what was typed and not read is forgotten."""
+        termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
+
+    def read(self, now: float) -> Given:
+        """Return the axes whose keys were typed just now."""
+        presses: set[Press] = set()
+        while select.select([self._input], [], [], 0.0)[0]:
+            if not (data := os.read(self._input, 4096)):
+                return Given((0.0,) * len(self.axes), False, frozenset({Press.QUIT}))
+            text = self._rest + data.decode(errors="replace")
+            part = _PART.search(text)
+            self._rest = part[0] if part else ""
+            for arrow, key in _TYPED.findall(text.removesuffix(self._rest)):
+                side = _ARROWS.get(arrow) if arrow else _KEYS.get(key.lower())
+                if side is not None:
+                    self._typed[side[0]] = side[1], now
+                elif key == " ":
+                    self._typed.clear()
+                elif key in _PRESSES:
+                    presses.add(_PRESSES[key])
+        held = {axis: side for axis, (side, typed) in self._typed.items() if now - typed <= HELD_S}
+        axes = tuple(held.get(axis, 0.0) for axis in range(len(self.axes)))
+        return Given(axes, bool(held), frozenset(presses))

@@ -1,0 +1,60 @@
+"""The screen: which key moves what, what is commanded, and where the robot is, live."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from dxlrun import RemoteRobot
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import fitted, out
+from dxlrun_teleop.drive import Drive
+from dxlrun_teleop.source import Source
+
+REFRESH_S = 0.1
+_SHOWN = {"rad": (180 / math.pi, "deg"), "m": (1e3, "mm")}
+
+
+def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
+    """Return what is driven and how, and a row an axis: what it moves, its command, where that is."""
+    bank, values, states = drive.bank, drive.values, robot.states()
+    positions = dict(zip(states.joints, states.position.tolist(), strict=True))
+    rows = []
+    for label, index in zip(source.axes, bank.driven, strict=False):
+        slot = bank.slots[index]
+        factor, unit = _SHOWN[slot.unit]
+        per_s = "" if bank.form.integrates else "/s"
+        commanded = f"{values[index] * factor:.1f} {unit}{per_s}" if values else ""
+        at = f"{positions[slot.name] * factor:.1f} {unit}" if slot.name in positions else ""
+        rows.append((label, slot.name, commanded, at))
+    head = f"{robot.name}: {bank.controller} {'moves' if values else 'holds'}, speed x{drive.factor:.2g}"
+    columns = (Column("axis", "name"), Column("moves", "name"), Column("commanded"), Column("position"))
+    return head, Table.of("", columns, rows)
+
+
+@contextmanager
+def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callable[[float], None]]:
+    """Give what draws the view at a time, s, at most each REFRESH_S; nothing where there is no terminal."""
+    console = out()
+    if not console.is_terminal:
+        yield lambda now: None
+        return
+    from rich.console import Group
+    from rich.live import Live
+    from rich.text import Text
+
+    drawn_s = -math.inf
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+
+        def draw(now: float) -> None:
+            nonlocal drawn_s
+            if now - drawn_s >= REFRESH_S:
+                drawn_s = now
+                head, table = view(robot, drive, source)
+                style = "green" if drive.values else ""
+                lines = [[(head, style)], *fitted(table, console.width), [(source.help, "dim")]]
+                texts = (Text.assemble(*line, no_wrap=True, overflow="ellipsis") for line in lines)
+                live.update(Group(*texts), refresh=True)
+
+        yield draw

@@ -1,0 +1,114 @@
+"""Driving on virtual time: what moves, and that the robot holds, judged by the ledger of its servos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import pytest
+from tests.kit.driven import DrivenRobot, changes
+
+from dxlrun import RemoteRobot
+from dxlrun_teleop.bank import banks_of
+from dxlrun_teleop.drive import Drive
+from dxlrun_teleop.source import Given
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+BEGIN_S, END_S, HELD_S = 1.0, 2.0, 0.25
+VELOCITY, POSITION = (104, 4), (116, 4)
+"""Address and size of XL430 goals; AX-12: Goal Position at 30"""
+ARM = """\
+name: arm
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}}
+loop: {rate: 100}
+joint_defaults:
+  {bus: main, model: XL430-W250, reference: 180 deg, direction: 1, limits: {position: [-60 deg, 60 deg]}}
+groups: {hand: {joints: [wrist]}}
+joints: {elbow: {id: 1}, wrist: {id: 2}}
+controllers: {arm: {type: joint_group_position_controller, joints: [elbow, wrist]}}
+"""
+
+
+class Hand:
+    """A script: the axes of some time, held until another one; released, unplugged or killed then."""
+
+    def __init__(self, drive: Drive, ending: str, axes: tuple[float, ...] = (1.0,)) -> None:
+        self._drive, self._ending, self._axes = drive, ending, axes
+        self.gone = False
+
+    def __call__(self, now: float) -> None:
+        if self.gone:
+            return
+        held = BEGIN_S <= now < END_S
+        if now >= END_S and self._ending != "released":
+            self.gone = True
+            if self._ending == "unplugged":  # as the command's `finally` does
+                self._drive.close()
+            return
+        self._drive.step(Given(self._axes if held else (0.0,) * len(self._axes), held), now)
+
+
+def driven(
+    robot: Path,
+    ending: str,
+    *targets: str,
+    axes: tuple[float, ...] = (1.0,),
+    factor: float = 1.0,
+    arguments: Mapping[str, str] = MappingProxyType({}),
+) -> DrivenRobot:
+    run = DrivenRobot(robot, 3.5, arguments)
+
+    def begin(client: RemoteRobot) -> Callable[[float], object]:
+        return Hand(Drive(client, banks_of(client, targets, 8), factor), ending, axes)
+
+    run.run(begin)
+    return run
+
+
+def goals_of(run: DrivenRobot, address: int, size: int) -> dict[int, list[tuple[float, int]]]:
+    return changes(run.virtual.ledger.entries, run.virtual.plan, address, size)
+
+
+def arm(directory: Path) -> Path:
+    path = directory / "arm.yaml"
+    path.write_text(ARM)
+    return path
+
+
+class Case(NamedTuple):
+    robot: str
+    item: tuple[int, int]
+    targets: tuple[str, ...] = ()
+    arguments: Mapping[str, str] = MappingProxyType({})
+
+
+CASES = {
+    "base": Case("diff_drive.yaml", VELOCITY),
+    "wheels": Case("diff_drive.yaml", VELOCITY, (), {"base": "false", "wheels": "true"}),
+    "trajectory": Case("leader_follower.yaml", POSITION, ("left_arm",)),
+    "posvel": Case("bioloid_torso.yaml", (30, 2), ("head",)),
+    "group": Case("arm", POSITION, ("wrist",)),
+}
+
+
+@pytest.mark.parametrize("ending", ["released", "unplugged", "killed"])
+@pytest.mark.parametrize("case", CASES)
+def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -> None:
+    name, item, targets, arguments = CASES[case]
+    robot = arm(tmp_path) if name == "arm" else ROBOTS / name
+    run = driven(robot, ending, *targets, arguments=arguments)
+    goals = {servo: found for servo, found in goals_of(run, *item).items() if found[-1][0] > BEGIN_S}
+    goals.pop(3, None)  # the follower of leader_follower comes after the measured position of its leader
+    assert goals
+    for found in goals.values():
+        moved = [at for at, _ in found if at > BEGIN_S]
+        assert min(moved) < BEGIN_S + HELD_S
+        assert max(moved) < END_S + HELD_S
+        before = [value for at, value in found if at < END_S][-1]
+        if item == VELOCITY:
+            assert (before != 0, found[-1][1]) == (True, 0)
+        else:
+            assert abs(before - found[0][1]) > 50, found  # ticks: on the way, all the time
+            assert len(moved) > 10

@@ -1,0 +1,92 @@
+"""`dxlrun teleop` at a terminal: keys move a base; by Ctrl-C and a kill it holds.
+
+The base and `dxlrun teleop` are the first two commands of docs/teleoperation.md.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from tests.kit.driven import changes
+from tests.kit.hands import CODE, DEADLINE_S, Screen
+
+from dxlrun import RemoteRobot, connect, running
+from dxlrun.simulation.bus.ledger import read_ledger
+from dxlrun.testing import plan_of
+
+ROBOT = Path(__file__).parents[2] / "robots" / "diff_drive.yaml"
+GOAL_VELOCITY = 104
+
+
+def until(done: Callable[[], bool]) -> None:
+    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+    while not done():
+        assert time.monotonic() < give_up
+        tick.wait(0.02)
+
+
+@pytest.fixture
+def ledger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The ledger of a base that runs."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    words = [sys.executable, "-P", "-c", CODE, str(ROBOT), "--no-record", "--ledger", "seen.jsonl"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL) as run:
+        until(lambda: run.poll() is not None or bool(running()))
+        yield tmp_path / "seen.jsonl"
+        run.terminate()
+
+
+def speeds() -> tuple[float, ...]:
+    """Return the goals of the wheels now, rad/s."""
+    with connect() as robot:
+        return tuple(robot.states().goal_velocity.tolist())
+
+
+def is_held(robot: RemoteRobot) -> bool:
+    """Return whether the stream for the base ran out."""
+    (base,) = [one for one in cast("Any", robot.info())["controllers"] if one["name"] == "base"]
+    return bool(base["active"] and base["held"])
+
+
+def drives(screen: Screen, key: str, done: Callable[[], bool]) -> None:
+    """Hold a key as a keyboard repeats it."""
+
+    def typed() -> bool:
+        screen.types(key)
+        return done()
+
+    until(typed)
+
+
+def test_a_base_is_driven_and_holds_when_the_program_is_interrupted_and_when_it_is_killed(
+    ledger: Path, tmp_path: Path
+) -> None:
+    with Screen(tmp_path, "teleop") as screen:
+        screen.sees("diff_drive: base holds")
+        drives(screen, "q", lambda: min(speeds()) > 0.5)
+        screen.sees("base moves")
+        screen.types("\x03")
+        assert screen.ended() == 0
+        assert re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", screen.text).strip().endswith("diff_drive holds")
+        assert screen.echoes()
+    until(lambda: speeds() == (0.0, 0.0))
+    with Screen(tmp_path, "teleop") as screen:
+        screen.sees("base holds")
+        drives(screen, "\x1b[D", lambda: speeds()[0] < -0.5 and speeds()[1] > 0.5)  # turns left
+        screen.kill()
+    with connect() as robot:
+        until(lambda: is_held(robot))
+        assert speeds() == (0.0, 0.0)
+        robot.stop()
+    goals = [value for _, value in changes(read_ledger(ledger), plan_of(ROBOT), GOAL_VELOCITY)[1]]
+    assert max(goals) > 20
+    assert min(goals) < -20
+    assert goals[-1] == 0
