@@ -9,8 +9,10 @@ from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.robot import compile_robot
 from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
-from dxlrun.dynamixel.servo.checks import BusSurvey, inspect
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
+from dxlrun.dynamixel.servo.access import first_reach
+from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.registers import compare
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
 from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
@@ -164,20 +166,19 @@ def _named(plan: BusPlan, name: str) -> ServoPlan:
 
 def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[list[str]]:
     """Compare servos with the robot file as a start does, and all that setup has written."""
-    line, survey = setup_line(plan), BusSurvey()
+    survey = Findings()
     for servo in servos:
-        reply = yield from retry(line.ping(servo.servo_id))
+        one = first_reach(plan, servo)
+        reply = yield from retry(one.line.ping(servo.servo_id))
         if not reply.answered:
             how = "does not answer" if reply.outcome is Outcome.TIMEOUT else "answers garbled"
             survey.problems.append(f"{plan.label(servo)} {how} at {plan.baud_rate} bit/s")
             continue
-        if not (yield from inspect(plan, servo, line, survey, take_over=True)):
+        if not (yield from inspect(one, survey, take_over=True)):
             continue
         table = control_table(servo.model, plan.protocol)
-        for one in (yield from compare(plan, servo, stored(table, plan, servo), line)):
-            if one.found != one.register.value:
-                title = table.items[one.register.name].title
-                survey.problems.append(
-                    f"{plan.label(servo)} has {title} = {one.found}, not {one.register.value}"
-                )
+        for each in (yield from compare(one, stored(table, plan, servo))):
+            if each.found != each.register.value:
+                title = table.items[each.register.name].title
+                survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
     return survey.problems

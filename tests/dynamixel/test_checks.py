@@ -4,9 +4,11 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.servo.checks import CHECKS, BusSurvey, inspect
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.servo.access import reach
+from dxlrun.dynamixel.servo.checks import CHECKS, inspect
 from dxlrun.plan.bus_plan import RegisterValue
 from dxlrun.plan.transaction import Outcome, Reply
 
@@ -77,10 +79,10 @@ def look(protocol, change, *, take_over=False):
     for item in table.items.values():
         if not item.name.startswith("indirect"):
             memory[item.address : item.address + item.size] = item.encode(values[item.name])
-    found, line = BusSurvey(), plan_line(plan)
-    program = inspect(plan, servo, line, found, take_over=take_over)
+    found, one = Findings(), reach(plan, servo)
+    program = inspect(one, found, take_over=take_over)
     reads = {
-        line.read(1, start, length).packet: bytes(memory[start : start + length])
+        one.line.read(1, start, length).packet: bytes(memory[start : start + length])
         for start in range(table.size)
         for length in range(1, 40)
     }
@@ -90,16 +92,16 @@ def look(protocol, change, *, take_over=False):
             data = reads[read.packet]
             read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
     except StopIteration as end:
-        readable = end.value
-    assert readable is True
+        mode = end.value
+    assert mode is not None
     return found
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_a_servo_that_fits_has_neither_problem_nor_difference(protocol):
     found = look(protocol, {})
-    assert (found.problems, found.differences) == ([], [])
-    assert len(found.servos) == len(found.modes) == 1
+    assert found.problems == []
+    assert [code for code, *_ in found.events] == [EventCode.SETUP]
 
 
 @pytest.mark.parametrize(("protocol", "change", "sentence"), FAILS)
@@ -113,7 +115,7 @@ def test_a_servo_that_does_not_fit_is_refused_with_one_sentence(protocol, change
 def test_what_refuses_nothing_is_reported(protocol, change, sentence):
     found = look(protocol, change)
     assert found.problems == []
-    ((joint, text),) = found.differences
+    ((joint, text),) = found.texts(EventCode.REGISTER_DIFFERS)
     assert joint == "main_1_joint"
     assert sentence in text
 

@@ -10,6 +10,7 @@ from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo import modes
+from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 
 
@@ -211,7 +212,7 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
 )
 def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(model, protocol):
     plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
-    program = modes.mode_now(plan, plan.servos[0])
+    program = modes.mode_now(reach(plan, plan.servos[0]))
     assert next(program).awaited[0].length != plan.torque_reads[0].awaited[0].length
 
 

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
+from dxlrun.dynamixel.servo.reboots import RebootCount, TickReading
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.plan.bus_plan import RegisterValue
 from dxlrun.plan.transaction import Outcome, Reply
@@ -170,9 +170,9 @@ def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again():
     ],
 )
 def test_two_reboots_latch_a_servo_only_within_a_minute(times_s, latched):
-    count = RebootCount(2)
-    assert tuple(count.add(1, round(at_s * 1e9)) for at_s in times_s) == latched
-    assert count.exhausted == [False, any(latched)]
+    count = RebootCount()
+    assert tuple(count.add(round(at_s * 1e9)) for at_s in times_s) == latched
+    assert count.exhausted == any(latched)
 
 
 def _goals(packet, protocol):
@@ -300,15 +300,14 @@ def _tick(tick, sent_ns, last_ns=None):
     ],
 )
 def test_a_tick_shows_a_reboot(tick, after_ms, rebooted):
-    ticks = RealtimeTicks(1)
-    assert ticks.rebooted(0, _tick(30_000, 0)) is None
-    assert ticks.rebooted(0, _tick(tick, after_ms * 1_000_000)) is rebooted
+    before = TickReading.of(_tick(30_000, 0))
+    assert before.rebooted(None) is None
+    assert TickReading.of(_tick(tick, after_ms * 1_000_000)).rebooted(before) is rebooted
 
 
 def test_a_reply_that_was_long_under_way_is_no_reboot():
-    ticks = RealtimeTicks(1)
-    ticks.rebooted(0, _tick(0, 0))
-    assert ticks.rebooted(0, _tick(1_000, 1_000_000_000, 1_150_000_000)) is False
+    before = TickReading.of(_tick(0, 0))
+    assert TickReading.of(_tick(1_000, 1_000_000_000, 1_150_000_000)).rebooted(before) is False
 
 
 def test_torque_that_was_cut_without_a_reboot_is_not_given_back():

@@ -33,12 +33,12 @@ def one():
     plan = make_plan((1,))
     rig = make_rig(plan)
     reads = CyclicReads(plan, Samples([plan], States.empty(1), rig.events).buses[0])
-    return Life(plan, reads, rig.events, rig.clock.now_ns)
+    return Life(plan, reads, rig.hardware._idle[0], rig.events)
 
 
 def put(servo, state):
     servo.states[0] = state
-    servo.losses[0] = life.Loss(True, False, False, False, 0) if state is ServoState.OFFLINE else None
+    servo.losses = {0: life.Loss(True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
     servo.reads.away[0] = state is ServoState.OFFLINE
 
 

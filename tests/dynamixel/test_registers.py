@@ -9,7 +9,8 @@ from dxlrun.channels.packets import NoPackets
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.retry import setup_line
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.servo.access import first_reach, reach
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError
@@ -38,10 +39,27 @@ def bench(plan, **change):
 
     def execute(program):
         (result,) = lines.run([program])
-        assert result is not None
         return result
 
     return rig, execute
+
+
+def settled(execute, plan):
+    """Settle the declared registers of the first servo; return what was found."""
+    found = Findings()
+    execute(settle(first_reach(plan, plan.servos[0]), plan.servos[0].registers, found))
+    return found
+
+
+def rejoined(execute, plan, torque):
+    """Take the first servo back; return whether it has torque, and what was found."""
+    found, servo = Findings(), plan.servos[0]
+    one = reach(plan, servo)
+    return execute(rejoin(one, found, servo.start_mode, servo.registers, torque=torque)), found
+
+
+def written(found):
+    return [text for _, text in found.texts(EventCode.REGISTER_WRITTEN)]
 
 
 def held(rig, name, index=0):
@@ -53,22 +71,22 @@ def test_only_what_differs_is_written_and_it_is_read_back():
     plan = declared(make_x((11, 12)), return_delay_time=250, position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
     rig.servo(11).poke("return_delay_time", 0)
-    settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
-    assert settled.problems == []
-    assert [text for _, text in settled.written] == [
+    found = settled(execute, plan)
+    assert found.problems == []
+    assert written(found) == [
         "Return Delay Time (9) was 0 and is 250",
         "Position P Gain (84) was 800 and is 900",
     ]
     assert len(rig.writes()) == 2
     assert (held(rig, "return_delay_time"), held(rig, "position_p_gain")) == (250, 900)
-    assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
+    assert written(settled(execute, plan)) == []
     assert len(rig.writes()) == 2
 
 
 def test_comparing_writes_nothing():
     plan = declared(make_x((11, 12)), position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
-    found = execute(compare(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
+    found = execute(compare(first_reach(plan, plan.servos[0]), plan.servos[0].registers))
     assert [(one.register.name, one.found, one.differs) for one in found] == [
         ("position_p_gain", 800, True),
         ("position_d_gain", 0, False),
@@ -81,7 +99,7 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque():
     rig, execute = bench(plan)
     rig.servo(11).poke("return_delay_time", 0)
     rig.servo(11).poke("torque_enable", 1)
-    (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
+    (problem,) = settled(execute, plan).problems
     assert "holds torque, so Return Delay Time (9) in its EEPROM was not written" in problem
     assert rig.writes() == []
 
@@ -98,7 +116,7 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read():
         write(data)
 
     line.write = listen
-    (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
+    (problem,) = settled(execute, plan).problems
     assert "did not answer when its torque was read, so Return Delay Time (9) was not written" in problem
     assert rig.writes() == []
 
@@ -106,13 +124,14 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read():
 def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     plan = declared(make_x((11, 12)), position_p_gain=900)
     rig, execute = bench(plan)
-    execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
+    settled(execute, plan)
     rig.servo(11).reset()
     rig.clock.wait_until(rig.clock.now_ns() + 2_000_000_000)
     assert held(rig, "position_p_gain") == 800
-    back = execute(rejoin(plan, 0, torque=True))
-    assert (back.problems, back.torqued) == ((), True)
-    assert back.written == (("arm_11_joint", "Position P Gain (84) was 800 and is 900"),)
+    torqued, found = rejoined(execute, plan, torque=True)
+    assert (found.problems, torqued) == ([], True)
+    text = "Position P Gain (84) was 800 and is 900"
+    assert found.texts(EventCode.REGISTER_WRITTEN) == [("arm_11_joint", text)]
     assert rig.torque() == [True, False]
     assert (
         abs(rig.servo(11).registers["goal_position"] * plan.servos[0].rad_per_tick - rig.servo(11).position)
@@ -123,12 +142,12 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
 def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
     plan = make_plan((1, 3))
     rig, execute = bench(plan)
-    back = execute(rejoin(plan, 0, torque=False))
-    assert (back.problems, back.torqued) == ((), False)
+    torqued, found = rejoined(execute, plan, torque=False)
+    assert (found.problems, torqued) == ([], False)
     assert rig.writes() == []
     rig.servo(1).poke("torque_enable", 1)
-    back = execute(rejoin(plan, 0, torque=False))
-    assert back.torqued
+    torqued, _ = rejoined(execute, plan, torque=False)
+    assert torqued
     assert rig.writes() == []  # it holds what it held
 
 
@@ -201,9 +220,9 @@ def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(pr
         wanted = sorted(others(table), key=lambda one: not one.eeprom)
         plan = replace(plan, servos=(replace(plan.servos[0], registers=tuple(wanted)),))
         rig, execute = bench(plan, position=1.5)
-        settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
-        assert settled.problems == []
-        assert len(settled.written) == len(rig.writes()) > 5, table.model
-        assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
+        found = settled(execute, plan)
+        assert found.problems == []
+        assert len(written(found)) == len(rig.writes()) > 5, table.model
+        assert written(settled(execute, plan)) == []
         memory = rig.buses[0].servos[0].registers
         assert all(memory.read(one.address, one.size) == one.data for one in wanted)

@@ -11,6 +11,7 @@ from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, start_rig
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.servo import watchdog
+from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
@@ -91,7 +92,7 @@ def _answer_once(rig):
     ("trick", "said"),
     [
         (lambda rig: rig.stick(12, "bus_watchdog", 0), "was given Bus Watchdog (98) = 10, but has 0"),
-        (_answer_once, "did not answer when its Bus Watchdog (98) was read back"),
+        (_answer_once, "did not answer when Bus Watchdog (98) was read back"),
     ],
 )
 def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(trick, said):
@@ -321,14 +322,14 @@ def run(program, answer):
     [
         (
             Reply(Outcome.TIMEOUT, 0, b"", 0, 0, False),
-            "did not answer when its Bus Watchdog (98) was read back",
+            "did not answer when Bus Watchdog (98) was read back",
         ),
         (Reply(Outcome.OK, 0, b"\x0a", 0, 0, False), "was given Bus Watchdog (98) = 0, but has 10"),
     ],
 )
 def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(reply, said):
     plan = arm()
-    sent, problem = run(watchdog.disarm(plan, plan.servos[0]), lambda _: reply)
+    sent, problem = run(watchdog.disarm(reach(plan, plan.servos[0])), lambda _: reply)
     assert protocol2.write(11, 98, b"\0") in sent
     assert said in problem
 
@@ -351,7 +352,7 @@ def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(
         data = b"" if packet[7] == 3 else b"\1\xff" if address == 11 else found.get(98, b"\xff")
         return Reply(Outcome.TIMEOUT if address == silent else Outcome.OK, 0, data, 0, 0, False)
 
-    _, problem = run(watchdog.disarm(plan, plan.servos[0]), answer)
+    _, problem = run(watchdog.disarm(reach(plan, plan.servos[0])), answer)
     assert said in problem
     assert bool(problem) == bool(said)
     assert set(found) == written

@@ -24,9 +24,9 @@ from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
 from dxlrun.dynamixel.servo.life import Done
 from dxlrun.dynamixel.servo.offline import ignore
-from dxlrun.dynamixel.servo.registers import reduced_torque_limits
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
+from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan

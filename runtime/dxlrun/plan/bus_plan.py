@@ -64,11 +64,15 @@ class GoalLayout(msgspec.Struct, frozen=True):
     pwm: Field | None = None
 
     @property
-    def position_place(self) -> Field:
-        """Where the position stands; raises LookupError for a block without."""
-        if self.position is None:
-            raise LookupError("no goal position stands in this block")
-        return self.position
+    def leading(self) -> Field:
+        """Where the goal stands that a servo follows: a position, else a speed, an effort or a PWM.
+
+        Raises LookupError for a block without any.
+        """
+        for place in (self.position, self.speed, self.effort, self.pwm):
+            if place is not None:
+                return place
+        raise LookupError("no goal stands in this block")
 
 
 class TorqueLimit(msgspec.Struct, frozen=True):

@@ -284,7 +284,7 @@ def _get(one: OneServo | OneDevice, asked: Asked) -> None:
 
 def _set(one: OneServo, asked: Asked) -> None:
     from dxlrun.compile.joints.registers import any_value
-    from dxlrun.dynamixel.servo.watchdog import shown
+    from dxlrun.dynamixel.servo.registers import shown
 
     name, text = asked.words
     if name in _ELSEWHERE:

@@ -24,6 +24,7 @@ from dxlrun.dynamixel.control_table.table import (
     ControlTable,
     EffortUnit,
     Encoding,
+    decoded,
     side_by_side,
 )
 
@@ -40,6 +41,7 @@ __all__ = [
     "added_control_tables",
     "all_tables",
     "control_table",
+    "decoded",
     "model_names",
     "models_by_number",
     "perhaps_meant",

@@ -69,6 +69,10 @@ class ControlItem(msgspec.Struct, frozen=True):
         """Return what the item's own bytes mean, SI units."""
         return self.decode(data) * self.scale
 
+    def integer(self, data: bytes | memoryview) -> int:
+        """Return the integer on the wire that the item's own bytes are, signed where the item is."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
     @property
     def title(self) -> str:
         """The item as the e-Manual writes it: `Torque Enable (24)`."""
@@ -204,3 +208,13 @@ def side_by_side(
         else:
             blocks.append([item])
     return tuple(map(tuple, blocks))
+
+
+def decoded(items: Iterable[ControlItem], start: int, data: bytes | memoryview) -> dict[str, int]:
+    """Return those of some items, by name, that lie whole in the bytes from an address on: signed ticks."""
+    found: dict[str, int] = {}
+    for item in items:
+        at = item.address - start
+        if 0 <= at <= len(data) - item.size:
+            found[item.name] = item.decode(data[at : at + item.size])
+    return found

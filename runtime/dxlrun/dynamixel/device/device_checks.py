@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import msgspec
 from msgspec.structs import replace
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.control_table import models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.plan.bus_plan import BusPlan, DevicePlan
@@ -20,16 +21,9 @@ _SILENCE_NS = 60_000_000
 """A board that waits for a status of an earlier chain gives up after 50 ms of silence (protocol.md)."""
 
 
-class DeviceSurvey(msgspec.Struct):
-    """What was found on one bus."""
-
-    problems: list[str] = []  # Why the robot must not start, one sentence each
-    devices: list[tuple[str, str]] = []  # Name, and what answered
-
-
-def survey_devices(plan: BusPlan) -> Program[DeviceSurvey]:
+def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
     """Look at every device of the bus, and collect all problems of all devices; only reads."""
-    found, line = DeviceSurvey(), setup_line(plan)
+    line = setup_line(plan)
     for device in plan.devices:
         ping = line.ping(device.servo_id)
         if (yield ping).outcome is Outcome.TIMEOUT:
@@ -39,8 +33,7 @@ def survey_devices(plan: BusPlan) -> Program[DeviceSurvey]:
             found.problems.append(f"{plan.label(device)} {problem}")
         else:
             text = f"{device.model}, ID {device.servo_id} on bus {plan.name}"
-            found.devices.append((device.name, text))
-    return found
+            found.note(EventCode.SETUP, Severity.INFO, device.name, text)
 
 
 def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str]:

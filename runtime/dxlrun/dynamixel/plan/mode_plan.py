@@ -219,7 +219,7 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
         to_goal, layout = Scale(table.rad_s_per_tick, table.max_speed_tick), position_layout(table)
         if many:
             # turns below 0 are in two's complement (e-Manual MX-28, Goal Position (30), Multi-turn Mode)
-            layout = replace(layout, position=replace(layout.position_place, encoding="twos_complement"))
+            layout = replace(layout, position=replace(layout.leading, encoding="twos_complement"))
         goals = (layout,)
         joint = replace(plain, mode=Mode.POSITION, operating=_selected(table, limits), goals=goals)
         found.append(replace(joint, speed=to_goal))

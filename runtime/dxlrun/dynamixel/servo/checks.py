@@ -13,13 +13,16 @@ from typing import NamedTuple
 
 import msgspec
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.line import Line, listen
+from dxlrun.dynamixel.control_table import ControlItem, decoded
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import servo_read
-from dxlrun.dynamixel.plan.retry import retry, setup_line
-from dxlrun.dynamixel.servo.watchdog import shown, tripped
+from dxlrun.dynamixel.plan.retry import retry
+from dxlrun.dynamixel.servo.access import Access, first_reach
+from dxlrun.dynamixel.servo.registers import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
@@ -84,19 +87,6 @@ _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
 
 _MOST_NAMED = 4  # Servos that a sentence about several names
 _SIMULATED = "sim"
-
-
-class BusSurvey(msgspec.Struct):
-    """What was found on one bus."""
-
-    problems: list[str] = []
-    """Why the robot must not start, one sentence each; one for all servos that do not answer."""
-    silent: list[ServoPlan] = []
-    differences: list[tuple[str, str]] = []
-    """Joint, and what its registers have that the robot file assumes otherwise."""
-    servos: list[tuple[str, str]] = []  # Joint, and what answered
-    modes: dict[int, Mode] = {}
-    """ID, and the mode in which the servo is; it is brought into its first one before it gets torque."""
 
 
 class Inspected(msgspec.Struct, frozen=True):
@@ -283,69 +273,72 @@ CHECKS: tuple[Check, ...] = (
 """In the order in which problems are reported; what each refuses is in failures.md."""
 
 
-def survey(plan: BusPlan, take_over: bool) -> Program[BusSurvey]:
+def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
     """Look at every servo of the bus, and collect all problems of all servos."""
-    found, line = BusSurvey(), setup_line(plan)
     yield listen(LISTEN_NS)
-    if plan.servos and (yield from _echoes(plan, line, found)):
-        return found
-    present: list[ServoPlan] = []
-    for servo in plan.servos:
-        if (yield from _answers(plan, servo, line, found)):
-            present.append(servo)
-    if found.silent:
-        found.problems.insert(0, _silence(plan, found.silent))
-    readable: list[ServoPlan] = []
-    for servo in present:
-        if (yield from inspect(plan, servo, line, found, take_over=take_over)):
-            readable.append(servo)
-    yield from inspect_states(plan, readable, line, found)
-    return found
+    every = [first_reach(plan, servo) for servo in plan.servos]
+    if every and (yield from _echoes(every[0], found)):
+        return
+    present: list[Access] = []
+    silent: list[ServoPlan] = []
+    for one in every:
+        answered = yield from _answers(one, found)
+        if answered is None:
+            silent.append(one.servo)
+        elif answered:
+            present.append(one)
+    if silent:
+        found.problems.insert(0, _silence(plan, silent))
+    readable: list[tuple[Access, Mode]] = []
+    for one in present:
+        mode = yield from inspect(one, found, take_over=take_over)
+        if mode is not None:
+            readable.append((one, mode))
+    yield from inspect_states(readable, found)
 
 
-def inspect(
-    plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey, *, take_over: bool
-) -> Program[bool]:
-    """Read what must fit the plan, and walk the table; return False when the servo cannot be read."""
-    items = control_table(servo.model, plan.protocol).items
-    declared = {one.name: one.value for one in servo.registers}
+def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
+    """Read what must fit the plan, and walk the table.
+
+    Returns the mode in which the servo is, which is brought into its first one before it gets torque; None
+    when it cannot be read.
+    """
+    plan, servo, items = one.plan, one.servo, one.items
+    declared = {each.name: each.value for each in servo.registers}
     values: dict[str, int] = {}
     for first, last in _BLOCKS[plan.protocol]:
         if first not in items or items[first].firmware > values.get("firmware_version", 1 << 16):
             continue
         start, end = items[first].address, items[last].address + items[last].size
-        reply = yield from retry(line.read(servo.servo_id, start, end - start))
+        reply = yield from one.read_bytes(start, end - start)
         if not reply.answered:
-            found.problems.append(f"{plan.label(servo)} {_unreadable(items, line, reply)}")
-            return False
-        for item in items.values():
-            if start <= item.address and item.address + item.size <= end:
-                at = item.address - start
-                raw = item.decode(reply.parameters[at : at + item.size])
-                values[item.name] = declared.get(item.name, raw)
+            found.problems.append(f"{one} {_unreadable(one, reply)}")
+            return None
+        read = decoded(items.values(), start, reply.parameters)
+        values |= {name: declared.get(name, raw) for name, raw in read.items()}
         if plan.protocol == 1.0 and first == "torque_enable":
             values[STATUS_ERROR] = reply.error
     text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
-    found.servos.append((servo.joint, text))
-    # torque control mode of Protocol 1.0 is RAM, and only of some models: it is not read here
-    found.modes[servo.servo_id] = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
+    found.note(EventCode.SETUP, Severity.INFO, servo.joint, text)
     inspected = Inspected(plan, servo, items, values, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
             sentence = check.sentence(inspected, values[check.item])
             if check.refuses:
-                found.problems.append(f"{plan.label(servo)} {sentence}")
+                found.problems.append(f"{one} {sentence}")
             else:
-                found.differences.append((servo.joint, sentence))
-    return True
+                found.note(EventCode.REGISTER_DIFFERS, Severity.WARNING, servo.joint, sentence)
+    # torque control mode of Protocol 1.0 is RAM, and only of some models: it is not read here
+    return mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
 
 
-def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: BusSurvey) -> Program[None]:
-    """Read every state twice: inside the limits, and no jump in between."""
+def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
+    """Read every state twice, each of a servo in a mode: inside the limits, and no jump in between."""
     before: dict[int, tuple[int, int]] = {}
     for again in (False, True):
-        for servo in servos:
-            reply = yield from retry(servo_read(line, servo))
+        for one, mode in servos:
+            servo = one.servo
+            reply = yield from retry(servo_read(one.line, servo))
             problem = ""
             if not reply.answered:
                 problem = "answers the reading of its state garbled: do two servos have its ID?"
@@ -357,27 +350,27 @@ def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Bu
                     problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
                 elif not again:
                     before[servo.servo_id] = raw, reply.sent_ns
-                    problem = _misplaced(servo, raw, found)
+                    problem = _misplaced(servo, raw, mode)
             if problem:
-                found.problems.append(f"{plan.label(servo)} {problem}")
+                found.problems.append(f"{one} {problem}")
 
 
-def _echoes(plan: BusPlan, line: Line, found: BusSurvey) -> Program[bool]:
+def _echoes(one: Access, found: Findings) -> Program[bool]:
     """Find out whether the adapter echoes: a read cannot be mistaken for its own answer."""
-    reply = yield line.read(plan.servos[0].servo_id, 0, 3)
+    reply = yield one.reading(0, 3)
     if reply.echoed:
         found.problems.append(
-            f"bus {plan.name}: the adapter at {plan.port} echoes what it sends; use one that switches its "
-            "receiver off while it sends"
+            f"bus {one.plan.name}: the adapter at {one.plan.port} echoes what it sends; use one that "
+            "switches its receiver off while it sends"
         )
     return reply.echoed
 
 
-def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey) -> Program[bool]:
-    """Ping a servo three times; report silence and collisions."""
+def _answers(one: Access, found: Findings) -> Program[bool | None]:
+    """Ping a servo three times; report collisions and loose contacts. None: it is silent."""
     answered = disturbed = 0
     for _ in range(PINGS):
-        reply = yield line.ping(servo.servo_id)
+        reply = yield one.line.ping(one.servo.servo_id)
         after = yield listen(LISTEN_NS)
         answered += reply.answered
         disturbed += bool(reply.strays or after.strays)
@@ -388,12 +381,11 @@ def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey) -> P
             "Connect them one by one and give each its own"
         )
     elif answered == 0:
-        found.silent.append(servo)
-        return False
+        return None
     elif answered < PINGS - 1:
         problem = f"answers only {answered} of {PINGS} pings: check its cable and power"
     if problem:
-        found.problems.append(f"{plan.label(servo)} {problem}")
+        found.problems.append(f"{one} {problem}")
     return not problem
 
 
@@ -417,19 +409,19 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
     )
 
 
-def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> str:
+def _unreadable(one: Access, reply: Reply) -> str:
     if reply.outcome is Outcome.TIMEOUT:
         return (
-            f"answers pings but no read: its {items['status_return_level'].title} is 0; write {RETURN_ALL} "
-            "there (writes are carried out, though not acknowledged)"
+            f"answers pings but no read: its {one.items['status_return_level'].title} is 0; write "
+            f"{RETURN_ALL} there (writes are carried out, though not acknowledged)"
         )
     if reply.outcome is Outcome.REFUSED:
-        return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
+        return f"refuses to be read{one.reason(reply)}"
     return "answers reads garbled: do two servos have its ID? If not, check cable and ground"
 
 
-def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
-    if found.modes.get(servo.servo_id) != servo.start_mode:
+def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
+    if mode != servo.start_mode:
         return ""  # its position counts in another mode; it is looked at again before it gets torque
     if not servo.torque_at_start:
         return ""  # a person moves it as far as it goes; `hold` looks at it before it gets torque

@@ -42,8 +42,11 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
+from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Program
 
 
 @unique
@@ -89,56 +92,45 @@ class ServoEvent(Enum):
 
 _ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
 """From every state in which a servo is read."""
+_S, _E = ServoState, ServoEvent
 
 TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
     {
-        ServoState.LIMP: {
-            ServoEvent.ENGAGED: ServoState.HOLDING,
-            ServoEvent.REQUESTED: ServoState.LIMP,
-            ServoEvent.RETURNED: ServoState.STOPPED,
-            ServoEvent.TORQUE_OFF: ServoState.LIMP,
-            ServoEvent.DOUBT: ServoState.LIMP,
-            ServoEvent.WATCHDOG: ServoState.LIMP,
+        _S.LIMP: {
             **_ONLINE,
+            **dict.fromkeys((_E.REQUESTED, _E.TORQUE_OFF, _E.DOUBT, _E.WATCHDOG), _S.LIMP),
+            _E.ENGAGED: _S.HOLDING,
+            _E.RETURNED: _S.STOPPED,
         },
-        ServoState.HOLDING: {
-            ServoEvent.TORQUE_ON: ServoState.TORQUED,
-            ServoEvent.TORQUE_OFF: ServoState.LIMP,
-            ServoEvent.DOUBT: ServoState.HOLDING,
-            ServoEvent.WATCHDOG: ServoState.STOPPED,
+        _S.HOLDING: {
             **_ONLINE,
+            _E.DOUBT: _S.HOLDING,
+            _E.TORQUE_ON: _S.TORQUED,
+            _E.TORQUE_OFF: _S.LIMP,
+            _E.WATCHDOG: _S.STOPPED,
         },
-        ServoState.TORQUED: {
-            ServoEvent.DOUBT: ServoState.HOLDING,
-            ServoEvent.WATCHDOG: ServoState.STOPPED,
+        _S.TORQUED: {**_ONLINE, _E.DOUBT: _S.HOLDING, _E.WATCHDOG: _S.STOPPED},
+        _S.STOPPED: {
             **_ONLINE,
+            **dict.fromkeys((_E.DOUBT, _E.WATCHDOG), _S.STOPPED),
+            _E.TORQUE_ON: _S.RETURNING,
+            _E.TORQUE_OFF: _S.LIMP,
         },
-        ServoState.STOPPED: {
-            ServoEvent.TORQUE_ON: ServoState.RETURNING,
-            ServoEvent.TORQUE_OFF: ServoState.LIMP,
-            ServoEvent.DOUBT: ServoState.STOPPED,
-            ServoEvent.WATCHDOG: ServoState.STOPPED,
+        _S.RETURNING: {
             **_ONLINE,
+            **dict.fromkeys((_E.DOUBT, _E.WATCHDOG), _S.STOPPED),
+            _E.CAUGHT_UP: _S.TORQUED,
         },
-        ServoState.RETURNING: {
-            ServoEvent.CAUGHT_UP: ServoState.TORQUED,
-            ServoEvent.DOUBT: ServoState.STOPPED,
-            ServoEvent.WATCHDOG: ServoState.STOPPED,
+        _S.OFFLINE: {
+            # of RELEASE, `Loss.released` is kept until the servo is back
+            **dict.fromkeys((_E.DOUBT, _E.LOST, _E.RELEASE), _S.OFFLINE),
+            _E.RETURNED: _S.STOPPED,
+            _E.RETURNED_LIMP: _S.LIMP,
+        },
+        _S.RELEASED: {
             **_ONLINE,
-        },
-        ServoState.OFFLINE: {
-            ServoEvent.RETURNED: ServoState.STOPPED,
-            ServoEvent.RETURNED_LIMP: ServoState.LIMP,
-            ServoEvent.DOUBT: ServoState.OFFLINE,
-            ServoEvent.LOST: ServoState.OFFLINE,
-            ServoEvent.RELEASE: ServoState.OFFLINE,  # `Loss.released` keeps it until the servo is back
-        },
-        ServoState.RELEASED: {
-            ServoEvent.REQUESTED: ServoState.LIMP,
-            ServoEvent.TORQUE_OFF: ServoState.RELEASED,
-            ServoEvent.DOUBT: ServoState.RELEASED,
-            ServoEvent.WATCHDOG: ServoState.RELEASED,
-            **_ONLINE,
+            **dict.fromkeys((_E.TORQUE_OFF, _E.DOUBT, _E.WATCHDOG), _S.RELEASED),
+            _E.REQUESTED: _S.LIMP,
         },
     }
 )
@@ -149,19 +141,13 @@ IN_DOUBT = frozenset((ServoState.HOLDING, ServoState.STOPPED))
 """Their torque enable is read as soon as there is time for it."""
 POWERLESS = frozenset((ServoState.LIMP, ServoState.RELEASED))
 _SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE))
-
-
-_SHOWN: Mapping[ServoState, Torque] = MappingProxyType(
-    {
-        ServoState.LIMP: Torque.OFF,
-        ServoState.HOLDING: Torque.DOUBT,
-        ServoState.TORQUED: Torque.ON,
-        ServoState.STOPPED: Torque.DOUBT,
-        ServoState.RETURNING: Torque.ON,
-        ServoState.OFFLINE: Torque.LOST,
-        ServoState.RELEASED: Torque.RELEASED,
-    }
-)
+_SHOWN: Mapping[ServoState, Torque] = {
+    **dict.fromkeys(GETS_GOALS, Torque.ON),
+    **dict.fromkeys(IN_DOUBT, Torque.DOUBT),
+    ServoState.LIMP: Torque.OFF,
+    ServoState.OFFLINE: Torque.LOST,
+    ServoState.RELEASED: Torque.RELEASED,
+}
 """What the robot's states have of a servo's state."""
 
 Done = Callable[[str], None]
@@ -195,19 +181,17 @@ class Loss(msgspec.Struct):
 
 
 class Life:
-    """The state of each servo of one bus, and what follows from it."""
+    """The state of each servo of one bus, and what follows from it; programs that drive it wait in `idle`."""
 
-    def __init__(
-        self, plan: BusPlan, reads: CyclicReads, events: EventSink, now_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, plan: BusPlan, reads: CyclicReads, idle: IdleScheduler, events: EventSink) -> None:
         count = len(plan.servos)
-        self._plan = plan
-        self._events = events
-        self._now_ns = now_ns
         self._all_torqued = b"\1" * count
+        self.plan = plan
+        self.events = events
+        self.idle = idle
         self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
         self.states = [ServoState.LIMP] * count  # The state of each servo
-        self.losses: list[Loss | None] = [None] * count  # Of each servo that is OFFLINE
+        self.losses: dict[int, Loss] = {}  # Of each servo that is OFFLINE, by its index
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): the servos that get goals; memory that the exchange kernel shares."""
         self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
@@ -221,22 +205,23 @@ class Life:
         before = self.states[index]
         after = TRANSITIONS[before].get(event)
         if after is None:
-            name = self._plan.label(self._plan.servos[index])
-            raise IllegalTransition(f"{name} is {before.value}, where {event.value} cannot happen")
+            raise IllegalTransition(
+                f"{self.name(index)} is {before.value}, where {event.value} cannot happen"
+            )
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
         if after is not before:
             self._show(index, _SHOWN[after])
-        slow = RETURN_SPEED * self._plan.servos[index].ratio
+        slow = RETURN_SPEED * self.plan.servos[index].ratio
         self.ceiling[index] = slow if after in _SLOW else np.nan
-        loss = self.losses[index]
+        loss = self.losses.get(index)
         if event is ServoEvent.LOST:
             self.losses[index] = self._loss(before, loss)
             self.reads.leave(index)
         elif loss is not None and event is ServoEvent.RELEASE:
             loss.released = True
         elif loss is not None and after is not ServoState.OFFLINE:
-            self.losses[index] = None
+            del self.losses[index]
             self.reads.join(index)
         return after
 
@@ -244,7 +229,6 @@ class Life:
         """Take a servo out of the exchange, to be probed after a while until it is in order."""
         self.on(index, ServoEvent.LOST)
         loss = self.losses[index]
-        assert loss is not None  # noqa: S101  a servo that is lost has one
         loss.probe_at_ns += probe_after_ns
         return loss
 
@@ -257,7 +241,7 @@ class Life:
 
     def answered(self, index: int) -> None:
         """Show a servo whose requested reboot is over and that is still OFFLINE as lost."""
-        if self.states[index] is ServoState.OFFLINE:
+        if self.offline(index):
             self._show(index, Torque.LOST)
 
     def _show(self, index: int, torque: Torque) -> None:
@@ -272,7 +256,7 @@ class Life:
             limp_reported=powerless,
             released=before is ServoState.RELEASED if earlier is None else earlier.released,
             rebooted=earlier is not None and earlier.rebooted,
-            probe_at_ns=self._now_ns(),
+            probe_at_ns=self.now_ns(),
             reboot=None if earlier is None else earlier.reboot,
         )
 
@@ -285,13 +269,28 @@ class Life:
         """Return whether a servo is out of the exchange."""
         return self.states[index] is ServoState.OFFLINE
 
+    def now_ns(self) -> int:
+        """Return the time."""
+        return self.idle.now_ns()
+
+    def reach(self, index: int) -> Access:
+        """Return the access to a servo."""
+        return reach(self.plan, self.plan.servos[index])
+
+    def name(self, index: int) -> str:
+        """Return what messages call a servo."""
+        return self.plan.label(self.plan.servos[index])
+
+    def do(self, index: int, program: Program[None], what: str, urgency: Urgency = Urgency.REPAIR) -> None:
+        """Let a program about a servo be carried out in idle time; `what`: as `torque enable`."""
+        self.idle.add(program, urgency, f"{what} of {self.name(index)}", index)
+
     def report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         """Log an event of a servo; `text` stands behind its name."""
-        servo = self._plan.servos[index]
-        self._events.emit(code, severity, servo.joint, f"{self._plan.label(servo)} {text}")
+        self.events.emit(code, severity, self.plan.servos[index].joint, f"{self.name(index)} {text}")
 
     def report_limp(self, index: int, enabled: int) -> None:
         """Log that a servo was found without torque."""
-        item = f"Torque Enable ({self._plan.servos[index].torque_address})"
+        item = f"Torque Enable ({self.plan.servos[index].torque_address})"
         text = f"has {item} = {enabled}: it was reset or its torque was cut; it gets no goals"
         self.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)

@@ -9,18 +9,19 @@ Angle Limit (6, 8) and Torque Control Mode Enable (70).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import msgspec
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import watchdog
-from dxlrun.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply
+from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.torque_limits import SILENT, limits_positions
+from dxlrun.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit
+from dxlrun.plan.transaction import Program
 
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
@@ -56,8 +57,7 @@ def never() -> Program[bool]:
 
 
 def enter(
-    plan: BusPlan,
-    servo: ServoPlan,
+    one: Access,
     mode: Mode,
     *,
     again: bool = True,
@@ -70,94 +70,87 @@ def enter(
     `hold`. `rebooted` finds out whether the servo rebooted meanwhile: then it is left without torque, and
     what is returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
     """
-    desired, line = servo.mode_plan(mode), plan_line(plan)
-    torque = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
-    names = [register.name for register in desired.operating]
-    found = yield from _read_items(plan, servo, names)
+    desired = one.servo.mode_plan(mode)
+    torque = yield from one.read_bytes(one.servo.torque_address, 1)
+    found = yield from one.read(register.name for register in desired.operating)
     if not torque.answered or found is None:
         return "did not answer when its mode was read"
     enabled = bool(torque.parameters[0])
     problem = ""
     if not in_mode(desired, found):
-        problem = yield from _change(plan, servo, desired, found, enabled=enabled)
+        problem = yield from _change(one, desired, found, enabled=enabled)
     elif not again:
         return ""
     if enabled and (yield from rebooted()):
         return STARTED_ANEW
     if problem and enabled:
         # a joint that does not change shall not fall for that
-        now = yield from mode_now(plan, servo)
+        now = yield from mode_now(one)
         if now is not Mode.UNKNOWN:
-            back = yield from hold(plan, servo, servo.mode_plan(now), inward=inward)
+            back = yield from hold(one, now, inward=inward)
             problem += f", and {back.problem}" if back.problem else ""
     elif enabled:
-        problem = (yield from hold(plan, servo, desired, inward=inward)).problem
+        problem = (yield from hold(one, mode, inward=inward)).problem
     if enabled and (yield from rebooted()):
         # between that look and torque on
-        yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
+        yield from one.torque_off()
         return STARTED_ANEW
     return problem
 
 
-class SettledModes(msgspec.Struct):
-    """What came of the modes of one bus' servos before they get torque."""
+def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, int]]]:
+    """Bring every servo into its first mode, where it is in another one, before it gets torque.
 
-    problems: list[str] = []  # Why a servo is not in its first mode, one sentence each
-    switched: list[tuple[str, str]] = []  # Joint, and what its mode had been
-    limits: list[Mapping[OwnLimit, int]] = []
-    """Of each servo, in the order of the plan's: the limits beyond which it refuses goals, ticks."""
-
-
-def settle_modes(plan: BusPlan) -> Program[SettledModes]:
-    """Bring every servo into its first mode, where it is in another one, and read its own limits."""
-    settled = SettledModes()
+    Returns, in the order of the plan's servos, the limits beyond which each refuses goals, ticks.
+    """
+    limits = []
     for servo in plan.servos:
-        settled.limits.append((yield from read_limits(plan, servo)))
+        one = reach(plan, servo)
+        limits.append((yield from read_limits(one)))
         desired = servo.mode_plan(servo.start_mode)
-        found = yield from _read_items(plan, servo, [register.name for register in desired.operating])
-        if found is not None and in_mode(desired, found):
+        before = yield from one.read(register.name for register in desired.operating)
+        if before is not None and in_mode(desired, before):
             continue
         # one that has torque takes no goal while its watchdog has stopped it
-        problem = yield from watchdog.disarm(plan, servo)
-        problem = problem or (yield from enter(plan, servo, servo.start_mode))
-        if problem or found is None:
+        problem = yield from watchdog.disarm(one)
+        problem = problem or (yield from enter(one, servo.start_mode))
+        if problem or before is None:
             problem = problem or "did not answer when its mode was read"
-            settled.problems.append(f"{plan.label(servo)} {problem}")
+            found.problems.append(f"{one} {problem}")
             continue
-        items = _items(plan, servo)
-        was = ", ".join(f"{items[name].title} was {value}" for name, value in found.items())
+        was = ", ".join(f"{one.items[name].title} was {value}" for name, value in before.items())
         words = servo.start_mode.name.lower().replace("_", "-")
-        settled.switched.append((servo.joint, f"{was}: {plan.label(servo)} was brought into {words} mode"))
-    return settled
+        text = f"{was}: {one} was brought into {words} mode"
+        found.note(EventCode.MODE, Severity.WARNING, servo.joint, text)
+    return limits
 
 
-def mode_now(plan: BusPlan, servo: ServoPlan) -> Program[Mode]:
+def mode_now(one: Access) -> Program[Mode]:
     """Read in which mode a servo is; UNKNOWN where it does not answer, or the plan has none for it."""
-    names = dict.fromkeys(register.name for mode in servo.modes for register in mode.operating)
-    found = yield from _read_items(plan, servo, list(names))
-    return Mode.UNKNOWN if found is None else mode_in(servo, found)
+    names = dict.fromkeys(register.name for mode in one.servo.modes for register in mode.operating)
+    found = yield from one.read(names)
+    return Mode.UNKNOWN if found is None else mode_in(one.servo, found)
 
 
-def read_limits(plan: BusPlan, servo: ServoPlan) -> Program[dict[OwnLimit, int]]:
+def read_limits(one: Access) -> Program[dict[OwnLimit, int]]:
     """Read the limits beyond which a servo refuses goals, ticks; what it does not answer is left out."""
     found: dict[OwnLimit, int] = {}
-    for limit in servo.own_limits:
-        reply = yield from retry(plan_line(plan).read(servo.servo_id, limit.address, limit.size))
+    for limit in one.servo.own_limits:
+        reply = yield from one.read_bytes(limit.address, limit.size)
         if reply.answered:
             found[limit] = reply.word(limit.size)
     return found
 
 
-def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = False) -> Program[Held]:
+def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
     """Hold a servo where it stands: a goal that moves nothing, torque on, both read back.
 
     One that stands outside its limits is refused; `inward`: it goes back to them, slowly, because one that
     followed an effort may have coasted over them, and without torque it would fall.
     """
-    line, position = plan_line(plan), None
+    servo, mode, position = one.servo, one.servo.mode_plan(wanted), None
     if mode.goals[-1].position is not None:
-        block = servo.state
-        state = yield from retry(line.read(servo.servo_id, block.address, block.length))
+        state = yield from one.read_bytes(servo.state.address, servo.state.length)
         if not state.answered:
             return Held("did not answer when torque was to be switched on")
         present = servo.state.position.tick(state.parameters)
@@ -168,73 +161,43 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
             return Held("stands outside its limits, or left them before torque was switched on")
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
-        most_effort, problem = yield from _most_effort(plan, servo, mode)
+        most_effort, problem = yield from _most_effort(one, mode)
         if problem:
             return Held(problem)
     # the goal comes first: torque on a stale goal would move the joint
-    writes = [(layout, _resting(mode, layout, position, most_effort)) for layout in mode.goals]
-    for layout, data in writes:
-        reply = yield from retry(line.write(servo.servo_id, layout.address, data))
+    data = b""
+    for layout in mode.goals:
+        data = _resting(mode, layout, position, most_effort)
+        reply = yield from one.write_bytes(layout.address, data)
         if not reply.answered:
-            return Held("did not acknowledge its goal" + _reason(plan, reply))
-    reply = yield from retry(line.write(servo.servo_id, servo.torque_address, b"\x01"))
+            return Held(f"did not acknowledge its goal{one.reason(reply)}")
+    reply = yield from one.write_bytes(servo.torque_address, b"\x01")
     if not reply.answered:
-        return Held("did not acknowledge torque enable" + _reason(plan, reply))
-    problem = yield from _read_back(plan, servo, *writes[-1])
+        return Held(f"did not acknowledge torque enable{one.reason(reply)}")
+    problem = yield from _read_back(one, mode.goals[-1], data)
     return Held(problem, None if problem else position)
 
 
-def unlimit(plan: BusPlan, servo: ServoPlan, mode: Mode) -> Program[str]:
-    """Give a servo all of its torque again in a mode without a limit, where another one has limited it.
-
-    It holds already: with an old goal it would spring back. Returns what went wrong, or nothing. One that
-    shut itself down is left alone: the write would revive it.
-    """
-    place = servo.torque_limit
-    limited = any(_in_torque_limit(servo, one) for one in servo.modes)
-    if place is None or not limited or _in_torque_limit(servo, servo.mode_plan(mode)):
-        return ""
-    full = yield from retry(plan_line(plan).read(servo.servo_id, place.full_address, place.size))
-    now = yield from retry(plan_line(plan).read(servo.servo_id, place.address, place.size))
-    if not (full.answered and now.answered):
-        return "did not answer when its torque limit was read"
-    most, present = (reply.word(place.size) for reply in (full, now))
-    if present in {0, most}:
-        return ""
-    most = min(most, _items(plan, servo)["torque_limit"].maximum)  # its answer may be anything
-    return (yield from _write(plan, servo, "torque_limit", most))
-
-
-def _in_torque_limit(servo: ServoPlan, mode: ModePlan) -> bool:
-    """Return whether the effort of positions is limited by what policies reduce, too: Torque Limit (34)."""
-    place = servo.torque_limit
-    return (
-        mode.mode is Mode.EFFORT_POSITION
-        and place is not None
-        and any(goal.address == place.address for goal in mode.goals)
-    )
-
-
-def _most_effort(plan: BusPlan, servo: ServoPlan, mode: ModePlan) -> Program[tuple[int, str]]:
+def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
     """Return the servo's own limit of the effort, ticks, and why it must not be its goal, or nothing.
 
     Where the goal is its Torque Limit, 0 shows a shutdown, which a goal would undo.
     """
-    limits = yield from read_limits(plan, servo)
+    limits = yield from read_limits(one)
     most = next((value for limit, value in limits.items() if limit.of == "effort"), 0)
-    place = servo.torque_limit
-    if place is None or not _in_torque_limit(servo, mode):
+    place = one.servo.torque_limit
+    if place is None or not limits_positions(one.servo, mode):
         return most, ""
-    reply = yield from retry(plan_line(plan).read(servo.servo_id, place.address, place.size))
+    reply = yield from one.read_bytes(place.address, place.size)
     if not (most and reply.answered):
-        return 0, "did not answer when its torque limit was read"
+        return 0, SILENT
     return most, "" if any(reply.parameters) else f"has {place.name} = 0: it shut itself down"
 
 
 def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effort: int) -> bytes:
     """Return a block of goals that moves nothing: the present position with full effort, else 0."""
     block = bytearray(layout.length)
-    goals = []
+    goals: list[tuple[Field, int]] = []
     if layout.position is not None and position is not None:
         goals.append((layout.position, position))
         if layout.speed is not None and mode.speed is not None:
@@ -250,18 +213,15 @@ def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effo
     return bytes(block)
 
 
-def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes) -> Program[str]:
-    line, torque = plan_line(plan), servo.torque_address
-    place = layout.position or layout.speed or layout.effort or layout.pwm
-    assert place is not None  # noqa: S101  a block of goals has one
+def _read_back(one: Access, layout: GoalLayout, data: bytes) -> Program[str]:
+    torque, place = one.servo.torque_address, layout.leading
     start, end = layout.address + place.offset, layout.address + place.offset + place.size
-    table = control_table(servo.model, plan.protocol)
-    if torque < start and end - torque <= LONGEST_BACK and table.readable(torque, end):
-        replies = [(yield from retry(line.read(servo.servo_id, torque, end - torque)))]
+    if torque < start and end - torque <= LONGEST_BACK and one.table.readable(torque, end):
+        replies = [(yield from one.read_bytes(torque, end - torque))]
     else:
         replies = [
-            (yield from retry(line.read(servo.servo_id, torque, 1))),
-            (yield from retry(line.read(servo.servo_id, start, place.size))),
+            (yield from one.read_bytes(torque, 1)),
+            (yield from one.read_bytes(start, place.size)),
         ]
     if not all(reply.answered for reply in replies):
         return "did not answer when its torque was read back"
@@ -274,84 +234,42 @@ def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes)
     return ""
 
 
-def _change(
-    plan: BusPlan, servo: ServoPlan, desired: ModePlan, found: Mapping[str, int], *, enabled: bool
-) -> Program[str]:
+def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled: bool) -> Program[str]:
     """Change the mode with torque off, and give the servo again what it forgets over that."""
-    line = plan_line(plan)
-    kept = yield from _read_items(plan, servo, _forgotten(plan, servo, desired, found))
+    kept = yield from one.read(_forgotten(one, desired, found))
     if kept is None:
         return "did not answer when its gains were read before its mode was changed"
     if enabled:
-        reply = yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
+        reply = yield from one.torque_off()
         if not reply.answered:
-            return "did not acknowledge torque off before its mode was changed" + _reason(plan, reply)
+            return f"did not acknowledge torque off before its mode was changed{one.reason(reply)}"
     for register in desired.operating:
         if found[register.name] != register.value and (
-            problem := (yield from _write(plan, servo, register.name, register.value))
+            problem := (yield from one.write(register.name, register.value))
         ):
             return problem
-    now = yield from _read_items(plan, servo, list(kept))
+    now = yield from one.read(kept)
     if now is None:
         return "did not answer when its gains were read after its mode was changed"
-    items, declared = _items(plan, servo), {register.name for register in servo.registers}
+    declared = {register.name for register in one.servo.registers}
     for name, value in kept.items():
         # what had its initial value begins with the one of the new mode, which may be another
         if (
             now[name] != value
-            and (value != items[name].initial or name in declared)
-            and (problem := (yield from _write(plan, servo, name, value)))
+            and (value != one.items[name].initial or name in declared)
+            and (problem := (yield from one.write(name, value)))
         ):
             return problem
     return ""
 
 
-def _forgotten(
-    plan: BusPlan, servo: ServoPlan, desired: ModePlan, found: Mapping[str, int]
-) -> tuple[str, ...]:
+def _forgotten(one: Access, desired: ModePlan, found: Mapping[str, int]) -> tuple[str, ...]:
     """Return the items whose values a change of the operating mode resets, and that outlive it."""
-    items = _items(plan, servo)
+    items = one.items
     if "operating_mode" not in items:
         return ()
     names = [name for name in _RESET if name in items]
-    names += [register.name for register in servo.registers if not register.eeprom]
-    if Mode.PWM not in {desired.mode, mode_in(servo, found)} and "goal_pwm" in items:
+    names += [register.name for register in one.servo.registers if not register.eeprom]
+    if Mode.PWM not in {desired.mode, mode_in(one.servo, found)} and "goal_pwm" in items:
         names.append("goal_pwm")  # it limits every other mode, for a policy too
     return tuple(dict.fromkeys(names))
-
-
-def _write(plan: BusPlan, servo: ServoPlan, name: str, value: int) -> Program[str]:
-    line, item = plan_line(plan), _items(plan, servo)[name]
-    reply = yield from retry(line.write(servo.servo_id, item.address, item.encode(value)))
-    if reply.outcome is Outcome.REFUSED:
-        return f"refuses {item.title} = {value}" + _reason(plan, reply)
-    back = yield from retry(line.read(servo.servo_id, item.address, item.size))
-    if not back.answered:
-        return f"did not answer when {item.title} was read back"
-    has = item.decode(back.parameters)
-    return "" if has == value else f"was given {item.title} = {value}, but has {has}"
-
-
-def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Program[dict[str, int] | None]:
-    """Read items, those side by side at once; None when one of them does not come."""
-    values: dict[str, int] = {}
-    for block in side_by_side(_items(plan, servo)[name] for name in names):
-        start, end = block[0].address, block[-1].address + block[-1].size
-        if end - start == 1 and control_table(servo.model, plan.protocol).readable(start, end + 1):
-            end += 1  # torque enable is one byte, too: a late answer to that is none to this
-        reply = yield from retry(plan_line(plan).read(servo.servo_id, start, end - start))
-        if not reply.answered:
-            return None
-        for item in block:
-            at = item.address - start
-            values[item.name] = item.decode(reply.parameters[at : at + item.size])
-    return values
-
-
-def _items(plan: BusPlan, servo: ServoPlan) -> Mapping[str, ControlItem]:
-    return control_table(servo.model, plan.protocol).items
-
-
-def _reason(plan: BusPlan, reply: Reply) -> str:
-    dialect = plan_line(plan).dialect
-    return f": {dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""

@@ -6,12 +6,8 @@ from collections import deque
 from typing import NamedTuple
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.idle import IdleScheduler
-from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo.life import Life
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
 TICK_MODULUS_MS = 32_768
@@ -26,49 +22,43 @@ TOO_MANY_REBOOTS = 2
 """So many within a minute, and a servo gets no torque back in this run (failures.md)."""
 
 
-class _Reading(NamedTuple):
+class TickReading(NamedTuple):
+    """A servo's millisecond counter, which a reboot sets back to 0."""
+
     tick: int
     middle_ns: int
     half_ms: float  # The tick was read within this time around the middle
 
-
-class RealtimeTicks:
-    """Compares a servo's millisecond counter with the host's clock: a reboot sets it back to 0."""
-
-    def __init__(self, servos: int) -> None:
-        self._last: list[_Reading | None] = [None] * servos
-
-    def rebooted(self, servo: int, reply: Reply) -> bool | None:
-        """Take a reading of Realtime Tick; return whether the servo rebooted since the one before.
-
-        None: there was none before, or it is too long ago to know.
-        """
+    @classmethod
+    def of(cls, reply: Reply) -> TickReading:
+        """Return the reading that a reply is."""
         half_ns = (reply.last_ns - reply.sent_ns) // 2
-        now = _Reading(reply.word(), reply.sent_ns + half_ns, half_ns * 1e-6)
-        before, self._last[servo] = self._last[servo], now
-        if before is None or now.middle_ns - before.middle_ns > BLIND_NS:
+        return cls(reply.word(), reply.sent_ns + half_ns, half_ns * 1e-6)
+
+    def rebooted(self, before: TickReading | None) -> bool | None:
+        """Return whether the servo rebooted since a reading; None: that is too long ago to know, or none."""
+        if before is None or self.middle_ns - before.middle_ns > BLIND_NS:
             return None
-        elapsed_ms = (now.middle_ns - before.middle_ns) * 1e-6
+        elapsed_ms = (self.middle_ns - before.middle_ns) * 1e-6
         half = TICK_MODULUS_MS / 2
-        off = (now.tick - before.tick - elapsed_ms + half) % TICK_MODULUS_MS - half
-        return abs(off) > DRIFT * elapsed_ms + SLACK_MS + now.half_ms + before.half_ms
+        off = (self.tick - before.tick - elapsed_ms + half) % TICK_MODULUS_MS - half
+        return abs(off) > DRIFT * elapsed_ms + SLACK_MS + self.half_ms + before.half_ms
 
 
 class RebootCount:
-    """Counts the reboots of each servo; after two within a minute it gets no torque back."""
+    """Counts the reboots of a servo; after two within a minute it gets no torque back."""
 
-    def __init__(self, servos: int) -> None:
-        self._times: list[deque[int]] = [deque(maxlen=TOO_MANY_REBOOTS) for _ in range(servos)]
-        self.exhausted = [False] * servos
-        """True for a servo that rebooted TOO_MANY_REBOOTS times within a minute, ever."""
+    def __init__(self) -> None:
+        self._times: deque[int] = deque(maxlen=TOO_MANY_REBOOTS)
+        self.exhausted = False  # It rebooted TOO_MANY_REBOOTS times within a minute, ever
 
-    def add(self, servo: int, now_ns: int) -> bool:
+    def add(self, now_ns: int) -> bool:
         """Count a reboot; return whether it is the one too many."""
-        times = self._times[servo]
+        times = self._times
         times.append(now_ns)
-        if self.exhausted[servo] or len(times) < TOO_MANY_REBOOTS or now_ns - times[0] > WITHIN_NS:
+        if self.exhausted or len(times) < TOO_MANY_REBOOTS or now_ns - times[0] > WITHIN_NS:
             return False
-        self.exhausted[servo] = True
+        self.exhausted = True
         return True
 
 
@@ -78,28 +68,26 @@ class Reboots:
     There a lit LED shows them, which a reboot puts out, from `watch` to `unwatch`.
     """
 
-    def __init__(self, plan: BusPlan, idle: IdleScheduler, life: Life) -> None:
-        count = len(plan.servos)
-        self._plan = plan
-        self._idle = idle
+    def __init__(self, life: Life) -> None:
+        count = len(life.plan.servos)
         self._life = life
-        self._lamps = [_lamp(plan, index) for index in range(count)]
         self._lit: list[int | None] = [None] * count
         """What the LED was before it was lit for `watch`; None: it is not watched."""
-        self._ticks = RealtimeTicks(count)
-        self._count = RebootCount(count)
-        self._reads = [_tick_read(plan, index) for index in range(count)]
+        self._ticks: list[TickReading | None] = [None] * count
+        self._counts = [RebootCount() for _ in range(count)]
 
     def read(self, index: int) -> Transaction | None:
         """Return the read of a servo's Realtime Tick; None where it has none."""
-        return self._reads[index]
+        one = self._life.reach(index)
+        item = one.items.get("realtime_tick")
+        return None if item is None else one.reading(item.address, item.size)
 
     def tick(self, index: int) -> Program[bool]:
         """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted.
 
         Of a servo without one that is watched: whether its LED is out.
         """
-        read = self._reads[index]
+        read = self.read(index)
         if read is not None:
             return bool(self.judge(index, (yield from retry(read))))
         if self._lit[index] is None or (yield from self._lamp_is(index)) != 0:
@@ -110,66 +98,58 @@ class Reboots:
 
     def watch(self, index: int) -> Program[bool]:
         """Let `tick` show each reboot from now on; return whether there was one before."""
-        lamp, servo = self._lamps[index], self._plan.servos[index]
+        lamp = self._lamp(index)
         if lamp is not None and self._lit[index] is None:
             self._lit[index] = yield from self._lamp_is(index)
             if self._lit[index] == 0:
-                yield from retry(plan_line(self._plan).write(servo.servo_id, lamp, b"\1"))
+                yield from self._life.reach(index).write_bytes(lamp, b"\1")
                 if (yield from self._lamp_is(index)) != 1:
                     self._lit[index] = None
         return (yield from self.tick(index))
 
     def unwatch(self, index: int) -> Program[None]:
         """Put out the LED that `watch` lit."""
-        before, lamp, servo = self._lit[index], self._lamps[index], self._plan.servos[index]
+        before, lamp = self._lit[index], self._lamp(index)
         self._lit[index] = None
         if before == 0 and lamp is not None:
-            yield from retry(plan_line(self._plan).write(servo.servo_id, lamp, b"\0"))
+            yield from self._life.reach(index).write_bytes(lamp, b"\0")
+
+    def _lamp(self, index: int) -> int | None:
+        """Return where a servo without a clock has an LED behind torque enable; None: there is none."""
+        one = self._life.reach(index)
+        item = None if "realtime_tick" in one.items else one.items.get("led", one.items.get("led_red"))
+        return item.address if item is not None and item.address == one.servo.torque_address + 1 else None
 
     def _lamp_is(self, index: int) -> Program[int | None]:
         """Read an LED, behind torque enable: a late answer to that alone is none to this."""
-        servo = self._plan.servos[index]
-        reply = yield from retry(plan_line(self._plan).read(servo.servo_id, servo.torque_address, 2))
+        reply = yield from self._life.reach(index).read_bytes(self._life.plan.servos[index].torque_address, 2)
         return reply.parameters[1] if reply.answered else None
 
     def judge(self, index: int, reply: Reply) -> bool | None:
         """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""
-        if self._reads[index] is None or not reply.answered:
+        if self.read(index) is None or not reply.answered:
             return None
-        rebooted = self._ticks.rebooted(index, reply)
+        before, now = self._ticks[index], TickReading.of(reply)
+        self._ticks[index] = now
+        rebooted = now.rebooted(before)
         if rebooted:
             self.count(index)
         return rebooted
 
     def count(self, index: int) -> None:
         """Report a reboot, and count it unless a client requested it."""
-        loss = self._life.losses[index]
+        life, loss = self._life, self._life.losses.get(index)
         if loss is not None:
             loss.rebooted, loss.had_torque = True, False
             if loss.reboot is not None:
-                text = "started anew, as requested"
-                self._life.report(EventCode.SERVO_REBOOTED, Severity.INFO, index, text)
+                life.report(EventCode.SERVO_REBOOTED, Severity.INFO, index, "started anew, as requested")
                 return
         text = "started anew: it was without power, or something rebooted it"
-        self._life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
-        if self._count.add(index, self._idle.now_ns()):
+        life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+        if self._counts[index].add(life.now_ns()):
             text = "rebooted twice within a minute: it gets no torque again by itself; check its supply"
-            self._life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+            life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
 
     def exhausted(self, index: int) -> bool:
         """Return whether a servo rebooted so often that no policy gives it torque any more."""
-        return self._count.exhausted[index]
-
-
-def _tick_read(plan: BusPlan, index: int) -> Transaction | None:
-    servo = plan.servos[index]
-    item = control_table(servo.model, plan.protocol).items.get("realtime_tick")
-    return None if item is None else plan_line(plan).read(servo.servo_id, item.address, item.size)
-
-
-def _lamp(plan: BusPlan, index: int) -> int | None:
-    """Return where a servo without a clock has an LED behind torque enable; None: there is none."""
-    servo = plan.servos[index]
-    items = control_table(servo.model, plan.protocol).items
-    item = None if "realtime_tick" in items else items.get("led", items.get("led_red"))
-    return item.address if item is not None and item.address == servo.torque_address + 1 else None
+        return self._counts[index].exhausted

@@ -1,12 +1,7 @@
-"""Registers of a servo as declared: compared, only differences written, each read back; torque limits.
+"""Registers of a servo as declared: compared, only differences written, each read back.
 
 EEPROM wears, and a servo of Protocol 2.0 refuses to write it while it holds torque (e-Manual XM430-W350,
 Control Table of EEPROM Area), so then it is never written.
-
-Torque limit of Protocol 1.0: Torque Limit (34), which begins as Max Torque (14) (e-Manual AX-12A). Of 2.0:
-Goal PWM (100), which in position control limits the PWM, up to PWM Limit (36) (e-Manual XM430-W350); XL-320
-has Torque Limit (35). All of them are RAM: what a policy reduced stays so until power-off, unless it is
-written again.
 """
 
 from __future__ import annotations
@@ -16,24 +11,13 @@ from collections.abc import Sequence
 
 import msgspec
 
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry, setup_line
-from dxlrun.dynamixel.servo.watchdog import shown, tripped
-from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply
-
-
-class Settled(msgspec.Struct):
-    """What came of the declared registers of one servo."""
-
-    problems: list[str] = []  # Why it does not have them, one sentence each
-    written: list[tuple[str, str]] = []
-    """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
-    found: dict[str, int] = {}  # What the servo had before, by item
-    silent: bool = False  # True when the servo answered nothing, so that nothing was written
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.control_table import ControlItem
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.plan.retry import ATTEMPTS
+from dxlrun.dynamixel.servo.access import Access, first_reach
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue
+from dxlrun.plan.transaction import Outcome, Program
 
 
 class RegisterDifference(msgspec.Struct, frozen=True):
@@ -49,97 +33,81 @@ class RegisterDifference(msgspec.Struct, frozen=True):
         return self.found is not None and self.found != self.register.value
 
 
-class TorqueLimits(msgspec.Struct):
-    """What is known of the torque limits of one bus' servos."""
-
-    full: list[int] = []
-    """The servos' own limits in ticks, in the order of the plan's; 0: it has none that is known."""
-    problems: list[str] = []
-    restored: list[tuple[str, str]] = []  # Joint, and what its limit had been
-
-
-def compare(
-    plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue], line: Line
-) -> Program[tuple[RegisterDifference, ...]]:
+def compare(one: Access, registers: Sequence[RegisterValue]) -> Program[tuple[RegisterDifference, ...]]:
     """Read registers of one servo; writes nothing."""
     found = []
     for register in registers:
-        reply = yield from retry(line.read(servo.servo_id, register.address, register.size))
-        found.append(RegisterDifference(register, _integer(_item(plan, servo, register), reply)))
+        found.append(RegisterDifference(register, (yield from _integer(one, register))))
     return tuple(found)
 
 
-def settle(
-    plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue], line: Line
-) -> Program[Settled]:
-    """Write the registers that a servo has otherwise, and read them back.
+def settle(one: Access, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
+    """Write the registers that a servo has otherwise, and read them back; return what it had, by item.
 
-    Nothing is written when one cannot be read, and no EEPROM while the servo holds torque. `line`: how long a
-    reply may take; before the start the longest time.
+    Nothing is written when one cannot be read, and no EEPROM while the servo holds torque.
     """
-    settled = Settled()
-    differences = yield from compare(plan, servo, registers, line)
-    settled.found = {one.register.name: one.found for one in differences if one.found is not None}
-    silent = [one.register for one in differences if one.found is None]
-    if silent:
-        settled.silent = len(silent) == len(differences)
-        settled.problems.append(
-            f"{plan.label(servo)} did not answer when {_names(plan, servo, silent)} was read"
-        )
-        return settled
-    differing = [one for one in differences if one.differs]
-    stored = [one.register for one in differing if one.register.eeprom]
-    if stored and (problem := (yield from _torqued(plan, servo, stored, line))):
-        settled.problems.append(f"{plan.label(servo)} {problem}")
-        return settled
-    for one in differing:
-        problem = yield from write_register(plan, servo, one.register, line)
-        item = _item(plan, servo, one.register)
-        if problem or one.found is None:
-            settled.problems.append(f"{plan.label(servo)} {problem}")
+    differences = yield from compare(one, registers)
+    before = {each.register.name: each.found for each in differences if each.found is not None}
+    if silent := [each.register for each in differences if each.found is None]:
+        found.problems.append(f"{one} did not answer when {_names(one, silent)} was read")
+        return before
+    differing = [each.register for each in differences if each.differs]
+    stored = [register for register in differing if register.eeprom]
+    if stored and (problem := (yield from _torqued(one, stored))):
+        found.problems.append(f"{one} {problem}")
+        return before
+    for register in differing:
+        if problem := (yield from write_register(one, register)):
+            found.problems.append(f"{one} {problem}")
         else:
-            text = f"{item.title} was {shown(item, one.found)} and is {one.register.value}"
-            settled.written.append((servo.joint, text))
-    return settled
+            item = one.items[register.name]
+            text = f"{item.title} was {shown(item, before[item.name])} and is {register.value}"
+            found.note(EventCode.REGISTER_WRITTEN, Severity.INFO, one.servo.joint, text)
+    return before
 
 
-def settle_bus(plan: BusPlan) -> Program[Settled]:
+def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
     """Write what the robot file declares for the servos of a bus, each whatever became of the one before."""
-    together = Settled()
     for servo in plan.servos:
-        settled = yield from settle(plan, servo, servo.registers, setup_line(plan))
-        together.problems += settled.problems
-        together.written += settled.written
-    return together
+        yield from settle(first_reach(plan, servo), servo.registers, found)
 
 
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
     """Return registers with one of them changed, or one more behind the others."""
-    found = {one.name: one for one in registers}
-    found[newer.name] = newer
-    return tuple(found.values())
+    return tuple({**{one.name: one for one in registers}, newer.name: newer}.values())
 
 
-def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue, line: Line) -> Program[str]:
+def write_register(one: Access, register: RegisterValue) -> Program[str]:
     """Write one register and read it back; return what went wrong, or nothing.
 
     The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by Status
     Return Level, and EEPROM wears.
     """
-    item = _item(plan, servo, register)
-    problem = ""
+    item, problem = one.items[register.name], ""
     for _ in range(ATTEMPTS):
-        written = yield line.write(servo.servo_id, register.address, register.data)
+        written = yield one.writing(register.address, register.data)
         if written.outcome is Outcome.REFUSED:
-            return f"refuses {item.title} = {register.value}: {line.dialect.describe_error(written.error)}"
-        back = yield from retry(line.read(servo.servo_id, register.address, register.size))
-        found = _integer(item, back)
+            return f"refuses {item.title} = {register.value}{one.reason(written)}"
+        found = yield from _integer(one, register)
         if found == register.value:
             return ""
         problem = f"was given {item.title} = {register.value}, but has {found}"
         if found is None:
             problem = f"did not answer when {item.title} was read back"
     return problem
+
+
+def tripped(item: ControlItem, raw: int) -> bool:
+    """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
+    return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
+
+
+def shown(item: ControlItem, raw: int) -> str:
+    """Return a value of an item as messages show it: that of a tripped Bus Watchdog is `255 (tripped)`.
+
+    e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
+    """
+    return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
 
 
 def meaning(item: ControlItem, value: int) -> str:
@@ -158,62 +126,9 @@ def meaning(item: ControlItem, value: int) -> str:
     return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
 
 
-def restore_torque_limits(plan: BusPlan) -> Program[TorqueLimits]:
-    """Give every servo all of its torque again, after its goal is where it stands.
-
-    One that was weak and held may have sagged: with an old goal it would spring back.
-    """
-    found = TorqueLimits()
-    line = setup_line(plan)
-    for servo in plan.servos:
-        place = servo.torque_limit
-        found.full.append(0)
-        if place is None:
-            continue
-        full = yield from retry(line.read(servo.servo_id, place.full_address, place.size))
-        now = yield from retry(line.read(servo.servo_id, place.address, place.size))
-        if not (full.answered and now.answered):
-            found.problems.append(f"{plan.label(servo)} did not answer when its torque limit was read")
-            continue
-        most, present = (reply.word(place.size) for reply in (full, now))
-        found.full[-1] = most
-        if present != most and _limits(servo, servo.start_mode):
-            data = most.to_bytes(place.size, "little")
-            written = yield from retry(line.write(servo.servo_id, place.address, data))
-            if written.answered:
-                text = f"{place.name} was {present} and is {most} again"
-                found.restored.append((servo.joint, text))
-            else:
-                found.problems.append(f"{plan.label(servo)} did not acknowledge {place.name}")
-    return found
-
-
-def reduced_torque_limits(
-    plan: BusPlan, full: Sequence[int], fraction: float, modes: Sequence[Mode]
-) -> list[bytes]:
-    """Return the packets that leave each servo a fraction of its own limit, one tick at least.
-
-    `modes`: in which the servos are; one whose mode is changing is left alone.
-    """
-    writes = [
-        (servo.servo_id, place.address, max(1, round(own * fraction)).to_bytes(place.size, "little"))
-        for servo, own, mode in zip(plan.servos, full, modes, strict=True)
-        if (place := servo.torque_limit) is not None and own and _limits(servo, mode)
-    ]
-    return sync_writes(dialect_of(plan.protocol), writes)
-
-
-def _limits(servo: ServoPlan, mode: Mode) -> bool:
-    """Return whether the torque limit limits in a mode; where Goal PWM is the goal, it would drive."""
-    place = servo.torque_limit
-    if place is None or mode is Mode.UNKNOWN:
-        return False
-    return all(goal.address != place.address for goal in servo.mode_plan(mode).goals)
-
-
-def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue], line: Line) -> Program[str]:
-    reply = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
-    names = _names(plan, servo, stored)
+def _torqued(one: Access, stored: Sequence[RegisterValue]) -> Program[str]:
+    reply = yield from one.read_bytes(one.servo.torque_address, 1)
+    names = _names(one, stored)
     if not reply.answered:
         return f"did not answer when its torque was read, so {names} was not written"
     if reply.parameters[0]:
@@ -224,15 +139,11 @@ def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue], l
     return ""
 
 
-def _item(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> ControlItem:
-    return control_table(servo.model, plan.protocol).items[register.name]
+def _integer(one: Access, register: RegisterValue) -> Program[int | None]:
+    reply = yield from one.read_bytes(register.address, register.size)
+    item = one.items[register.name]
+    return item.integer(reply.parameters[: item.size]) if reply.answered else None
 
 
-def _integer(item: ControlItem, reply: Reply) -> int | None:
-    if not reply.answered:
-        return None
-    return int.from_bytes(reply.parameters[: item.size], "little", signed=item.signed)
-
-
-def _names(plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue]) -> str:
-    return ", ".join(_item(plan, servo, register).title for register in registers)
+def _names(one: Access, registers: Sequence[RegisterValue]) -> str:
+    return ", ".join(one.items[register.name].title for register in registers)

@@ -9,82 +9,60 @@ from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import (
     IN_DOUBT,
     POWERLESS,
     Done,
-    Life,
     RequestedReboot,
     ServoEvent,
     ServoState,
 )
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, Offline, rejoin
-from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Outcome, Program
 
 
 class Requests:
     """Torque and reboots of the servos of one bus, as clients request them; each is answered once."""
 
-    def __init__(  # noqa: PLR0917  what a bus consists of
-        self,
-        plan: BusPlan,
-        idle: IdleScheduler,
-        life: Life,
-        reboots: Reboots,
-        desired: DesiredState,
-        offline: Offline,
-    ) -> None:
-        self._plan = plan
-        self._idle = idle
-        self._life = life
-        self._reboots = reboots
-        self._desired = desired
+    def __init__(self, offline: Offline) -> None:
         self._offline = offline
+        self._life = offline.life
+        self._reboots = offline.reboots
+        self._desired = offline.desired
 
     def torque_off(self, index: int, done: Done) -> None:
         """Switch a servo's torque off, and keep it off; of an offline one when it is back."""
         if self._life.on(index, ServoEvent.RELEASE) is ServoState.RELEASED:
             self._offline.switch_off(index, done)
         else:
-            done(f"{self._name(index)} does not answer: its torque stays off when it is back")
+            done(f"{self._life.name(index)} does not answer: its torque stays off when it is back")
 
     def torque_on(self, index: int, done: Done) -> None:
         """Switch a servo's torque on where it stands, if it has none."""
         state = self._life.states[index]
         if state is ServoState.OFFLINE:
-            done(f"{self._name(index)} does not answer")
+            done(f"{self._life.name(index)} does not answer")
             return
         if state in POWERLESS:
             self._life.on(index, ServoEvent.REQUESTED)
-        self._add(self._torque_on(index, done), "torque on", index)
+        self._life.do(index, self._torque_on(index, done), "torque on")
 
     def reboot(self, index: int, done: Done) -> None:
         """Reboot a servo of Protocol 2.0; it comes back with the torque that it has now."""
-        servo = self._plan.servos[index]
-        if "reboot" not in control_table(servo.model, self._plan.protocol).capabilities:
-            done(f"{self._name(index)} knows no reboot instruction: switch its power off and on")
+        one = self._life.reach(index)
+        if "reboot" not in one.table.capabilities:
+            done(f"{one} knows no reboot instruction: switch its power off and on")
         elif self._life.offline(index):
-            done(f"{self._name(index)} does not answer")
+            done(f"{one} does not answer")
         else:
-            self._add(self._reboot(index, done), "the reboot", index)
-
-    def _add(self, program: Program[None], what: str, index: int) -> None:
-        self._idle.add(program, Urgency.REPAIR, f"{what} of {self._name(index)}", index)
-
-    def _name(self, index: int) -> str:
-        return self._plan.label(self._plan.servos[index])
+            self._life.do(index, self._reboot(index, done), "the reboot")
 
     def _torque_on(self, index: int, done: Done) -> Program[None]:
-        life = self._life
+        life, name = self._life, self._life.name(index)
         if life.states[index] is not ServoState.LIMP:
             done((yield from self._torqued(index)))
             return
@@ -102,53 +80,51 @@ class Requests:
             life.report(EventCode.TORQUE_ON, Severity.INFO, index, text)
         if problem:
             life.report(EventCode.TORQUE_ON, Severity.WARNING, index, f"gets no torque: it {problem}")
-            problem = f"{self._name(index)} {problem}"
-        done(problem)
+        done(problem and f"{name} {problem}")
 
     def _torqued(self, index: int) -> Program[str]:
-        if self._life.offline(index):
-            return f"{self._name(index)} was lost meanwhile"
-        if self._life.states[index] is ServoState.RELEASED:
-            return f"{self._name(index)} was switched off again meanwhile"
-        if self._life.states[index] not in IN_DOUBT:
+        life, name = self._life, self._life.name(index)
+        if life.offline(index):
+            return f"{name} was lost meanwhile"
+        if life.states[index] is ServoState.RELEASED:
+            return f"{name} was switched off again meanwhile"
+        if life.states[index] not in IN_DOUBT:
             return ""
-        back = yield from retry(self._plan.torque_reads[index])
+        back = yield from retry(life.plan.torque_reads[index])
         if back.answered and back.parameters[0] == 1:
             return ""
-        return f"{self._name(index)} did not confirm its torque; ask again when it answers"
+        return f"{name} did not confirm its torque; ask again when it answers"
 
     def _hold(self, index: int) -> Program[tuple[str, Mode]]:
         """Bring a limp servo in order, and hold it; return what went wrong, behind its name, and its mode."""
-        plan, servo, name = self._plan, self._plan.servos[index], f"{self._name(index)} "
+        one, name, found = self._life.reach(index), f"{self._life.name(index)} ", Findings()
         yield from self._reboots.tick(index)
-        yield from watchdog.disarm(plan, servo)
+        yield from watchdog.disarm(one)
         mode = self._desired.mode(index)
-        found = yield from rejoin(plan, index, False, mode, self._desired.registers(index))
-        self._desired.report_written(found.written)
+        yield from rejoin(one, found, mode, self._desired.registers(index), torque=False)
+        found.log(self._life.events)
         if found.problems:
-            return "; ".join(one.removeprefix(name) for one in found.problems), mode
+            return "; ".join(problem.removeprefix(name) for problem in found.problems), mode
         if (yield from self._reboots.tick(index)):
             return "started anew while it was checked; ask again", mode
-        held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
-        problem = held.problem or (yield from watchdog.arm(plan, servo)).removeprefix(name)
-        return problem, mode
+        problem = (yield from modes.hold(one, mode)).problem or (yield from watchdog.arm(one))
+        return problem.removeprefix(name), mode
 
     def _reboot(self, index: int, done: Done) -> Program[None]:
-        life, servo = self._life, self._plan.servos[index]
+        life, one = self._life, self._life.reach(index)
         if life.offline(index):
-            done(f"{self._name(index)} was lost before it was rebooted")
+            done(f"{one} was lost before it was rebooted")
             return
         had_torque = life.states[index] not in POWERLESS
         yield from self._reboots.tick(index)  # so that the next reading shows the reboot, however long ago
-        packet = protocol2.reboot(servo.servo_id)
-        reply = yield from retry(plan_line(self._plan).instruct(servo.servo_id, packet))
+        servo_id = one.servo.servo_id
+        reply = yield from retry(one.line.instruct(servo_id, protocol2.reboot(servo_id)))
         if reply.outcome is Outcome.REFUSED:
-            why = plan_line(self._plan).dialect.describe_error(reply.error)
-            done(f"{self._name(index)} refuses to reboot: {why}")
+            done(f"{one} refuses to reboot{one.reason(reply)}")
         elif not life.offline(index):
             # an acknowledgement may be lost: its clock will tell whether it started anew
-            request = RequestedReboot(had_torque, self._idle.now_ns() + REBOOT_NS, done)
+            request = RequestedReboot(had_torque, life.now_ns() + REBOOT_NS, done)
             loss = life.reboot(index, request, FIRST_PROBE_NS)
             loss.rebooted = self._reboots.read(index) is None
         else:
-            done(f"{self._name(index)} was lost while it was rebooted")
+            done(f"{one} was lost while it was rebooted")

@@ -16,9 +16,9 @@ from dxlrun.dynamixel.device.devices import Devices
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.goals import GoalArrays
-from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
+from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
@@ -73,16 +73,15 @@ class Servos:
         """The job that reads every servo and every device once."""
         self.devices = Devices(plan, idle, self.reads, samples, events, device_commands)
         """What is on the bus and is no servo."""
-        self.life = Life(plan, self.reads, events, idle.now_ns)  # The state of each servo
-        self._reboots = Reboots(plan, idle, self.life)
-        self.desired = DesiredState(plan, idle, self.goals, self.life, self._reboots, states.mode, events)
+        self.life = Life(plan, self.reads, idle, events)  # The state of each servo
+        self._reboots = Reboots(self.life)
+        self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
         """Modes and registers that the servos shall have."""
-        self.watchdogs = WatchdogMonitor(plan, bus, idle, self.life, self.desired, events)
+        self.watchdogs = WatchdogMonitor(self.life, bus, self.desired)
         """Whether the Bus Watchdogs receive enough instructions."""
-        self._offline = Offline(plan, idle, self.life, self._reboots, self.desired)
-        self.requests = Requests(plan, idle, self.life, self._reboots, self.desired, self._offline)
-        """Torque and reboots that clients request."""
-        self._slow = SlowReads(plan, idle, self.life, self._reboots, states)
+        self._offline = Offline(self.life, self._reboots, self.desired)
+        self.requests = Requests(self._offline)  # Torque and reboots that clients request
+        self._slow = SlowReads(self.life, self._reboots, states)
         self._reported_errors = [0] * count  # error byte of each servo
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
@@ -116,14 +115,14 @@ class Servos:
                 self.life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
-    def watch(self) -> Program[list[str]]:
-        """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
+    def watch(self, found: Findings) -> Program[None]:
+        """Read every servo's clock for the first time, and arm the Bus Watchdogs.
 
         The last step of the start: from now on the exchange must not stop.
         """
         for index in range(len(self._rows)):
             yield from self._reboots.tick(index)
-        return (yield from self.watchdogs.arm())
+        yield from self.watchdogs.arm(found)
 
     def withhold_goals(self) -> None:
         """Send no goals any more: torque is being switched off."""
@@ -286,8 +285,7 @@ class Servos:
         if not self._reading and (due := self._due()) is not None:
             index, what, program = due
             self._reading, self._read_last = True, index
-            name = f"{what} of {self._plan.label(self._plan.servos[index])}"
-            self._idle.add(program, Urgency.REPAIR, name, index)
+            self.life.do(index, program, what)
 
     def _due(self) -> tuple[int, str, Program[None]] | None:
         """Return the servo that is read next, what of it, and the program; None: nothing is due."""
@@ -297,12 +295,12 @@ class Servos:
         for index in self._alerts:
             address = servos[index].hardware_error_address
             if address is not None and fresh[index]:
-                read = plan_line(self._plan).read(servos[index].servo_id, address, 1)
+                read = self.life.reach(index).reading(address, 1)
                 return index, "hardware error status", self._read_hardware_error(index, read)
         for index in self._strained:
             limit = servos[index].torque_limit
             if limit is not None and fresh[index]:
-                read = plan_line(self._plan).read(servos[index].servo_id, limit.address, limit.size)
+                read = self.life.reach(index).reading(limit.address, limit.size)
                 return index, limit.name, self._read_torque_limit(index, read, limit.name)
         if not self.life.calm:
             for offset in range(1, len(servos) + 1):

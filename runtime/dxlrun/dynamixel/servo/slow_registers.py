@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.cycle import Floats, States
+from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
+from dxlrun.dynamixel.control_table import ControlItem, control_table, decoded, side_by_side
 from dxlrun.dynamixel.exchange.bus import NEVER
-from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.exchange.idle import Urgency
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
@@ -18,7 +17,7 @@ _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0  # degrees C below the servo's own limit (failures.md)
 COOLED = 5.0  # degrees C below the warning: the servo counts as cooled down
 
-_Block = tuple[ControlItem, ...]  # Items side by side, read by one instruction
+_Block = tuple[ControlItem, ...]  # Items side by side, read by one instruction; none: Realtime Tick
 
 
 class SlowReads:
@@ -28,23 +27,17 @@ class SlowReads:
     along with them: it shows a reboot between two cycles.
     """
 
-    def __init__(
-        self, plan: BusPlan, idle: IdleScheduler, life: Life, reboots: Reboots, states: States
-    ) -> None:
-        self._plan = plan
-        self._idle = idle
+    def __init__(self, life: Life, reboots: Reboots, states: States) -> None:
         self._life = life
         self._reboots = reboots
         self._states = states
-        self._round: list[tuple[int, _Block | None]] = _round(plan)  # None: the tick
+        self._round = _round(life.plan)
         self._next = 0
         self._reading = False
-        count = len(plan.servos)
-        self._interval_ns = plan.slow_period_ns // len(self._round) if self._round else 0
+        self._interval_ns = life.plan.slow_period_ns // max(len(self._round), 1)
         self._due_ns = 0
         self._known: dict[tuple[int, str], int] = {}
-        self._limits = [_limit_item(plan, index) for index in range(count)]
-        self._hot = [False] * count
+        self._hot: set[int] = set()  # Servos near their temperature limit
 
     @property
     def due_ns(self) -> int:
@@ -53,7 +46,7 @@ class SlowReads:
 
     def look(self) -> None:
         """Let the coming idle time read the next block when its time has come; called once a cycle."""
-        if self._idle.now_ns() < self.due_ns:
+        if self._life.now_ns() < self.due_ns:
             return
         for _ in self._round:
             index, block = self._round[self._next]
@@ -61,13 +54,12 @@ class SlowReads:
             if not self._life.offline(index):
                 self._begin(index, block)
                 break
-        self._due_ns = self._idle.now_ns() + self._interval_ns
+        self._due_ns = self._life.now_ns() + self._interval_ns
 
-    def _begin(self, index: int, block: _Block | None) -> None:
+    def _begin(self, index: int, block: _Block) -> None:
         self._reading = True
-        program = self._read_tick(index) if block is None else self._read(index, block)
-        name = f"slow registers of {self._plan.servos[index].joint}"
-        self._idle.add(program, Urgency.SLOW, name, index)
+        program = self._read(index, block) if block else self._read_tick(index)
+        self._life.do(index, program, "slow registers", Urgency.SLOW)
 
     def _read_tick(self, index: int) -> Program[None]:
         rebooted = yield from self._reboots.tick(index)
@@ -77,29 +69,29 @@ class SlowReads:
 
     def _read(self, index: int, block: _Block) -> Program[None]:
         start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield plan_line(self._plan).read(self._plan.servos[index].servo_id, start, end - start)
+        reply = yield self._life.reach(index).reading(start, end - start)
         self._reading = False
         if reply.answered:
+            values = decoded(block, start, reply.parameters)
             for item in block:
-                at = item.address - start
-                self._note(index, item, item.decode(reply.parameters[at : at + item.size]))
+                self._note(index, item, values[item.name])
 
     def _note(self, index: int, item: ControlItem, raw: int) -> None:
-        states, row = self._states, self._plan.servos[index].row
+        states, row = self._states, self._life.plan.servos[index].row
         before = self._known.get((index, item.name))
         self._known[index, item.name] = raw
         if item.name in TEMPERATURES:
-            self._warm(index, raw * item.scale, states.temperature, row)
+            states.temperature[row] = raw * item.scale
+            self._warm(index, raw * item.scale)
         elif item.name in VOLTAGES:
             states.voltage[row] = raw * item.scale
         elif before not in (None, raw) and item.name not in _LIMITS:
-            self._life.report(
-                EventCode.REGISTER_DIFFERS, Severity.INFO, index, f"{item.title} was {before}, is {raw}"
-            )
+            text = f"{item.title} was {before}, is {raw}"
+            self._life.report(EventCode.REGISTER_DIFFERS, Severity.INFO, index, text)
 
-    def _warm(self, index: int, celsius: float, temperature: Floats, row: int) -> None:
-        temperature[row] = celsius
-        item = self._limits[index]
+    def _warm(self, index: int, celsius: float) -> None:
+        items = self._life.reach(index).items
+        item = next((items[name] for name in _LIMITS if name in items), None)
         if item is None:
             return
         raw = self._known.get((index, item.name))
@@ -109,29 +101,24 @@ class SlowReads:
             return
         limit = raw * item.scale
         text = f"is at {celsius:.0f} deg C; its {item.title} is {limit:.0f} deg C"
-        if celsius >= limit - WARN_BELOW and not self._hot[index]:
-            self._hot[index] = True
+        if celsius >= limit - WARN_BELOW and index not in self._hot:
+            self._hot.add(index)
             text = f"{text}, beyond which it cuts its torque: let it rest"
             self._life.report(EventCode.SERVO_HOT, Severity.WARNING, index, text)
-        elif celsius <= limit - WARN_BELOW - COOLED and self._hot[index]:
-            self._hot[index] = False
+        elif celsius <= limit - WARN_BELOW - COOLED and index in self._hot:
+            self._hot.remove(index)
             self._life.report(EventCode.SERVO_HOT, Severity.INFO, index, text)
 
 
-def _round(plan: BusPlan) -> list[tuple[int, _Block | None]]:
+def _round(plan: BusPlan) -> list[tuple[int, _Block]]:
     """Return what is read in turn: the first block of every servo, then the second, then the ticks."""
     if not plan.slow_period_ns:
         return []
-    found: list[tuple[int, int, _Block | None]] = []
+    found: list[tuple[int, int, _Block]] = []
     for index, servo in enumerate(plan.servos):
         items = control_table(servo.model, plan.protocol).items
-        blocks: list[_Block | None] = [*side_by_side(items[name] for name in servo.slow if name in items)]
+        blocks = [*side_by_side(items[name] for name in servo.slow if name in items)]
         if "realtime_tick" in items:
-            blocks.append(None)
+            blocks.append(())
         found += [(number, index, block) for number, block in enumerate(blocks)]
     return [(index, block) for _, index, block in sorted(found, key=lambda one: one[:2])]
-
-
-def _limit_item(plan: BusPlan, index: int) -> ControlItem | None:
-    items = control_table(plan.servos[index].model, plan.protocol).items
-    return next((items[name] for name in _LIMITS if name in items), None)

@@ -7,9 +7,9 @@ on every line. The order and its reasons are in failures.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from statistics import median
-from typing import Protocol, TypeVar
+from typing import TypeAlias
 
 import msgspec
 
@@ -19,15 +19,18 @@ from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.device_checks import survey_devices
 from dxlrun.dynamixel.exchange.bus import Lines
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
 from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.dynamixel.servo import modes, watchdog
+from dxlrun.dynamixel.servo.access import Access, first_reach, reach
 from dxlrun.dynamixel.servo.checks import survey
-from dxlrun.dynamixel.servo.registers import restore_torque_limits, settle_bus
+from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
+from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Program, Result
@@ -40,25 +43,8 @@ _SOME = 8
 """Replies, from which on it is known how late they usually come: three pings a servo, and its model."""
 
 
-class _Stage(Protocol):
-    """What a stage found on one bus."""
-
-    @property
-    def problems(self) -> list[str]:
-        """Why the robot must not start, one sentence each."""
-        ...
-
-
-_Found = TypeVar("_Found", bound=_Stage)
-
-
-class Engagement(msgspec.Struct):
-    """What came of torque on."""
-
-    problems: list[str] = []
-    goals: list[int | None] = []
-    """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
-    limp: list[str] = []  # Joints that the robot file wants without torque
+Stage: TypeAlias = Callable[[BusPlan, Findings], Program[Result]]
+"""Makes the program of a stage for one bus, which adds what it finds."""
 
 
 class Probed(msgspec.Struct):
@@ -85,34 +71,31 @@ class StartUp:
 
     def look(self, take_over: bool) -> None:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
-        surveys = self._run([survey(plan, take_over) for plan in self._plans])
-        devices = self._run([survey_devices(plan) for plan in self._plans])
-        for one in surveys:
-            self._log(EventCode.SETUP, Severity.INFO, one.servos)
-            self._log(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.differences)
-        for found in devices:
-            self._log(EventCode.SETUP, Severity.INFO, found.devices)
-        _judge([*surveys, *devices])
+        found = [Findings() for _ in self._plans]
+        self._run(lambda plan, found: survey(plan, take_over, found), found)
+        self._run(survey_devices, found)
+        self._judge(found)
         _refuse(self._late_replies())
-        self._settle_registers()
-        self._settle_modes()
+        self.stage(settle_bus)
+        for servos, limits in zip(self._servos, self.stage(modes.settle_modes), strict=True):
+            for index, own in enumerate(limits):
+                servos.goals.set_limits(index, own)
         self._probe_reads()
-        self.carry_out([watchdog.disarm_all(plan) for plan in self._plans])
+        self.stage(watchdog.disarm_all)
 
     def engage(self, goals: Commands) -> None:
         """Hold every servo where it stands, and let the goals be that."""
-        engaged = self._run([_engage(plan) for plan in self._plans])
-        _judge(engaged)
-        for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
+        engaged = self.stage(_engage)
+        for plan, servos, ticks in zip(self._plans, self._servos, engaged, strict=True):
             servos.engaged()
-            for servo, raw in zip(plan.servos, one.goals, strict=True):
+            for servo, raw in zip(plan.servos, ticks, strict=True):
                 _first_goals(goals, servo, raw)
             # servos of one joint are next to one another, and it is named once
             names = ", ".join(dict.fromkeys(servo.joint for servo in plan.servos if servo.torque_at_start))
             if names:
                 self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
-            if one.limp:
-                text = f"limp, as the robot file says: {', '.join(one.limp)}"
+            if limp := ", ".join(servo.joint for servo in plan.servos if not servo.torque_at_start):
+                text = f"limp, as the robot file says: {limp}"
                 self._events.emit(EventCode.TORQUE_OFF, Severity.INFO, plan.name, text)
 
     def restore_limits(self) -> list[list[int]]:
@@ -120,63 +103,36 @@ class StartUp:
 
         Returns each servo's own limit in ticks, by bus.
         """
-        limits = self._run([restore_torque_limits(plan) for plan in self._plans])
-        _judge(limits)
-        for one in limits:
-            self._log(EventCode.SETUP, Severity.INFO, one.restored)
-        return [one.full for one in limits]
+        return self.stage(restore_torque_limits)
 
     def confirm(self) -> None:
         """Read torque enable of every servo again, and let them get goals.
 
         Torque on draws current: a servo that browned out meanwhile answers again, limp, and may get no goal.
         """
-        self.carry_out([_confirm(plan) for plan in self._plans])
+        self.stage(_confirm)
         for servos in self._servos:
             servos.confirmed()
 
-    def carry_out(self, programs: Sequence[Program[list[str]]]) -> None:
-        """Run one program a bus that returns what went wrong."""
-        _refuse_any(self._run_all(programs))
-
     def watch(self) -> None:
         """Arm the Bus Watchdogs, which stop the servos where a reply is awaited for too long."""
-        programs = [servos.watch() for servos in self._servos]
+        mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
-        _refuse_any(self._run_all(programs, longer_ns))
+        self.stage(lambda plan, found: mine[plan.name].watch(found), longer_ns)
 
     def pause(self, duration_ns: int) -> None:
         """Let a moment pass, and take what still comes."""
-        self.carry_out([_pause(duration_ns) for _ in self._plans])
+        self.stage(lambda *_: _pause(duration_ns))
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no start without it."""
         if error := report_failures(self._lines, self._servos):
             raise error
 
-    def _settle_registers(self) -> None:
-        """Write what the robot file declares and a servo has otherwise, before torque is switched on."""
-        settled = self._run([settle_bus(plan) for plan in self._plans])
-        for one in settled:
-            self._log(EventCode.REGISTER_WRITTEN, Severity.INFO, one.written)
-        _judge(settled)
-
-    def _settle_modes(self) -> None:
-        """Bring every servo into its first mode, before torque is switched on, and learn its own limits."""
-        settled = self._run([modes.settle_modes(plan) for plan in self._plans])
-        for one in settled:
-            self._log(EventCode.MODE, Severity.WARNING, one.switched)
-        _judge(settled)
-        for servos, one in zip(self._servos, settled, strict=True):
-            for index, limits in enumerate(one.limits):
-                servos.goals.set_limits(index, limits)
-
     def _probe_reads(self) -> None:
         """Find out when replies are due, and read each group plainly that does not answer the fast form."""
-        probes = self._run_all([_probe_reads(plan) for plan in self._plans])
+        probes = self.stage(_probe_reads)
         for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
-            if probed is None:
-                continue
             servos.reads.learn(probed.return_delays)
             for group in probed.refused:
                 servos.reads.plain(group)
@@ -190,22 +146,33 @@ class StartUp:
                 )
                 self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
 
-    def _run(self, programs: Sequence[Program[_Found]]) -> list[_Found]:
-        """Run one program a bus; `_judge` comes when everything that they found was logged."""
-        return [one for one in self._run_all(programs) if one is not None]
+    def stage(self, stage: Stage[Result], most_ns: Sequence[int] = ()) -> list[Result]:
+        """Run a stage on all lines, log what it found, and raise its problems; return what came of it.
 
-    def _run_all(
-        self, programs: Sequence[Program[Result]], most_ns: Sequence[int] = ()
-    ) -> list[Result | None]:
-        """Run one program a bus with longer timeouts, as nothing else waits; `most_ns`: for a reply."""
-        most_ns = most_ns or [LONGER_NS] * len(programs)
+        `most_ns`: how much longer than usual a reply is awaited on each line.
+        """
+        found = [Findings() for _ in self._plans]
+        results = self._run(stage, found, most_ns)
+        self._judge(found)
+        return results
+
+    def _run(
+        self, stage: Stage[Result], found: Sequence[Findings], most_ns: Sequence[int] = ()
+    ) -> list[Result]:
+        """Run one program a bus with longer timeouts, as nothing else waits."""
+        most_ns = most_ns or [LONGER_NS] * len(found)
         slow = [
-            extend_timeouts(program, most, late_ns)
-            for program, most, late_ns in zip(programs, most_ns, self._late_ns, strict=True)
+            extend_timeouts(stage(plan, one), most, late_ns)
+            for plan, one, most, late_ns in zip(self._plans, found, most_ns, self._late_ns, strict=True)
         ]
-        found = self._lines.run(slow)
+        results = self._lines.run(slow)
         self.raise_failures()
-        return found
+        return [result for result in results if result is not None]
+
+    def _judge(self, found: Iterable[Findings]) -> None:
+        for one in found:
+            one.log(self._events)
+        _refuse(problem for one in found for problem in one.problems)
 
     def _late_replies(self) -> Iterable[str]:
         """Name the buses whose replies usually come when the cyclic reads have given them up."""
@@ -214,10 +181,6 @@ class StartUp:
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
                 what, fix = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
                 yield f"every servo answers too late: {'; '.join(filter(None, (what, fix)))}"
-
-    def _log(self, code: EventCode, severity: Severity, texts: Iterable[tuple[str, str]]) -> None:
-        for joint, text in texts:
-            self._events.emit(code, severity, joint, text)
 
 
 def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
@@ -231,65 +194,60 @@ def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
     return first
 
 
-def _engage(plan: BusPlan) -> Program[Engagement]:
+def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
     """Hold every servo where it stands: goal := present, torque on, both read back, group by group.
 
     Those that the robot file wants limp get none, and lose what they have. Ends at the first problem; the
-    caller takes back the torque.
+    caller takes back the torque. Returns the goal positions as they were written, in ticks, in the order of
+    the plan's servos; None: there is none.
     """
-    result = Engagement()
-    for index, servo in enumerate(plan.servos):
-        if not servo.torque_at_start:
-            if problem := (yield from _let_go(plan, index)):
-                result.problems.append(f"{plan.label(servo)} {problem}")
-                break
-            result.limp.append(servo.joint)
-            result.goals.append(None)
-            continue
-        given = index - len(result.limp)
-        if given and given % GROUP == 0:
-            yield listen(GROUP_PAUSE_NS)
-        held = yield from modes.hold(plan, servo, servo.mode_plan(servo.start_mode))
-        if held.problem:
-            result.problems.append(f"{plan.label(servo)} {held.problem}")
+    goals: list[int | None] = []
+    given = 0
+    for servo in plan.servos:
+        one = reach(plan, servo)
+        if servo.torque_at_start:
+            if given and given % GROUP == 0:
+                yield listen(GROUP_PAUSE_NS)
+            held = yield from modes.hold(one, servo.start_mode)
+            problem, given = held.problem, given + 1
+            goals.append(held.goal)
+        else:
+            problem = yield from _let_go(one)
+            goals.append(None)
+        if problem:
+            found.problems.append(f"{one} {problem}")
             break
-        result.goals.append(held.goal)
-    return result
+    return goals
 
 
-def _let_go(plan: BusPlan, index: int) -> Program[str]:
-    servo = plan.servos[index]
-    back = yield from retry(plan.torque_reads[index])
+def _let_go(one: Access) -> Program[str]:
+    back = yield from one.read_bytes(one.servo.torque_address, 1)
     if back.answered and back.parameters[0]:
-        yield from retry(setup_line(plan).write(servo.servo_id, servo.torque_address, b"\0"))
-        back = yield from retry(plan.torque_reads[index])
-    if back.answered and not back.parameters[0]:
-        return ""
-    return "did not confirm that its torque is off"
+        yield from one.torque_off()
+        back = yield from one.read_bytes(one.servo.torque_address, 1)
+    return "" if back.answered and not back.parameters[0] else "did not confirm that its torque is off"
 
 
-def _confirm(plan: BusPlan) -> Program[list[str]]:
-    """Read torque enable of every servo again, after the last one got torque; return what is wrong."""
-    problems: list[str] = []
+def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
+    """Read torque enable of every servo again, after the last one got torque."""
     for servo, read in zip(plan.servos, plan.torque_reads, strict=True):
         if not servo.torque_at_start:
             continue
         reply = yield from retry(read)
         if not reply.answered:
-            problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
+            found.problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
         elif reply.parameters[0] != 1:
-            problems.append(
+            found.problems.append(
                 f"{plan.label(servo)} lost its torque again while the others got theirs (Torque Enable "
                 f"({servo.torque_address}) is {reply.parameters[0]}): is its supply strong enough?"
             )
-    return problems
 
 
-def _probe_reads(plan: BusPlan) -> Program[Probed]:
+def _probe_reads(plan: BusPlan, _: Findings) -> Program[Probed]:
     """Read the return delay of every servo, and try the fast form on every group that is to be read by it."""
     found = Probed()
     for servo in plan.servos:
-        raw = yield from _read_item(plan, servo, "return_delay_time")
+        raw = yield from first_reach(plan, servo).read_one("return_delay_time")
         if raw is not None:
             found.return_delays[servo.servo_id] = raw * RETURN_DELAY_STEP_NS
     line = setup_line(plan)
@@ -307,7 +265,7 @@ def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
     needed: set[int] = set()
     for servo in servos:
         first = control_table(servo.model, plan.protocol).fast_sync_read_firmware
-        found = yield from _read_item(plan, servo, "firmware_version")
+        found = yield from first_reach(plan, servo).read_one("firmware_version")
         if first is not None and found is not None and found < first:
             old.append(f"{plan.label(servo)} has {found}")
             needed.add(first)
@@ -326,25 +284,8 @@ def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
     return extra_ns
 
 
-def _read_item(plan: BusPlan, servo: ServoPlan, name: str) -> Program[int | None]:
-    item = control_table(servo.model, plan.protocol).items.get(name)
-    if item is None:
-        return None
-    reply = yield from retry(setup_line(plan).read(servo.servo_id, item.address, item.size))
-    return item.decode(reply.parameters) if reply.answered else None
-
-
-def _pause(duration_ns: int) -> Program[list[str]]:
+def _pause(duration_ns: int) -> Program[None]:
     yield listen(duration_ns)
-    return []
-
-
-def _judge(stage: Iterable[_Stage]) -> None:
-    _refuse(problem for one in stage for problem in one.problems)
-
-
-def _refuse_any(found: Iterable[list[str] | None]) -> None:
-    _refuse(problem for one in found if one is not None for problem in one)
 
 
 def _refuse(problems: Iterable[str]) -> None:

@@ -16,6 +16,7 @@ from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes
+from dxlrun.dynamixel.servo.access import reach
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
 
@@ -123,8 +124,8 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
 
 def _stop(plan: BusPlan, index: int) -> Program[str | None]:
     """Stop a servo; return why it does not stand, empty when it does, None where nothing was to be done."""
-    servo = plan.servos[index]
-    mode = yield from modes.mode_now(plan, servo)
+    one = reach(plan, plan.servos[index])
+    mode = yield from modes.mode_now(one)
     if mode in _HOLD:
         return None
     torque = yield from retry(plan.torque_reads[index])
@@ -132,7 +133,7 @@ def _stop(plan: BusPlan, index: int) -> Program[str | None]:
         return None
     if mode is Mode.UNKNOWN:
         return "its mode is not known"
-    return (yield from modes.hold(plan, servo, servo.mode_plan(mode))).problem
+    return (yield from modes.hold(one, mode)).problem
 
 
 def _off(plan: BusPlan, index: int, longer_ns: int) -> Program[bool]:

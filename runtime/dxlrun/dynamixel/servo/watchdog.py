@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import retry
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.registers import tripped
 from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Program
@@ -29,27 +30,14 @@ _FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
 LEAST_PERIODS = 3  # It must outlast two lost cycles (failures.md)
 
 
-def tripped(item: ControlItem, raw: int) -> bool:
-    """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
-    return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
-
-
-def shown(item: ControlItem, raw: int) -> str:
-    """Return a value of an item as messages show it: that of a tripped Bus Watchdog is `255 (tripped)`.
-
-    e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
-    """
-    return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
-
-
-def arm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+def arm(one: Access) -> Program[str]:
     """Arm a servo's watchdog, where the plan wants it and the model has one; return what went wrong."""
-    if not plan.watchdog_ticks or (item := item_of(plan, servo)) is None:
+    if not has_one(one.plan, one.servo):
         return ""
-    return (yield from _write(plan, servo, item, plan.watchdog_ticks))
+    return (yield from _write(one, one.plan.watchdog_ticks))
 
 
-def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+def disarm(one: Access) -> Program[str]:
     """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong.
 
     Also where the plan wants none: an earlier run that was killed may have left it armed. A servo that it
@@ -57,34 +45,31 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     one before. One that is led to no position would go on with its old velocity or effort: that becomes 0
     right behind, or its torque is switched off.
     """
-    if (item := item_of(plan, servo)) is None:
+    if (item := item_of(one.plan, one.servo)) is None:
         return ""
-    line = plan_line(plan)
-    reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
+    reply = yield from one.read_bytes(item.address, item.size)
     if reply.answered and reply.word(item.size) == 0:
         return ""
     if not (reply.answered and tripped(item, reply.word(item.size))):
-        return (yield from _write(plan, servo, item, 0))
-    items = control_table(servo.model, plan.protocol).items
-    speed, mode = items["profile_velocity"], items["operating_mode"]
+        return (yield from _write(one, 0))
+    speed, mode = one.items["profile_velocity"], one.items["operating_mode"]
     slow = max(1, round(RETURN_SPEED / speed.scale))
-    yield from retry(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
-    # with the byte behind it, as torque enable is one byte, too: a late answer to that is none to this
-    found = yield from retry(line.read(servo.servo_id, mode.address, mode.size + 1))
-    if not found.answered:
-        return f"{plan.label(servo)} did not answer when its {mode.title} was read"
-    problem = yield from _write(plan, servo, item, 0)
-    if (goal := items.get(_FOLLOWED.get(found.parameters[0], ""))) is not None:
-        stopped = yield from retry(line.write(servo.servo_id, goal.address, bytes(goal.size)))
+    yield from one.write_bytes(speed.address, slow.to_bytes(speed.size, "little"))
+    found = yield from one.read([mode.name])
+    if found is None:
+        return f"{one} did not answer when its {mode.title} was read"
+    problem = yield from _write(one, 0)
+    if (goal := one.items.get(_FOLLOWED.get(found[mode.name], ""))) is not None:
+        stopped = yield from one.write_bytes(goal.address, bytes(goal.size))
         if not stopped.answered:
-            yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
-            problem = problem or f"{plan.label(servo)} did not acknowledge {goal.title} = 0"
+            yield from one.torque_off()
+            problem = problem or f"{one} did not acknowledge {goal.title} = 0"
     return problem
 
 
-def revive(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+def revive(one: Access) -> Program[str]:
     """Clear and arm a servo's watchdog again after no instruction came for too long."""
-    return (yield from disarm(plan, servo)) or (yield from arm(plan, servo))
+    return (yield from disarm(one)) or (yield from arm(one))
 
 
 def longer_ns(plan: BusPlan) -> int:
@@ -92,12 +77,11 @@ def longer_ns(plan: BusPlan) -> int:
     return plan.watchdog_ticks * UNIT_NS // 3
 
 
-def disarm_all(plan: BusPlan) -> Program[list[str]]:
-    """Clear every servo of a bus, before torque is switched on or after; return what went wrong."""
-    found = []
+def disarm_all(plan: BusPlan, found: Findings) -> Program[None]:
+    """Clear every servo of a bus, before torque is switched on."""
     for servo in plan.servos:
-        found.append((yield from disarm(plan, servo)))
-    return [problem for problem in found if problem]
+        if problem := (yield from disarm(reach(plan, servo))):
+            found.problems.append(problem)
 
 
 def release_all(plan: BusPlan) -> Program[list[str]]:
@@ -107,20 +91,24 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
     speed as its profile was reset, with no loop that could stop it. One that does not answer stops by itself.
     While all answer, a read of all that are left keeps them from tripping before their turn.
     """
-    line, problems, all_answer = plan_line(plan), [], True
-    left = [(servo, item) for servo in plan.servos if plan.watchdog_ticks and (item := item_of(plan, servo))]
-    while left:
+    problems, all_answer = [], True
+    armed = [
+        (reach(plan, servo), item)
+        for servo in plan.servos
+        if plan.watchdog_ticks and (item := item_of(plan, servo))
+    ]
+    while armed:
         if all_answer:
-            reads = [(servo.servo_id, item.address, item.size) for servo, item in left]
-            all_answer = (yield line.read_many(reads)).answered
-        servo, item = left.pop(0)
-        reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
+            reads = [(one.servo.servo_id, item.address, item.size) for one, item in armed]
+            all_answer = (yield armed[0][0].line.read_many(reads)).answered
+        one, item = armed.pop(0)
+        reply = yield from one.read_bytes(item.address, item.size)
         if not reply.answered:
             problem = f"did not answer when its {item.title} was read: it may stop by itself"
-            problems.append(f"{plan.label(servo)} {problem}")
+            problems.append(f"{one} {problem}")
         elif tripped(item, reply.word(item.size)):
-            problems.append(f"{plan.label(servo)} was stopped by its {item.title} and stays where it stopped")
-        elif problem := (yield from _write(plan, servo, item, 0)):
+            problems.append(f"{one} was stopped by its {item.title} and stays where it stopped")
+        elif problem := (yield from _write(one, 0)):
             problems.append(problem)
     return problems
 
@@ -144,12 +132,6 @@ def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
     return control_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 
-def _write(plan: BusPlan, servo: ServoPlan, item: ControlItem, ticks: int) -> Program[str]:
-    line = plan_line(plan)
-    yield from retry(line.write(servo.servo_id, item.address, ticks.to_bytes(item.size, "little")))
-    back = yield from retry(line.read(servo.servo_id, item.address, item.size))
-    if not back.answered:
-        return f"{plan.label(servo)} did not answer when its {item.title} was read back"
-    if (found := back.word(item.size)) != ticks:
-        return f"{plan.label(servo)} was given {item.title} = {ticks}, but has {found}"
-    return ""
+def _write(one: Access, ticks: int) -> Program[str]:
+    problem = yield from one.write("bus_watchdog", ticks)
+    return problem and f"{one} {problem}"

@@ -8,14 +8,17 @@ from contextlib import contextmanager
 import msgspec
 from msgspec.structs import replace
 
+from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import NoPackets, PacketSink
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Lines
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.tools.scanning import identity
@@ -127,14 +130,15 @@ def _run(
 
 
 def _look(plan: BusPlan) -> Program[Found]:
-    surveyed = yield from survey(plan, take_over=False)
-    remarks = [f"{joint}: {difference}" for joint, difference in surveyed.differences]
-    answered = {joint for joint, _ in surveyed.servos}
+    surveyed = Findings()
+    yield from survey(plan, False, surveyed)
+    remarks = [f"{joint}: {text}" for joint, text in surveyed.texts(EventCode.REGISTER_DIFFERS)]
+    answered = {joint for joint, _ in surveyed.texts(EventCode.SETUP)}
     found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
     for servo in plan.servos:
         differences = [RegisterDifference(register, None) for register in servo.registers]
         if servo.joint in answered:
-            differences = list((yield from compare(plan, servo, servo.registers, setup_line(plan))))
+            differences = list((yield from compare(first_reach(plan, servo), servo.registers)))
         found.registers += [_row(plan, servo, one) for one in differences]
     return found
 

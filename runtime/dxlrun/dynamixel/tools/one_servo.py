@@ -13,12 +13,13 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
+from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.retry import drained, extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.registers import RegisterDifference, Settled, compare, settle
-from dxlrun.dynamixel.servo.watchdog import shown, tripped
+from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire import protocol1, protocol2
@@ -63,6 +64,10 @@ class OneServo:
     def _servo(self) -> ServoPlan:
         return self.plan.servos[0]
 
+    @property
+    def _reach(self) -> Access:
+        return Access(self.plan, self._servo, self.tool.line)
+
     def fail(self, text: str) -> ServoFault:
         """Return an error about this servo."""
         return ServoFault(f"{self.called}: {text}")
@@ -81,7 +86,7 @@ class OneServo:
 
     def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
-        found = self.run(compare(self.plan, self._servo, desired, self.tool.line))
+        found = self.run(compare(self._reach, desired))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]
         if silent:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
@@ -109,11 +114,13 @@ class OneServo:
         self.writable(desired)
         tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in desired)
         cleared = self.clear_watchdog(armed=False) if tripping else ()
-        settled: Settled = self.run(settle(self.plan, self._servo, desired, self.tool.line))
-        if settled.problems:
-            before = [f"written before that: {text}" for _, text in settled.written]
-            raise ServoFault("\n".join([*settled.problems, *before]))
-        return (*cleared, *(text for _, text in settled.written))
+        found = Findings()
+        self.run(settle(self._reach, desired, found))
+        written = [text for _, _, _, text in found.events]
+        if found.problems:
+            before = [f"written before that: {text}" for text in written]
+            raise ServoFault("\n".join([*found.problems, *before]))
+        return (*cleared, *written)
 
     def clear_watchdog(self, *, armed: bool) -> tuple[str, ...]:
         """Clear a Bus Watchdog that is tripped, `armed`: or would trip; return what was done, if anything.
@@ -131,7 +138,7 @@ class OneServo:
         stopped = tripped(item, raw) and self.holds_torque()
         if stopped:
             self.torque(False)
-        if problem := self.run(watchdog.disarm(self.plan, self._servo)):
+        if problem := self.run(watchdog.disarm(reach(self.plan, self._servo))):
             raise ServoFault(problem)
         why = "it had stopped the servo, as no instruction came"
         if not tripped(item, raw):
@@ -160,9 +167,9 @@ class OneServo:
 
     def _hold(self) -> str:
         mode = self._mode()
-        held = self.run(modes.hold(self.plan, self._servo, self._servo.mode_plan(mode)))
+        held = self.run(modes.hold(reach(self.plan, self._servo), mode))
         if held.problem:
-            self.run(settle(self.plan, self._servo, [self.register("torque_enable", 0)], self.tool.line))
+            self.run(settle(self._reach, [self.register("torque_enable", 0)], Findings()))
             raise self.fail(f"{held.problem}; its torque is off")
         where = "" if held.goal is None else f" at tick {held.goal}, where it stood"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
@@ -201,7 +208,7 @@ class OneServo:
                 self.plan = self._plan(continuous)
             except ValueError:  # the model has no modes without end
                 break
-            mode = self.run(modes.mode_now(self.plan, self._servo))
+            mode = self.run(modes.mode_now(reach(self.plan, self._servo)))
             if mode is not Mode.UNKNOWN:
                 return mode
         self.plan = self._plan()
@@ -240,12 +247,13 @@ class OneServo:
         start, end = block[0].address, block[-1].address + block[-1].size
         reply = yield from retry(self.tool.line.read(self.servo_id, start, end - start))
         if reply.answered:
-            return {item.name: _integer(item, reply.parameters, start) for item in block}
+            places = ((item, item.address - start) for item in block)
+            return {item.name: item.integer(reply.parameters[at : at + item.size]) for item, at in places}
         found: dict[str, int] = {}
         for item in block:
             reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
             if reply.answered:
-                found[item.name] = _integer(item, reply.parameters, item.address)
+                found[item.name] = item.integer(reply.parameters)
             elif reply.outcome is not Outcome.REFUSED:
                 raise self.fail(f"did not answer when {item.title} was read")
             elif not refused:
@@ -424,11 +432,6 @@ def _await(one: OneServo) -> None:
             port = one.tool.port.name
             raise one.fail(f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}")
         one.tool.wait(_PINGED_EVERY_NS)
-
-
-def _integer(item: ControlItem, data: bytes | memoryview, start: int) -> int:
-    offset = item.address - start
-    return int.from_bytes(data[offset : offset + item.size], "little", signed=item.signed)
 
 
 def _pause(duration_ns: int) -> Program[bool]:
