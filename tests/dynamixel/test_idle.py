@@ -19,7 +19,7 @@ class Rounds:
         self.rig = make_rig(make_x((11, 12)))
         self.lines = self.rig.lines
         (self.bus,) = self.lines.buses
-        self.idle = IdleScheduler(self.rig.plans[0], self.rig.events, self.bus)
+        self.idle = IdleScheduler(self.bus, self.rig.events)
 
     def gap(self, length_ns):
         until = self.rig.clock.now_ns() + length_ns

@@ -33,7 +33,7 @@ def one():
     plan = make_plan((1,))
     rig = make_rig(plan)
     reads = CyclicReads(plan, Samples([plan], States.empty(1), rig.events).buses[0])
-    return Life(plan, reads, rig.hardware._idle[0], rig.events)
+    return Life(rig.hardware._idle[0], reads)
 
 
 def put(servo, state):

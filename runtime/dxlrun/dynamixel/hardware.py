@@ -17,7 +17,7 @@ from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, Lines
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
-from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelLine
+from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
@@ -94,16 +94,12 @@ class DynamixelHardware:
         self._due_ns = 0  # when idle time has something to do,
         self._waiting: list[tuple[array[int], int]] = []
         """or where it is so long, ns, on a line, whose words these are."""
-        self._idle = tuple(
-            IdleScheduler(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
-        )
+        self._idle = tuple(IdleScheduler(bus, events) for bus in self._buses)
         self._samples = Samples(self._plans, states, events, sources)
         commands = np.empty(0) if device_commands is None else device_commands
         self._servos = tuple(
-            Servos(plan, bus, idle, events, states, arrays, commands)
-            for plan, bus, idle, arrays in zip(
-                self._plans, self._buses, self._idle, self._samples.buses, strict=True
-            )
+            Servos(idle, states, arrays, commands)
+            for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
         )
         self._pairs = tuple(zip(self._buses, self._servos, strict=True))
         self._places = {
@@ -112,19 +108,8 @@ class DynamixelHardware:
             for index, servo in enumerate(plan.servos)
         }
         """Row of a joint -> where its servo is."""
-        self._kernel = Kernel(
-            [
-                KernelLine(plan, bus, servos.goals, servos.life.torqued, servos.life.ceiling)
-                for plan, (bus, servos) in zip(self._plans, self._pairs, strict=True)
-            ],
-            self._samples,
-            states,
-            goals,
-            packets,
-            ports,
-            clock,
-            beat,
-        )
+        shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
+        self._kernel = Kernel(self._lines, shared, self._samples, goals, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
         self._start_up = StartUp(self._lines, self._servos, events)
 

@@ -12,7 +12,7 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.device.device_checks import inspect_device
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
@@ -20,7 +20,7 @@ from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.plan.bus_plan import BusPlan, DeviceCommand, DevicePlan
+from dxlrun.plan.bus_plan import DeviceCommand, DevicePlan
 from dxlrun.plan.transaction import Outcome, Program, Transaction
 
 PROBE_NS = 1_000_000_000
@@ -51,21 +51,14 @@ class _Written(msgspec.Struct):
 class Devices:
     """The devices of one bus, by their index in its plan."""
 
-    def __init__(  # noqa: PLR0917  what a bus consists of
-        self,
-        plan: BusPlan,
-        idle: IdleScheduler,
-        reads: CyclicReads,
-        samples: BusSamples,
-        events: EventSink,
-        commands: Floats,
+    def __init__(
+        self, idle: IdleScheduler, reads: CyclicReads, samples: BusSamples, commands: Floats
     ) -> None:
         """`commands`: of all devices of the robot, SI units; NaN = as it is."""
-        self._plan = plan
+        self._plan = plan = idle.plan
         self._idle = idle
         self._reads = reads
         self._samples = samples
-        self._events = events
         self._commands = commands
         self._dialect = dialect_of(plan.protocol)
         self._members: list[list[int]] = [[] for _ in plan.devices]
@@ -230,7 +223,7 @@ class Devices:
 
     def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         device = self._plan.devices[index]
-        self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+        self._idle.events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
 
 
 def _probes(line: Line, device: DevicePlan) -> list[Transaction]:

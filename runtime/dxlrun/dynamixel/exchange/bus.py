@@ -67,7 +67,7 @@ class Bus:
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
         self.index = index  # Its number in the log
-        self.name = plan.name
+        self.plan = plan
         self.now_ns = clock.now_ns
         self.failure: PortError | None = None
         """Why the line is lost; a bus with a failure does nothing more."""
@@ -165,12 +165,11 @@ class Bus:
 
         `received_ns`: when the replies to the one before came.
         """
-        if self._job is None:
+        if self._job is None or (transaction := self._job.advance(None)) is None:
             return
         if self.receiver.pending:
             self.receiver.flush()
-        self._awaited = transaction = self._job.advance(None)
-        assert transaction is not None  # noqa: S101  its instruction was sent
+        self._awaited = transaction
         self._last_byte_ns = max(self._last_byte_ns, received_ns)
         self._await(transaction, sent_ns)
         self._deadline_ns = deadline_ns
@@ -328,13 +327,13 @@ class Bus:
         if self._is_fast(packet):
             return self._take_fast(packet, last_ns) > 0
         status = self._dialect.opened(packet) if self._state == _AWAITING else None
-        index = -1 if status is None else self._place(status, last_ns)
-        if status is None or index < 0 or self._job is None:
+        if status is None or self._job is None or (place := self._place(status, last_ns)) is None:
             return False
+        index, refused = place
         reply = self._reply
         reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
         self._open &= ~(1 << index)
-        if status.error and self._refuses(status, index):
+        if refused:
             self._refused = True
         else:
             self._job.status(index, reply)
@@ -352,22 +351,18 @@ class Bus:
         brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
         self._deadline_ns = min(self._deadline_ns, brief_ns)
 
-    def _place(self, status: Status, last_ns: int) -> int:
-        """Return which of the awaited statuses this is; -1 when it is none of them."""
+    def _place(self, status: Status, last_ns: int) -> tuple[int, bool] | None:
+        """Return which of the awaited statuses this is, and whether it is a refusal; None: it is none."""
         servo_id, error, parameters = status
         length = len(parameters)
         # an echo, or left over from before, comes sooner than the wire allows
         if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
-            return -1
+            return None
         for index, one in enumerate(self._awaited.awaited):
             if one.servo_id == servo_id and self._open >> index & 1:
-                return index if length == one.length or (error and self._refuses(status, index)) else -1
-        return -1
-
-    def _refuses(self, status: Status, index: int) -> bool:
-        assert self._awaited is not None  # noqa: S101  a status has its place
-        length = self._awaited.awaited[index].length
-        return self._dialect.refused(status.error, len(status.parameters), length)
+                refused = error != 0 and self._dialect.refused(error, length, one.length)
+                return (index, refused) if refused or length == one.length else None
+        return None
 
     def _is_fast(self, data: memoryview) -> bool:
         """Check whether a fast form is awaited, and this looks like its one status, whole or not."""

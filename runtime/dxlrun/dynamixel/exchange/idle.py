@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.bus import NEVER, Bus
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000
@@ -71,10 +70,10 @@ class IdleScheduler:
     line that is gone answers with time-outs (`abandon`).
     """
 
-    def __init__(self, plan: BusPlan, events: EventSink, bus: Bus) -> None:
-        self._plan = plan
-        self._events = events
-        self._bus = bus
+    def __init__(self, bus: Bus, events: EventSink) -> None:
+        self.plan = bus.plan
+        self.bus = bus
+        self.events = events
         self.now_ns = bus.now_ns
         self.tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
@@ -178,7 +177,7 @@ class IdleScheduler:
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
         """Return the transaction with a timeout that the idle time allows; None: it has to wait."""
         left_ns = self._until_ns - self.now_ns()
-        latest_ns = self._need_ns(wanted, max(self._bus.late_ns, LEAST_MARGIN_NS))
+        latest_ns = self._need_ns(wanted, max(self.bus.late_ns, LEAST_MARGIN_NS))
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None
@@ -191,7 +190,7 @@ class IdleScheduler:
 
         A reply behind the end would disturb the next cyclic read, which costs far more than this brings.
         """
-        return wanted.due_ns + (self._plan.latency_ns + margin_ns if wanted.awaited else 0)
+        return wanted.due_ns + (self.plan.latency_ns + margin_ns if wanted.awaited else 0)
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
         """Count the cycles that a program waits; return whether it is done at the cost of the next cycle."""
@@ -200,12 +199,12 @@ class IdleScheduler:
             return False
         if not task.reported:
             task.reported = True
-            servos = self._plan.servos
-            source = self._plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
+            servos = self.plan.servos
+            source = self.plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
             need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
             text = f"{task.name} waits for idle time: it may take {need:.1f} ms, of which the cycle leaves"
             text = f"{text} {left:.1f} ms; periods may be skipped"
-            self._events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
+            self.events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
         return True
 
 

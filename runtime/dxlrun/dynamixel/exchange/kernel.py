@@ -18,16 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.compiled import structs
-from dxlrun.channels.cycle import Commands, Floats, States
+from dxlrun.channels.cycle import Commands, Floats
 from dxlrun.channels.fence import SOURCE, array_of, library
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
-from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus
+from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
-from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
+from dxlrun.dynamixel.port.ports import ReplyPolling
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import BusPlan, Field
@@ -168,12 +167,10 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
     return expected, known, [_Packet(0, size, BROADCAST_ID)], parts
 
 
-class KernelLine(msgspec.Struct, frozen=True):
-    """What the exchange kernel has of one bus; the arrays are shared."""
+class KernelGoals(msgspec.Struct, frozen=True):
+    """What the exchange kernel makes the goals of one bus of; the arrays are shared."""
 
-    plan: BusPlan
-    bus: Bus
-    goals: GoalArrays
+    arrays: GoalArrays
     included: NDArray[np.bool_]  # Which of its servos may get goals
     ceiling: Floats  # The highest speed of each toward a position, rad/s; NaN: no limit
 
@@ -181,34 +178,32 @@ class KernelLine(msgspec.Struct, frozen=True):
 class Kernel:
     """The lines of a robot as the exchange kernel has them."""
 
-    def __init__(  # noqa: PLR0917  the arrays and lines that the hardware has
+    def __init__(
         self,
-        lines: Sequence[KernelLine],
+        lines: Lines,
+        shared: Sequence[KernelGoals],
         samples: Samples,
-        states: States,
         goals: Commands,
         packets: PacketLog,
-        ports: Ports,
-        clock: Clock,
-        beat: Callable[[], None],
     ) -> None:
         self._library = library(ctypes.CDLL)
-        self._known = tuple(lines)
+        self._buses = lines.buses
+        self._shared = tuple(shared)
         self._packets = packets
-        self._ports = ports
-        self._beat = beat
-        self._clock = clock
-        self._now_ns = clock.now_ns
+        self._ports = lines.ports
+        self._beat = lines.beat
+        self._clock = lines.clock
+        self._now_ns = lines.clock.now_ns
         self._raised: BaseException | None = None
-        self._kept: list[object] = [samples, states, goals]
-        self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in lines]
-        self.programs: list[Program | None] = [None] * len(lines)  # By which each bus is read
-        self._writes: list[tuple[SyncWrite, ...]] = [()] * len(lines)
-        self._written: list[object] = [None] * len(lines)
+        self._kept: list[object] = [samples, goals]
+        self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in shared]
+        self.programs: list[Program | None] = [None] * len(shared)  # By which each bus is read
+        self._writes: list[tuple[SyncWrite, ...]] = [()] * len(shared)
+        self._written: list[object] = [None] * len(shared)
         self._kernel = STRUCTS["Kernel"](beat_ns=BEAT_NS)
         self._lines = self._laid_lines()
-        self._lay_states([line.plan for line in lines], samples, states, goals)
-        self._lay_devices([line.plan for line in lines], samples.devices)
+        self._lay_states(lines.plans, samples, goals)
+        self._lay_devices(lines.plans, samples.devices)
         self._lay_ports()
         desk = packets.desk
         self._room = NEVER
@@ -227,16 +222,16 @@ class Kernel:
         """Sends the goals that are due, in C; returns 0, or what `finish_write` takes."""
 
     def _laid_lines(self) -> ctypes.Array[ctypes.Structure]:
-        lines = (STRUCTS["Line"] * max(len(self._known), 1))()
+        lines = (STRUCTS["Line"] * max(len(self._buses), 1))()
         first = first_block = 0
-        for index, (line, known) in enumerate(zip(lines, self._known, strict=False)):
-            plan = known.plan
-            line.included = known.included.ctypes.data
-            line.ceiling = known.ceiling.ctypes.data
+        for index, (line, bus, shared) in enumerate(zip(lines, self._buses, self._shared, strict=False)):
+            plan = bus.plan
+            line.included = shared.included.ctypes.data
+            line.ceiling = shared.ceiling.ctypes.data
             line.buffer = ctypes.addressof(self._buffers[index])
-            line.words, _ = known.bus.words.buffer_info()
+            line.words, _ = bus.words.buffer_info()
             line.room = _ROOM
-            line.byte_ns, line.latency_ns = known.bus.byte_ns, plan.latency_ns
+            line.byte_ns, line.latency_ns = bus.byte_ns, plan.latency_ns
             line.bus = index
             line.protocol = int(plan.protocol)
             line.first_servo, line.servo_count = first, len(plan.servos)
@@ -244,12 +239,10 @@ class Kernel:
             line.first_block, line.block_count = first_block, len(plan.members) - len(plan.servos)
             first_block += line.block_count
         self._kernel.lines = ctypes.addressof(lines)
-        self._kernel.line_count = len(self._known)
+        self._kernel.line_count = len(self._buses)
         return lines
 
-    def _lay_states(
-        self, plans: Sequence[BusPlan], samples: Samples, states: States, goals: Commands
-    ) -> None:
+    def _lay_states(self, plans: Sequence[BusPlan], samples: Samples, goals: Commands) -> None:
         servos = [servo for plan in plans for servo in plan.servos]
         kernel = self._kernel
         kernel.servo_count = len(servos)
@@ -262,7 +255,7 @@ class Kernel:
         for name in ("values", "scale", "reference", "fresh", "doubted", "at_ns", "shown_ns"):
             setattr(kernel, name, _data(getattr(samples, name)))
         for name in ("position", "velocity", "effort", "valid", "age_ns"):
-            setattr(kernel, name, _data(getattr(states, name)))
+            setattr(kernel, name, _data(getattr(samples.states, name)))
         kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals.values))
 
     def _lay_devices(self, plans: Sequence[BusPlan], samples: DeviceSamples) -> None:
@@ -341,7 +334,7 @@ class Kernel:
         return -1 if self._raised else count
 
     def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
-        indices: Sequence[int] = range(len(self._known))  # after an exception: all lines, whose calls fail
+        indices: Sequence[int] = range(len(self._buses))  # after an exception: all lines, whose calls fail
         try:
             if self._raised is None:
                 heard = self._ports.wait(deadline_ns)
@@ -355,7 +348,7 @@ class Kernel:
         return len(indices)
 
     def _is_read(self, index: int) -> bool:
-        return bool(self._lines[index].planned) and self._known[index].bus.failure is None
+        return bool(self._lines[index].planned) and self._buses[index].failure is None
 
     def _raise(self) -> None:
         """Raise what came up while the kernel was at work."""
@@ -376,7 +369,7 @@ class Kernel:
         batch must hold what the lines have at once, a line's buffer the replies to one read.
         """
         sizes = [read.size for read in program.reads[: program.count]]
-        if program.bytes * len(self._known) > self._room or max(sizes, default=0) > _ROOM // 4:
+        if program.bytes * len(self._buses) > self._room or max(sizes, default=0) > _ROOM // 4:
             return False
         line = self._lines[index]
         self.programs[index] = program
@@ -398,9 +391,9 @@ class Kernel:
 
     def plan_writes(self) -> None:
         """Take the goals' sync writes, which are others after a change of mode or limits."""
-        for index, known in enumerate(self._known):
-            if known.goals.sync_writes is not self._writes[index]:
-                self._take_writes(index, known.goals.sync_writes)
+        for index, shared in enumerate(self._shared):
+            if shared.arrays.sync_writes is not self._writes[index]:
+                self._take_writes(index, shared.arrays.sync_writes)
 
     def finish_write(self, code: int) -> dict[int, PortError]:
         """Continue a write that has not ended; return why lines took no more bytes, by index, once."""
@@ -410,7 +403,7 @@ class Kernel:
         self._raise()
         if code == Answer.OK:
             return {}
-        found = {index: self._failure(index) for index in range(len(self._known))}
+        found = {index: self._failure(index) for index in range(len(self._buses))}
         return {index: failure for index, failure in found.items() if failure is not None}
 
     def _take_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:

@@ -40,7 +40,7 @@ class Samples:
     ) -> None:
         """`sources`: with the states of devices; None: there are none."""
         servos = [servo for plan in plans for servo in plan.servos]
-        self._states = states
+        self.states = states  # Of the robot; filled here
         self.rows = np.array([servo.row for servo in servos], dtype=np.intp)
         """Row of each servo's joint in the states."""
         self.values: Floats = np.full((3, len(servos)), np.nan)
@@ -82,8 +82,8 @@ class Samples:
 
     def follow_modes(self) -> None:
         """Use the unit of velocity that belongs to each servo's mode; before replies are taken."""
-        self.modes = self._states.mode.tobytes()
-        turning = np.isin(self._states.mode[self.rows], _WHEEL_MODES)
+        self.modes = self.states.mode.tobytes()
+        turning = np.isin(self.states.mode[self.rows], _WHEEL_MODES)
         self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
 
     def settle(self, now_ns: int) -> None:
@@ -97,7 +97,7 @@ class Samples:
 
     def judge(self, now_ns: int) -> None:
         """Fill the states from those replies of this cycle that can be true."""
-        steps = self.values[0] - self._states.position[self.rows]
+        steps = self.values[0] - self.states.position[self.rows]
         for index in self.jumps.suspects(steps, self.fresh):
             elapsed_ns = int(self.at_ns[index] - self.shown_ns[index])
             if not self.jumps.can_be(index, float(steps[index]), elapsed_ns, now_ns):

@@ -40,12 +40,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Program
 
 
@@ -183,11 +182,11 @@ class Loss(msgspec.Struct):
 class Life:
     """The state of each servo of one bus, and what follows from it; programs that drive it wait in `idle`."""
 
-    def __init__(self, plan: BusPlan, reads: CyclicReads, idle: IdleScheduler, events: EventSink) -> None:
-        count = len(plan.servos)
+    def __init__(self, idle: IdleScheduler, reads: CyclicReads) -> None:
+        count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
-        self.plan = plan
-        self.events = events
+        self.plan = idle.plan
+        self.events = idle.events
         self.idle = idle
         self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
         self.states = [ServoState.LIMP] * count  # The state of each servo

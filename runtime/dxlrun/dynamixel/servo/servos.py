@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.device.devices import Devices
-from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
@@ -30,7 +29,6 @@ from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.errors import counted
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
 NOISE_EVENT_NS = 1_000_000_000  # A noisy line has at most one event in this time
@@ -47,22 +45,14 @@ CAUGHT_UP = 0.05  # rad of the servo from its goal: a returning one has caught u
 class Servos:
     """The servos of one bus: their life, cyclic reads, goals and desired state."""
 
-    def __init__(  # noqa: PLR0917  what a bus consists of
-        self,
-        plan: BusPlan,
-        bus: Bus,
-        idle: IdleScheduler,
-        events: EventSink,
-        states: States,
-        samples: BusSamples,
-        device_commands: Floats,
+    def __init__(
+        self, idle: IdleScheduler, states: States, samples: BusSamples, device_commands: Floats
     ) -> None:
         """`device_commands`: of all devices of the robot."""
-        count = len(plan.servos)
+        plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
-        self._bus = bus
-        self._idle = idle
-        self._events = events
+        self._bus = idle.bus
+        self._events = idle.events
         self._samples = samples
         self._shown = states.hardware_error  # of the robot: Hardware Error Status, or the error byte of 1.0
         self._rows = [servo.row for servo in plan.servos]
@@ -71,13 +61,13 @@ class Servos:
         self.goals = GoalArrays(plan)  # Builds the sync write
         self.reads = CyclicReads(plan, samples)
         """The job that reads every servo and every device once."""
-        self.devices = Devices(plan, idle, self.reads, samples, events, device_commands)
+        self.devices = Devices(idle, self.reads, samples, device_commands)
         """What is on the bus and is no servo."""
-        self.life = Life(plan, self.reads, idle, events)  # The state of each servo
+        self.life = Life(idle, self.reads)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
         """Modes and registers that the servos shall have."""
-        self.watchdogs = WatchdogMonitor(self.life, bus, self.desired)
+        self.watchdogs = WatchdogMonitor(self.life, self.desired)
         """Whether the Bus Watchdogs receive enough instructions."""
         self._offline = Offline(self.life, self._reboots, self.desired)
         self.requests = Requests(self._offline)  # Torque and reboots that clients request
@@ -276,7 +266,7 @@ class Servos:
         That is the hardware error of a servo that raised an alert, the torque limit of one that may have shut
         down, and torque enable of one that waits for its goals. Only a servo that answers is read.
         """
-        self._report_noise(self._idle.now_ns())
+        self._report_noise(self.life.now_ns())
         if not self.life.calm:
             self._offline.look()
         self._slow.look()

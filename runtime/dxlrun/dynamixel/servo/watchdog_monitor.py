@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.exchange.bus import ASKED_NS, SILENCE_NS, Bus
+from dxlrun.dynamixel.exchange.bus import ASKED_NS, SILENCE_NS
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -15,10 +15,10 @@ from dxlrun.plan.transaction import Program
 class WatchdogMonitor:
     """Knows when the servos of one bus were last sent anything; the exchange kernel looks at that, too."""
 
-    def __init__(self, life: Life, bus: Bus, desired: DesiredState) -> None:
+    def __init__(self, life: Life, desired: DesiredState) -> None:
         self._life = life
         self._desired = desired
-        self._words = bus.words
+        self._words = life.idle.bus.words
         self._words[SILENCE_NS] = life.plan.watchdog_ticks * watchdog.UNIT_NS
         self._reviving: set[int] = set()
         """Their revival waits for idle time already: a loop that is late again requests no second one."""
