@@ -10,8 +10,7 @@ import pytest
 from dxlrun.compile.joints.limits import (
     Interval,
     beyond_limits,
-    check_limits,
-    check_speeds,
+    check_samples,
     limits_of,
     number,
     position_text,
@@ -87,12 +86,8 @@ def test_the_worst_target_beyond_either_limit_is_told_once(
     positions: tuple[float, ...], told: str | None
 ) -> None:
     problems = Problems()
-    check_limits(
-        samples(*((index, position, None) for index, position in enumerate(positions))),
-        2 * SOME_S,
-        {"arm": limits_of(ARM)},
-        problems,
-    )
+    listed = samples(*((index, position, None) for index, position in enumerate(positions)))
+    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems, interpolated=False)
     assert [one.what for one in problems.warnings] == ([told] if told else [])
     if told:
         worst = max(range(2), key=lambda index: max(-1.0 - positions[index], positions[index] - 0.5))
@@ -117,7 +112,7 @@ def test_speeds_of_either_sign_are_compared(
     rows: tuple[tuple[float, float | None, float | None], ...], interpolated: bool, told: list[str]
 ) -> None:
     problems = Problems()
-    check_speeds(samples(*rows), 2 * SOME_S, {"arm": ARM}, problems, interpolated=interpolated)
+    check_samples(samples(*rows), 2 * SOME_S, {"arm": ARM}, problems, interpolated=interpolated)
     found = [str(one).split(": ", 1)[1] for one in (*problems.errors, *problems.warnings)]
     assert len(found) == len(told)
     assert all(one.startswith(start) for one, start in zip(found, told, strict=True)), found

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
+from dxlrun.compile.joints.limits import check_samples
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import (
     QUANTITIES,
@@ -33,9 +33,10 @@ from dxlrun.compile.samples import (
     listed_samples,
 )
 from dxlrun.contract.controller import Controller
+from dxlrun.description.document import refusal
 from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
 from dxlrun.description.problems import sentences_of
-from dxlrun.errors import Mark, suggestion
+from dxlrun.errors import InputError, Mark, suggestion
 from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
 from dxlrun.plan.robot_plan import MotionPart
 
@@ -60,16 +61,6 @@ SETTLE_NS = 1_000_000_000
 """From the last target to the end of the part, where the controller has no `goal_time`."""
 
 
-class UnfitError(ValueError):
-    """A sample does not fit into the controller's command."""
-
-    def __init__(self, mark: Mark, what: str, fix: str) -> None:
-        super().__init__(what)
-        self.mark = mark
-        self.what = what
-        self.fix = fix
-
-
 def compile_motion(
     motion: MotionDescription,
     controllers: Mapping[str, CompiledController],
@@ -78,33 +69,21 @@ def compile_motion(
     problems: Problems,
 ) -> list[MotionPart]:
     """Return the parts that could be compiled; `names` are all controllers of the robot file."""
-    limits = {name: limits_of(joint.plan) for name, joint in joints.items()}
     plans = {name: joint.plan for name, joint in joints.items()}
     parts: list[MotionPart] = []
     if not affordable(motion, problems):
         return parts
     for index, part in enumerate(motion.motion.motions):
-        samples = samples_of(motion, index, problems)
         controller = _controller(motion, index, controllers, names, problems)
-        if controller is None or not names_own_joints(motion, index, controller, problems) or not samples:
-            continue
-        kind = command_kind(controller.offer.controller)
-        if kind is None:
-            problems.error(
-                motion.marks.value("motions", index, "controller"),
-                f"{part.controller} ({controller.plan.type}) takes no commands that a motion could give",
-                "choose a group controller or a trajectory controller",
-            )
+        kind, samples = playable(motion, index, controller, plans, problems)
+        if controller is None or not samples:
             continue
         lead_ns = LEAD_NS if kind == TRAJECTORY and samples[0].t_ns == 0 else 0
-        if not right_units(motion, index, plans, problems):
-            continue
-        check_limits(samples, part.start + lead_ns, limits, problems)
-        check_speeds(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
+        check_samples(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
         try:
             commands = commands_of(controller, kind, samples, part.start, lead_ns)
-        except UnfitError as error:
-            problems.error(error.mark, error.what, error.fix)
+        except InputError as error:
+            problems.extend(error.problems)
             continue
         end_ns = part.start + lead_ns + samples[-1].t_ns + _settle_ns(controller)
         parts.append(
@@ -172,7 +151,30 @@ def _controller(
     return controller
 
 
-def names_own_joints(
+def playable(
+    motion: MotionDescription,
+    index: int,
+    controller: CompiledController | None,
+    joints: Mapping[str, JointPlan],
+    problems: Problems,
+) -> tuple[str, tuple[Sample, ...]]:
+    """Return the kind of command by which a part is played, and its samples; none where a part is wrong."""
+    samples = samples_of(motion, index, problems)
+    if controller is None or not _names_own_joints(motion, index, controller, problems):
+        return "", ()
+    kind = command_kind(controller.offer.controller)
+    if kind is None:
+        problems.error(
+            motion.marks.value("motions", index, "controller"),
+            f"{controller.plan.name} ({controller.plan.type}) takes no commands that a motion could give",
+            "choose a group controller or a trajectory controller",
+        )
+    if kind is None or not _right_units(motion, index, joints, problems):
+        return "", ()
+    return kind, samples
+
+
+def _names_own_joints(
     motion: MotionDescription, index: int, controller: CompiledController, problems: Problems
 ) -> bool:
     """Return whether every joint that the part names belongs to its controller."""
@@ -198,7 +200,7 @@ def names_own_joints(
     return not wrong
 
 
-def right_units(
+def _right_units(
     motion: MotionDescription, index: int, joints: Mapping[str, JointPlan], problems: Problems
 ) -> bool:
     """Return whether the listed targets of linear joints are lengths, and those of the others angles."""
@@ -229,7 +231,7 @@ def _settle_ns(controller: CompiledController) -> int:
 def commands_of(
     controller: CompiledController, kind: str, samples: tuple[Sample, ...], start_ns: int, lead_ns: int
 ) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part; raises UnfitError with the first that cannot be given."""
+    """Return the commands of a part; raises InputError with the first that cannot be given."""
     joints = controller.plan.joints
     if kind == TRAJECTORY:
         payload = trajectory_command(joints, samples, lead_ns)
@@ -264,7 +266,7 @@ def prepared(
             origin=str(mark),
             request=msgspec.json.encode(payload).decode(),
         )
-    raise UnfitError(mark, f"{controller.plan.name} refuses this: {reason}", "change the motion")
+    raise refusal(mark, f"{controller.plan.name} refuses this: {reason}", "change the motion")
 
 
 def command_kind(controller: type[Controller[Any]]) -> str | None:
@@ -280,13 +282,13 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
 def group_command(
     controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
 ) -> dict[str, object]:
-    """Return one command with a value for each joint; raises UnfitError."""
+    """Return one command with a value for each joint; raises InputError."""
     fields = controller.Commands[kind].model_fields
     quantities = [quantity for quantity, name in _FIELDS.items() if name in fields]
     for joint, target in sample.targets.items():
         for quantity in _FIELDS:
             if quantity not in quantities and target.get(quantity) is not None:
-                raise UnfitError(
+                raise refusal(
                     target.mark,
                     f"{joint} has a target {quantity}, which this controller does not take",
                     f"take the {quantity} out, or choose another controller",
@@ -297,7 +299,7 @@ def group_command(
 
 
 def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns: int) -> dict[str, object]:
-    """Return a trajectory through all samples, starting `lead_ns` after it was taken; raises UnfitError."""
+    """Return a trajectory through all samples, starting `lead_ns` after it was taken; raises InputError."""
     quantities: list[Quantity] = ["position"]
     derivatives: tuple[Quantity, ...] = ("velocity", "acceleration")
     for quantity in derivatives:
@@ -317,11 +319,11 @@ def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns
 
 
 def _value(sample: Sample, joint: str, quantity: Quantity) -> float:
-    """Return one value; raises UnfitError where the point does not give it."""
+    """Return one value; raises InputError where the point does not give it."""
     target = sample.targets.get(joint)
     value = None if target is None else target.get(quantity)
     if value is None:
-        raise UnfitError(
+        raise refusal(
             sample.mark if target is None else target.mark,
             f"{joint} has no target {quantity} at {sample.t_ns * 1e-9:g} s",
             f"give it one; every joint of the controller needs its {quantity}, here or, "

@@ -12,17 +12,13 @@ from msgspec import structs
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
+from dxlrun.compile.joints.limits import check_samples
 from dxlrun.compile.motions import (
     SETTLE_NS,
     TRAJECTORY,
-    UnfitError,
     affordable,
-    command_kind,
     commands_of,
-    names_own_joints,
-    right_units,
-    samples_of,
+    playable,
 )
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
@@ -105,8 +101,8 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
     for part in parts:
         try:
             commands = _commands(part, running, lead_ns)
-        except UnfitError as error:
-            problems.error(error.mark, error.what, error.fix)
+        except InputError as error:
+            problems.extend(error.problems)
             continue
         times = tuple(command.at_ns for command in commands)
         sizes = tuple(len(command.data) // 8 for command in commands)
@@ -122,29 +118,16 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
 
 def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:
     """Return one part for each controller, which has all parts of the file for it."""
-    by_name: dict[str, list[tuple[int, Sequence[Sample]]]] = {}
+    by_name: dict[tuple[str, str], list[tuple[int, Sequence[Sample]]]] = {}
     for index, part in enumerate(motion.motion.motions):
-        samples = samples_of(motion, index, problems)
         controller = _controller(motion, index, running, problems)
-        if controller is None or not names_own_joints(motion, index, controller, problems) or not samples:
-            continue
-        if not right_units(motion, index, running.joints, problems):
-            continue
-        if command_kind(controller.offer.controller) is None:
-            problems.error(
-                motion.marks.value("motions", index, "controller"),
-                f"{part.controller} ({controller.plan.type}) takes no commands that a motion could give",
-                "choose a group controller or a trajectory controller",
-            )
-            continue
-        by_name.setdefault(part.controller, []).append((part.start, samples))
+        kind, samples = playable(motion, index, controller, running.joints, problems)
+        if samples:
+            by_name.setdefault((part.controller, kind), []).append((part.start, samples))
     found = []
-    for name, pieces in by_name.items():
-        controller = running.controllers[name]
-        kind = command_kind(controller.offer.controller)
-        samples = _joined(sorted(pieces, key=lambda piece: piece[0]), speed, problems)
-        if kind is not None and samples:
-            found.append(_Part(controller, kind, samples))
+    for (name, kind), pieces in by_name.items():
+        if samples := _joined(sorted(pieces, key=lambda piece: piece[0]), speed, problems):
+            found.append(_Part(running.controllers[name], kind, samples))
     return found
 
 
@@ -208,9 +191,7 @@ def _faster(target: SampledTarget, speed: float) -> SampledTarget:
 
 
 def _check(part: _Part, running: Running, problems: Problems) -> None:
-    limits = {name: limits_of(joint) for name, joint in running.joints.items()}
-    check_limits(part.samples, 0, limits, problems)
-    check_speeds(part.samples, 0, running.joints, problems, interpolated=part.kind == TRAJECTORY)
+    check_samples(part.samples, 0, running.joints, problems, interpolated=part.kind == TRAJECTORY)
     for joint, target in part.samples[0].targets.items():
         if target.position is not None and not math.isfinite(running.position(joint)):
             problems.error(target.mark, f"{joint} has not answered yet", "play the motion when it has")
@@ -233,7 +214,7 @@ def _way_ns(part: _Part, running: Running) -> int:
 
 
 def _commands(part: _Part, running: Running, lead_ns: int) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part and when each is given; raises UnfitError."""
+    """Return the commands of a part and when each is given; raises InputError."""
     first_ns = lead_ns + part.samples[0].t_ns
     if part.kind == TRAJECTORY:
         return commands_of(

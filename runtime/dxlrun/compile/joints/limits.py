@@ -78,30 +78,7 @@ def _digits(value: float, *, signed: bool) -> str:
     return f"+{text}" if signed and value > 0 else text
 
 
-def check_limits(
-    samples: Sequence[Sample], start_ns: int, limits: dict[str, Interval], problems: Problems
-) -> None:
-    """Warn once for each joint whose targets leave its limits, with the worst of them."""
-    worst: dict[str, tuple[float, Sample, float]] = {}
-    for sample in samples:
-        for joint, target in sample.targets.items():
-            allowed = limits.get(joint)
-            if allowed is None or target.position is None:
-                continue
-            excess = max(allowed.lower - target.position, target.position - allowed.upper)
-            if excess > worst.get(joint, (1e-6, sample, 0.0))[0]:
-                worst[joint] = (excess, sample, target.position)
-    for joint, (_, sample, position) in worst.items():
-        problems.warning(
-            sample.targets[joint].mark,
-            f"{joint} is sent to {position_text(position, limits[joint].linear).removeprefix('+')} at "
-            f"{(start_ns + sample.t_ns) * 1e-9:.3f} s, "
-            f"outside its limits {limits[joint]}",
-            "the gate will hold it at the limit; change the motion or the limits",
-        )
-
-
-def check_speeds(
+def check_samples(
     samples: Sequence[Sample],
     start_ns: int,
     joints: Mapping[str, JointPlan],
@@ -109,36 +86,28 @@ def check_speeds(
     *,
     interpolated: bool,
 ) -> None:
-    """Refuse once for each joint a speed above the top speed of its servo; warn above the file's limit.
+    """Check the targets of joints against their limits: once for each joint, with the worst of them.
 
-    The speeds are the targets', and with `interpolated`, where a controller moves from sample to sample, the
-    mean speed between two samples, which every path through both reaches.
+    Warn of positions beyond the limits, and of speeds beyond the file's; refuse speeds above the top speed of
+    a servo. The speeds are the targets', and with `interpolated`, where a controller moves from sample to
+    sample, the mean speed between two samples, which every path through both reaches.
     """
-    fastest: dict[str, tuple[float, int, Mark]] = {}
-
-    def note(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
-        if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
-            fastest[joint] = abs(speed), t_ns, mark
-
-    before: dict[str, tuple[int, float]] = {}
-    for sample in samples:
-        for joint, target in sample.targets.items():
-            if target.velocity is not None:
-                note(joint, target.velocity, sample.t_ns, target.mark)
-            if target.position is None:
-                continue
-            t_ns, position = before.get(joint, (sample.t_ns, 0.0))
-            if interpolated and sample.t_ns > t_ns:
-                speed = (target.position - position) / ((sample.t_ns - t_ns) * 1e-9)
-                note(joint, speed, sample.t_ns, target.mark)
-            before[joint] = sample.t_ns, target.position
+    farthest, fastest = _worst(samples, joints, interpolated)
+    for joint, (_, sample, position) in farthest.items():
+        where = position_text(position, joints[joint].linear).removeprefix("+")
+        problems.warning(
+            sample.targets[joint].mark,
+            f"{joint} is sent to {where} at {(start_ns + sample.t_ns) * 1e-9:.3f} s, outside its limits "
+            f"{limits_of(joints[joint])}",
+            "the gate will hold it at the limit; change the motion or the limits",
+        )
     for joint, (speed, t_ns, mark) in fastest.items():
-        plan = joints.get(joint)
-        if plan is None or speed <= plan.highest_speed * (1 + 1e-9):
+        plan = joints[joint]
+        if speed <= plan.highest_speed * (1 + _ROUNDING):
             continue
         unit = speed_unit(plan.linear)
         asked = f"{joint} is asked for {speed:.4g} {unit} at {(start_ns + t_ns) * 1e-9:.3f} s"
-        if plan.top_speed is not None and speed > plan.top_speed * (1 + 1e-9):
+        if plan.top_speed is not None and speed > plan.top_speed * (1 + _ROUNDING):
             problems.error(
                 mark,
                 f"{asked}, more than {plan.top_speed:.4g} {unit}, the top speed of its servo",
@@ -150,6 +119,37 @@ def check_speeds(
                 f"{asked}, more than {plan.highest_speed:.4g} {unit}, its velocity limit",
                 "the gate will hold it at the limit, so it comes late; give it more time, or raise the limit",
             )
+
+
+def _worst(
+    samples: Sequence[Sample], joints: Mapping[str, JointPlan], interpolated: bool
+) -> tuple[dict[str, tuple[float, Sample, float]], dict[str, tuple[float, int, Mark]]]:
+    """Return by joint the position that is farthest beyond its limits, and the highest speed, with places."""
+    farthest: dict[str, tuple[float, Sample, float]] = {}
+    fastest: dict[str, tuple[float, int, Mark]] = {}
+
+    def note(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
+        if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
+            fastest[joint] = abs(speed), t_ns, mark
+
+    before: dict[str, tuple[int, float]] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            if joint not in joints:
+                continue
+            if target.velocity is not None:
+                note(joint, target.velocity, sample.t_ns, target.mark)
+            if target.position is None:
+                continue
+            excess = max(joints[joint].lower - target.position, target.position - joints[joint].upper)
+            if excess > farthest.get(joint, (_TOLERANCE, sample, 0.0))[0]:
+                farthest[joint] = (excess, sample, target.position)
+            t_ns, position = before.get(joint, (sample.t_ns, 0.0))
+            if interpolated and sample.t_ns > t_ns:
+                speed = (target.position - position) / ((sample.t_ns - t_ns) * 1e-9)
+                note(joint, speed, sample.t_ns, target.mark)
+            before[joint] = sample.t_ns, target.position
+    return farthest, fastest
 
 
 class BeyondLimit(NamedTuple):
