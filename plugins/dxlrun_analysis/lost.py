@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
@@ -60,6 +61,7 @@ _FIXES = {
 _REFUSED = (
     "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
 )
+_QUESTION = re.compile(r": [^:?]*\?.*")
 _FEWEST_OF_BUS = 2
 _AT_ONCE_NS = 500_000_000
 
@@ -89,7 +91,10 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
     if len(by_source) == 1 and (at := lost_at.get(ordered[0][0])) is not None:
         sentence = f"{sentence[:-1]}, at {math.degrees(at):.0f} deg."
     if len(by_source) <= _FEWEST_OF_BUS:  # of more it is what they share
-        sentence += "".join(f" {source} {why}." for source, (*_, why) in totals.returns.items())
+        for source, (*_, why) in totals.returns.items():
+            # a question, and what is behind it, is about the plugs of a real servo
+            seen = _QUESTION.sub("", why) if totals.plan.is_simulated(source) else why
+            sentence += f" {source} {seen}."
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
     rebooted = first == EventCode.SERVO_REBOOTED

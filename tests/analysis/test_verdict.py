@@ -512,6 +512,15 @@ def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> 
     assert "as in the robot file" in servo.remedy
 
 
+@pytest.mark.parametrize("port", ["/dev/ttyUSB0", "sim"])
+def test_what_to_do_about_a_servo_that_answers_twice_is_told_of_a_real_one(port: str) -> None:
+    returns = {"elbow": ["answers garbled or twice: do two servos have its ID? If not, check its cable"]}
+    verdict = judge(totals(events=(lost("elbow"),), returns=returns, plan=plan(port, port)))
+    told = " ".join(verdict.sentences)
+    assert "elbow answers garbled or twice" in told
+    assert ("check its cable" in told.lower()) is (port != "sim")
+
+
 @pytest.mark.parametrize(
     ("noise_ms", "others", "code", "accused"),
     [

@@ -232,6 +232,17 @@ def test_of_many_cycles_one_is_kept_each_20_ms() -> None:
     assert np.diff(trail.samples().at_s) == pytest.approx(STEP_S)
 
 
+@pytest.mark.parametrize("hertz", [50, 25])
+def test_a_joint_is_thrown_off_within_80_ms_at_any_rate_of_the_loop(hertz: int) -> None:
+    at_s = np.arange(0.0, 12.0, 1 / hertz)
+    way = 0.4 * np.sin(0.9 * at_s)[:, None]
+    slow = 0.2 * np.clip((at_s - 6.0) / 0.4, 0.0, 1.0)[:, None]  # by 2.3 deg in 80 ms, 3.4 deg in 120 ms
+    trail = Trail(1, 0)
+    trail.take((at_s * 1e9).astype(np.int64), way, way + slow, np.zeros_like(way))
+    (one,) = followed([PlannedJoint("j0", tick=TICK, top_effort=1.0)], trail.samples())
+    assert np.nanmax(one.jerks()[at_s[: len(one.jerks())] > 1.0]) == pytest.approx(0.04, abs=0.002)
+
+
 def test_a_joint_is_compared_with_the_lag_of_its_kind() -> None:
     trail = Trail(3, 0)
     way = np.tile(SWING[:, None], 3)

@@ -154,12 +154,13 @@ class Clients:
         clients = dict.fromkeys(origin for at_ns, origin in self._switches if begin - 1 <= at_ns <= end)
         asked = f", asked for by {' and '.join(list(clients)[:_MOST_NAMED])}" if clients else ""
         when = f"from {self._at_s(begin):.1f} s to {self._at_s(end):.1f} s"
-        who = f"Controllers took turns: {' and '.join(turns[:_MOST_NAMED])} were"
-        who = who if len(turns) > 1 else f"Controller {turns[0]} was deactivated again and again, and"
+        turned = f"Controllers took turns: {' and '.join(turns[:_MOST_NAMED])} were"
+        if len(turns) == 1:
+            turned = f"Controller {turns[0]} was deactivated again and again, and"
         yield Finding(
             "controllers_flap",
             turns[0],
-            f"{who} activated {len(changes)} times {when}, "
+            f"{turned} activated {len(changes)} times {when}, "
             f"every {usual / 1e9:.2f} s{asked}{'; goals were cut off' if cut else ''}.",
             "Let one program alone decide which controller has these joints.",
             Rank.CAUSE,

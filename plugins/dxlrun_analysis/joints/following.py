@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.joints.planned import PlannedJoint
-from dxlrun_analysis.joints.trail import STEP_S, Samples
+from dxlrun_analysis.joints.trail import Samples
 
 STROKE_RAD = 0.1
 """6 deg: by less to and fro a joint does not turn."""
@@ -29,9 +29,9 @@ _LOST = 0.02
 """Of the samples: where more are missing, goals are missing too, and the joint is not to blame."""
 _QUICK = 0.6
 """Part of the model's speed above which a servo follows as it can."""
-_SETTLES = round(0.3 / STEP_S)
-_GONE = round(0.16 / STEP_S)
-"""So many samples without a position are no lost replies: it had no torque ..."""
+_SETTLES_S = 0.3
+_GONE_S = 0.16
+"""So long without a position are no lost replies: it had no torque ..."""
 _NEAR_AGAIN_RAD = 0.035
 """... and has to come so near to its way first."""
 _PLACE_RAD = 0.05
@@ -42,9 +42,11 @@ _CREEPS_RAD_S = 0.1
 _FASTER = 1.5
 _MOST_BEFORE = 12
 """Stays at a place that later ones are compared with: the first ones of a run"""
-_AT_ONCE = round(0.08 / STEP_S)
+_AT_ONCE_S = 0.08
 _BENDS_RAD_S = 0.6
 """A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
+_BENDS_S, _BENT_S = 0.1, 0.16
+"""So long before and behind it that is measured, and so long it is thrown off."""
 _NEAR_RAD = 0.006
 _FEWEST_BENT, _MOSTLY = 2, 0.8
 _FLAT_RAD, _FLAT_OFF_RAD, _BENDS_IN_RAD = 0.2, 0.012, 0.35
@@ -135,6 +137,8 @@ class Followed(NamedTuple):
     """Joints of its kind that moved, itself among them"""
     lag_s: float
     """Of its kind"""
+    step_s: float
+    """Between two samples"""
     at_s: Floats
     goal: Floats
     """Where a joint like it would be"""
@@ -220,7 +224,7 @@ class Followed(NamedTuple):
             ):
                 usual[here].append(stay)
             if before:
-                seconds, middle = stay.end_s - at_s + STEP_S, (here + 0.5) * _PLACE_RAD
+                seconds, middle = stay.end_s - at_s + self.step_s, (here + 0.5) * _PLACE_RAD
                 even = not bends[begin:end].any()
                 yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even)
 
@@ -299,16 +303,18 @@ class Followed(NamedTuple):
 
         0 where its goal went as far; NaN where its trajectory bends.
         """
-        change, went = (np.abs(each[_AT_ONCE:] - each[:-_AT_ONCE]) for each in (self.off, self.goal))
-        change = np.append(np.where(change > went, change, 0.0), np.full(_AT_ONCE, np.nan))
-        change[np.convolve(self._bends(), np.ones(17), "same") > 0] = np.nan
+        at_once, bent = _samples(_AT_ONCE_S, self.step_s), _samples(_BENT_S, self.step_s)
+        change, went = (np.abs(each[at_once:] - each[:-at_once]) for each in (self.off, self.goal))
+        change = np.append(np.where(change > went, change, 0.0), np.full(at_once, np.nan))
+        change[np.convolve(self._bends(), np.ones(2 * bent + 1), "same") > 0] = np.nan
         return change
 
     def _bends(self) -> Flags:
         """Return where the speed of its trajectory changes within 0.2 s, or is not known."""
         bends = np.zeros(len(self.off), np.bool_)
-        least = np.maximum(_BENDS_RAD_S, np.abs(self.speed[5:-5]) / 2)
-        bends[5:-5] = ~(np.abs(self.speed[10:] - self.speed[:-10]) < least)
+        side = _samples(_BENDS_S, self.step_s)
+        least = np.maximum(_BENDS_RAD_S, np.abs(self.speed[side:-side]) / 2)
+        bends[side:-side] = ~(np.abs(self.speed[2 * side :] - self.speed[: -2 * side]) < least)
         return bends
 
 
@@ -318,7 +324,7 @@ def followed(joints: Sequence[PlannedJoint], samples: Samples) -> list[Followed]
     for row, joint in enumerate(joints):
         way, position = samples.way[:, row] / joint.share, samples.position[:, row] / joint.share
         known = way[np.isfinite(way)]
-        if len(known) < _FEWEST or np.ptp(known) < STROKE_RAD or _lossy(position):
+        if len(known) < _FEWEST or np.ptp(known) < STROKE_RAD or _lossy(position, samples.step_s):
             continue
         lag_s = _lag_s(samples.at_s, way, position)
         if lag_s is not None:
@@ -336,13 +342,13 @@ def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: 
     speed = np.gradient(goal, at_s)
     top = math.inf if joint.logged.top_speed is None else joint.logged.top_speed / joint.share
     off = position - goal
-    off[_lasting(~(np.abs(speed) < _QUICK * top), _SETTLES)] = np.nan
-    gone = _gone(position)
+    off[_lasting(~(np.abs(speed) < _QUICK * top), _samples(_SETTLES_S, samples.step_s))] = np.nan
+    gone = _gone(position, samples.step_s)
     for begin in np.flatnonzero(gone[:-1] & ~gone[1:]).tolist():
         near = np.flatnonzero(np.abs(off[begin:]) <= _NEAR_AGAIN_RAD)
         off[begin : begin + (int(near[0]) if len(near) else len(off))] = np.nan
     load = samples.load[:, row] / joint.top_effort
-    return Followed(row, joint, alike, lag_s, at_s, goal, position, off, load, speed)
+    return Followed(row, joint, alike, lag_s, samples.step_s, at_s, goal, position, off, load, speed)
 
 
 def _late(at_s: Floats, way: Floats, lag_s: float) -> Floats:
@@ -363,19 +369,24 @@ def _lag_s(at_s: Floats, way: Floats, position: Floats) -> float | None:
     return lag_s
 
 
-def _gone(position: Floats) -> Flags:
+def _samples(seconds: float, step_s: float) -> int:
+    """Return how many samples a time has, one at least."""
+    return max(1, round(seconds / step_s))
+
+
+def _gone(position: Floats, step_s: float) -> Flags:
     """Return where a joint was without a position for long."""
-    lost = np.isnan(position).astype(float)
-    return np.convolve(lost, np.ones(_GONE))[: len(lost)] >= _GONE
+    lost, many = np.isnan(position).astype(float), _samples(_GONE_S, step_s)
+    return np.convolve(lost, np.ones(many))[: len(lost)] >= many
 
 
-def _lossy(position: Floats) -> bool:
+def _lossy(position: Floats, step_s: float) -> bool:
     """Return whether positions are missing now and then."""
     known = np.flatnonzero(np.isfinite(position))
     if not len(known):
         return True
     gaps = np.diff(known) - 1
-    return float(gaps[gaps < _GONE].sum()) > _LOST * len(known)
+    return float(gaps[gaps < _samples(_GONE_S, step_s)].sum()) > _LOST * len(known)
 
 
 def _lasting(when: Flags, samples: int) -> Flags:

@@ -104,7 +104,7 @@ class ServoLosses:
     """One servo's own missing replies."""
 
     asked: int
-    """Those that it could have answered: nobody before it in a chain was missing."""
+    """Those that it could have answered: none before them in a chain was missing."""
     lost: int
     episodes: int
     broken_off: int = 0
