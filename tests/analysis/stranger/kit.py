@@ -391,9 +391,8 @@ class Story:
     def on_request(self, joint: str | int, decide: Callable[[tuple[int, ...], float], None]) -> None:
         """Call `decide` with the IDs that are about to reply to a read, and the time, before they do."""
 
-        def plan() -> None:
+        def watch(execute: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
             bus = self.bus(joint)
-            execute = bus._execute
 
             def watched(packet: Any, end_ns: int) -> None:
                 read = bus._codec.group_read(packet)
@@ -403,9 +402,9 @@ class Story:
                     decide((packet.servo_id,), end_ns / S)
                 execute(packet, end_ns)
 
-            bus._execute = watched  # type: ignore[method-assign]
+            return watched
 
-        self._later(plan)
+        self._later(lambda: instead(self.bus(joint), "_execute", watch))
 
     def alter(
         self, joint: str, decide: Callable[[float], tuple[Callable[[bytes], bytes], float] | None], kind: str
@@ -422,26 +421,20 @@ class Story:
     def on_arrival(self, joint: str | int, change: Callable[[int, bytes, float], bytes]) -> None:
         """Change bytes between line and host: `change` gets ID, bytes and time; the servos notice nothing."""
 
-        def plan() -> None:
-            bus = self.bus(joint)
-            arrive = bus._arrive
+        def watch(arrive: Callable[[Transmission], None]) -> Callable[[Transmission], None]:
+            at = 2 if self.kind.protocol < 2 else 4
 
             def changed(each: Transmission) -> None:
                 if each.note != "noise":
-                    group = each.group
-                    servo_id = (
-                        group.turns[each.turn].servo_id if group else each.data[2 if bus.protocol < 2 else 4]
-                    )
-                    data = change(servo_id, each.data, each.due_ns / S)
-                    if not data:
+                    servo_id = each.group.turns[each.turn].servo_id if each.group else each.data[at]
+                    each.data = change(servo_id, each.data, each.due_ns / S)
+                    if not each.data:
                         return
-                    if data != each.data:
-                        each.data = data
                 arrive(each)
 
-            bus._arrive = changed  # type: ignore[method-assign]
+            return changed
 
-        self._later(plan)
+        self._later(lambda: instead(self.bus(joint), "_arrive", watch))
 
     def hand_over_late(self, buses: Iterable[str | int], late_s: Callable[[float], float], kind: str) -> None:
         """Let the host receive intact bytes of some buses later, by a time that depends on the time, s."""
@@ -491,15 +484,17 @@ class Story:
 
         def plan() -> None:
             controller = self.virtual.robot.loop.manager._named[name].controller
-            update = controller.update
 
-            def broken(time_ns: int, period_ns: int) -> None:
-                update(time_ns, period_ns)
-                if time_ns >= at_s * S:
-                    self.evidence[f"{name} fails"] += 1
-                    act(controller)
+            def fails(update: Callable[[int, int], None]) -> Callable[[int, int], None]:
+                def broken(time_ns: int, period_ns: int) -> None:
+                    update(time_ns, period_ns)
+                    if time_ns >= at_s * S:
+                        self.evidence[f"{name} fails"] += 1
+                        act(controller)
 
-            controller.update = broken  # type: ignore[method-assign]
+                return broken
+
+            instead(controller, "update", fails)
 
         self._later(plan)
 
@@ -585,6 +580,11 @@ class Story:
         return logs[0]
 
 
+def instead(owner: object, name: str, make: Callable[[Any], Any]) -> None:
+    """Put what `make` returns of a method of an object in its place."""
+    setattr(owner, name, make(getattr(owner, name)))
+
+
 def freeze(story: Story, joint: str, since_s: float, *items: str) -> None:
     """Let registers of a joint's servo show what they showed last, from a time on."""
     for item in items:
@@ -617,7 +617,8 @@ def _hold_back(story: Story, bus: SimulatedBus, late_s: Callable[[float], float]
         inner = due()
         return inner if not held else min(held[0][0], inner if inner is not None else held[0][0])
 
-    bus.take, bus.next_due_ns = late, next_due_ns  # type: ignore[method-assign]
+    instead(bus, "take", lambda _: late)
+    instead(bus, "next_due_ns", lambda _: next_due_ns)
 
 
 def stronger(story: Story, old: float, new: float) -> float:

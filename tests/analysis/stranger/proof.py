@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from tests.analysis.stranger.kit import S, Story
+from tests.analysis.stranger.kit import S, Story, instead
 
 from dxlrun.errors import StartUpError
 from dxlrun.log.reader import Log
@@ -55,6 +55,20 @@ def unread(story: Story, joint: str, least: int) -> None:
     story.checks.append(check)
 
 
+def load_changes(
+    story: Story, joint: str, kind: str, at_s: float, holds: Callable[[float, float], bool]
+) -> None:
+    """Prove that something holds for a joint's mean load in a second before a time, and in one behind it."""
+
+    def check(log: Log) -> None:
+        times, effort = log.cycles["scheduled_ns"] / S, np.abs(column(log, "effort", joint))
+        parts = ((at_s - 1.2, at_s - 0.1), (at_s + 0.4, at_s + 1.4))
+        before, after = (float(np.nanmean(effort[(times > low) & (times < high)])) for low, high in parts)
+        story.evidence[kind] += holds(before, after)
+
+    story.checks.append(check)
+
+
 def said(story: Story, words: str, least: int = 1) -> None:
     """Prove that so many events have some words."""
 
@@ -77,19 +91,17 @@ def goals_stand(story: Story, since_s: float) -> None:
 def start_refused(story: Story) -> None:
     """Prove that the start is refused, and go on to the log that it leaves."""
 
-    def plan() -> None:
-        run = story.virtual.run
-
+    def tries(run: Callable[[], None]) -> Callable[[], None]:
         def tried() -> None:
             try:
                 run()
             except StartUpError:
                 story.evidence["start refused"] += 1
 
-        story.virtual.run = tried  # type: ignore[method-assign]
+        return tried
 
     story.evidence["start refused"] += 0
-    story.prepared.append(plan)
+    story.prepared.append(lambda: instead(story.virtual, "run", tries))
 
 
 def _travel(log: Log, since_s: float) -> float:

@@ -2,47 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from tests.analysis.stranger.kit import S, Story
+from msgspec.structs import replace
+from tests.analysis.stranger.kit import ARMS, JOINTS, MS, S, Spec, Story, instead
 
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+
+
+def _drives(story: Story, joint: str, change: Callable[[float, float, float], float]) -> None:
+    """Change what drives a joint: `change` gets that (Nm of the joint), time (s) and speed (rad/s)."""
+
+    def changes(step: Callable[[Any, Any, float], None]) -> Callable[[Any, Any, float], None]:
+        shaft = story.servo(joint).shaft
+        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
+
+        def changed(drive: Any, damping: Any, dt_s: float) -> None:
+            was, speed = sign * float(drive[index]), sign * float(mechanics.plant.velocity[index])
+            now = change(was, mechanics.grid_ns / S, speed)
+            if now != was:
+                drive = drive.copy()
+                drive[index] = sign * now
+            step(drive, damping, dt_s)
+
+        return changed
+
+    story.prepared.append(lambda: instead(story.servo(joint).shaft.mechanics.plant, "step", changes))
+
+
+def _stays_awake(story: Story, joint: str) -> None:
+    """Keep the mechanics of a joint going, which would rest without a goal that changes."""
+    story.every(0.02, lambda t_s: story.servo(joint).shaft.mechanics._wake(), joint)
 
 
 def shove(story: Story, joint: str, torque: Callable[[float, float, float], float], kind: str) -> None:
     """Let a torque (Nm of the joint) act on a joint, by time (s), angle (rad) and velocity (rad/s)."""
 
-    def plan() -> None:
-        shaft = story.servo(joint).shaft
-        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
-        plant = mechanics.plant
-        step = plant.step
+    def shoved(drive: float, t_s: float, velocity: float) -> float:
+        outside = torque(t_s, story.q(joint), velocity)
+        story.evidence[kind] += outside != 0.0
+        return drive + outside
 
-        def shoved(drive: Any, damping: Any, dt_s: float) -> None:
-            t_s, velocity = mechanics.grid_ns / S, sign * float(plant.velocity[index])
-            outside = torque(t_s, story.q(joint), velocity)
-            if outside:
-                story.evidence[kind] += 1
-                drive = drive.copy()
-                drive[index] += sign * outside
-            step(drive, damping, dt_s)
-
-        plant.step = shoved  # type: ignore[method-assign]
-
-    story.prepared.append(plan)
-    # without a goal that changes the mechanics would rest
-    story.every(0.02, lambda t_s: story.servo(joint).shaft.mechanics._wake(), joint)
+    _drives(story, joint, shoved)
+    _stays_awake(story, joint)
 
 
 def hard_stop(story: Story, joint: str, highest: float) -> None:
     """Let something stand in the way of a joint above an angle (rad); the other way is free."""
 
-    def plan() -> None:
+    def stops(step: Callable[[Any, Any, float], None]) -> Callable[[Any, Any, float], None]:
         shaft, sign = story.servo(joint).shaft, story.joint(joint)["direction"]
         plant, index = shaft.mechanics.plant, shaft.index
-        step = plant.step
 
         def stopped(drive: Any, damping: Any, dt_s: float) -> None:
             step(drive, damping, dt_s)
@@ -52,9 +65,9 @@ def hard_stop(story: Story, joint: str, highest: float) -> None:
                 plant.angle[index] -= sign * beyond
                 plant.velocity[index] = 0.0
 
-        plant.step = stopped  # type: ignore[method-assign]
+        return stopped
 
-    story.prepared.append(plan)
+    story.prepared.append(lambda: instead(story.servo(joint).shaft.mechanics.plant, "step", stops))
 
 
 def carry(story: Story, joint: str, torque_nm: float) -> None:
@@ -128,68 +141,58 @@ def noisy_imu(story: Story) -> None:
 def imu_gives(story: Story, change: Callable[[float, np.ndarray[Any, Any]], None]) -> None:
     """Change what the IMU gives, in place, by the time (s)."""
 
-    def plan() -> None:
-        sensor = story.virtual.sensors["gyro"]
-        read = sensor.read
+    def changed(read: Callable[[Any], int], values: Any) -> int:
+        t_ns = read(values)
+        change(story.now_s(), values)
+        return t_ns
 
-        def changed(values: Any) -> int:
-            t_ns = read(values)
-            change(story.now_s(), values)
-            return t_ns
+    imu_reads(story, changed)
 
-        sensor.read = changed  # type: ignore[method-assign]
 
-    story.prepared.append(plan)
+def imu_reads(story: Story, given: Callable[[Callable[[Any], int], Any], int]) -> None:
+    """Let `given` read the IMU: it gets how it is read and the values to fill, and returns their time, ns."""
+    story.prepared.append(
+        lambda: instead(story.virtual.sensors["gyro"], "read", lambda read: partial(given, read))
+    )
 
 
 def rubs(story: Story, joint: str, friction: Callable[[float, float, float], float], kind: str) -> None:
     """Let a joint have a friction (Nm) by time (s), angle (rad) and speed (rad/s), of its own beside it."""
 
-    def plan() -> None:
+    own: list[float] = []
+
+    def rubbed(drive: float, t_s: float, speed: float) -> float:
         shaft = story.servo(joint).shaft
-        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
-        plant, own = mechanics.plant, float(mechanics.plant._friction[shaft.index])
-        step = plant.step
+        plant, more = shaft.mechanics.plant, friction(t_s, story.q(joint), speed)
+        own[:] = own or [float(plant._friction[shaft.index])]
+        story.evidence[kind] += more > 0
+        plant._friction[shaft.index] = own[0] + more
+        return drive
 
-        def rubbed(drive: Any, damping: Any, dt_s: float) -> None:
-            speed = sign * float(plant.velocity[index])
-            more = friction(mechanics.grid_ns / S, story.q(joint), speed)
-            story.evidence[kind] += more > 0
-            plant._friction[index] = own + more
-            step(drive, damping, dt_s)
-
-        plant.step = rubbed  # type: ignore[method-assign]
-
-    story.prepared.append(plan)
-    story.every(0.02, lambda t_s: story.servo(joint).shaft.mechanics._wake(), joint)
+    _drives(story, joint, rubbed)
+    _stays_awake(story, joint)
 
 
 def transmits(story: Story, joint: str, change: Callable[[float, float], float], kind: str) -> None:
     """Change by the time (s) which torque (Nm of the joint) of a motor arrives at its output."""
 
-    def plan() -> None:
-        shaft = story.servo(joint).shaft
-        mechanics, index, sign = shaft.mechanics, shaft.index, story.joint(joint)["direction"]
-        step = mechanics.plant.step
+    def changed(drive: float, t_s: float, speed: float) -> float:
+        now = change(t_s, drive)
+        story.evidence[kind] += now != drive
+        return now
 
-        def changed(drive: Any, damping: Any, dt_s: float) -> None:
-            was = sign * float(drive[index])
-            now = change(mechanics.grid_ns / S, was)
-            if now != was:
-                story.evidence[kind] += 1
-                drive = drive.copy()
-                drive[index] = sign * now
-            step(drive, damping, dt_s)
+    _drives(story, joint, changed)
 
-        mechanics.plant.step = changed  # type: ignore[method-assign]
 
-    story.prepared.append(plan)
+def read_slowly(story: Story, hertz: int = 4) -> None:
+    """Let temperatures and voltages be read some times a second."""
+    for bus in story.spec["buses"].values():
+        bus["slow_registers"] = {"rate": hertz}
 
 
 def heats(story: Story, joint: str, celsius: Callable[[float], float], *, trips: bool = False) -> None:
     """Let a servo have a temperature (degrees C) by time (s), and trip above its limit if it is to."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 4}
+    read_slowly(story)
 
     def heat(t_s: float) -> None:
         story.evidence["heated"] += 1
@@ -209,10 +212,7 @@ def cut_tails(story: Story, joint: str | int, share: float, bytes_left: range, s
         cut = len(ids) > 1 and t_s > since_s and story.random.random() < share
         state.update({"from": story.random.choice(bytes_left) if cut else None, "got": 0})
 
-    def plan() -> None:
-        bus = story.bus(joint)
-        take = bus.take
-
+    def shorten(take: Callable[..., bytes]) -> Callable[..., bytes]:
         def short(now_ns: int, *, handed_ns: int | None = None) -> bytes:
             data = take(now_ns, handed_ns=handed_ns)
             begin, cut = state["got"] or 0, state["from"]
@@ -224,7 +224,38 @@ def cut_tails(story: Story, joint: str | int, share: float, bytes_left: range, s
                 story.evidence["tails cut"] += 1
             return data[: max(0, cut - begin)]
 
-        bus.take = short  # type: ignore[method-assign]
+        return short
 
     story.on_request(joint, decide)
-    story.prepared.append(plan)
+    story.prepared.append(lambda: instead(story.bus(joint), "take", shorten))
+
+
+def stream_to_arms(story: Story, lease_ms: int, goals: Iterable[tuple[float, list[float]]]) -> None:
+    """Let a client stream goals (rad) at times (s) to a controller of the arms, each with a lease."""
+    controllers = story.spec["controllers"]
+    controllers["body"]["joints"] = [joint for joint in JOINTS if joint not in ARMS]
+    controllers["arms"] = {"type": "joint_group_position_controller", "joints": list(ARMS)}
+    story.motion = story.swing()
+    story.asks += [(t_s, "arms", "positions", {"positions": goal}) for t_s, goal in goals]
+
+    def lease() -> None:
+        asks = story.virtual.robot.loop.steering.inbox._asks
+        for place, (at_s, command) in enumerate(asks):
+            asks[place] = (at_s, replace(command, lease_ns=lease_ms * MS))
+
+    story.prepared.append(lease)
+
+
+def foot_board(story: Story) -> None:
+    """Give the robot a board in its foot whose four forces tremble by some steps."""
+    if story.kind.protocol == 1.0:
+        model, middle, noise = "OP-FSR", 4.0, 0.02
+        cells = [f"force.{number}" for number in range(1, 5)]
+    else:
+        model, middle, noise = "bitbots-foot", 80_000.0, 400.0
+        cells = [f"pressure.{side}_{end}" for side in ("left", "right") for end in ("front", "back")]
+    forces: Spec = {
+        "values": {cell: middle * (1 + 0.1 * place) for place, cell in enumerate(cells)},
+        "noise": dict.fromkeys(cells, noise),
+    }
+    story.spec["devices"] = {"foot": {"bus": "main", "id": 101, "model": model, "simulation": forces}}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 from tests.analysis.stranger.expectation import BUSES, HARDWARE, TURNS, Case, collector, others, together
-from tests.analysis.stranger.kit import ARMS, HEAD, JOINTS, LEFT, MS, RIGHT, Broken, S, Spec, Story, stronger
+from tests.analysis.stranger.kit import ARMS, HEAD, JOINTS, LEFT, RIGHT, Broken, S, Story, stronger
 from tests.analysis.stranger.proof import goals_move, goals_stand, lags, said, seen, spread, turns
-from tests.analysis.stranger.world import noisy_imu
+from tests.analysis.stranger.world import foot_board, imu_reads, noisy_imu, read_slowly, stream_to_arms
 
 from dxlrun.log.reader import Log
 
@@ -31,21 +31,15 @@ case = collector(CASES)
 def stream_runs_out(story: Story) -> None:
     """The program that streams goals to the arms dies in the middle of a movement; its lease of 0.2 s runs
     out, and the arms stand still for the rest of the run, while head and legs go on."""
-    controllers = story.spec["controllers"]
-    controllers["body"]["joints"] = list(others(*ARMS))
-    controllers["arms"] = {"type": "joint_group_position_controller", "joints": list(ARMS)}
-    story.motion = story.swing()
     story.clients = ("teleop",)
-    for t_s in np.arange(0.6, 3.1, 0.03).tolist():
-        goal = [(0.3 + 0.1 * place) * math.sin(2.2 * (t_s - 0.6)) for place in range(len(ARMS))]
-        story.asks.append((t_s, "arms", "positions", {"positions": goal}))
-
-    def lease() -> None:
-        asks = story.virtual.robot.loop.steering.inbox._asks
-        for place, (at_s, command) in enumerate(asks):
-            asks[place] = (at_s, replace(command, lease_ns=200 * MS))
-
-    story.prepared.append(lease)
+    stream_to_arms(
+        story,
+        200,
+        (
+            (t_s, [(0.3 + 0.1 * place) * math.sin(2.2 * (t_s - 0.6)) for place in range(len(ARMS))])
+            for t_s in np.arange(0.6, 3.1, 0.03).tolist()
+        ),
+    )
     said(story, "stream")
 
 
@@ -146,23 +140,17 @@ def imu_grows_old(story: Story) -> None:
     noisy_imu(story)
     story.motion = story.swing(right_knee="0.35 * sin(2.1 * t)")
 
-    def plan() -> None:
-        sensor = story.virtual.sensors["gyro"]
-        read = sensor.read
-        last: list[Any] = []
+    last: list[Any] = []
 
-        def hung(values: Any) -> int:
-            if story.now_s() < 2.5 or not last:
-                t_ns = read(values)
-                last[:] = [t_ns, values.copy()]
-                return int(t_ns)
+    def hung(read: Callable[[Any], int], values: Any) -> int:
+        if story.now_s() < 2.5 or not last:
+            last[:] = [read(values), values.copy()]
+        else:
             values[:] = last[1]
             story.evidence["old"] += 1
-            return int(last[0])
+        return int(last[0])
 
-        sensor.read = hung  # type: ignore[method-assign]
-
-    story.prepared.append(plan)
+    imu_reads(story, hung)
 
 
 @case(
@@ -177,17 +165,7 @@ def imu_grows_old(story: Story) -> None:
 def foot_board_spikes(story: Story) -> None:
     """The ribbon cable of a force cell in the foot has a bad crimp: of one of four cells every tenth
     reading or so is three or four times too much, the others tremble by some steps as ever."""
-    if story.kind.protocol == 1.0:
-        model, middle, noise = "OP-FSR", 4.0, 0.02
-        cells = [f"force.{number}" for number in range(1, 5)]
-    else:
-        model, middle, noise = "bitbots-foot", 80_000.0, 400.0
-        cells = [f"pressure.{side}_{end}" for side in ("left", "right") for end in ("front", "back")]
-    forces: Spec = {
-        "values": {cell: middle * (1 + 0.1 * place) for place, cell in enumerate(cells)},
-        "noise": dict.fromkeys(cells, noise),
-    }
-    story.spec["devices"] = {"foot": {"bus": "main", "id": 101, "model": model, "simulation": forces}}
+    foot_board(story)
 
     def crimp() -> None:
         registers = story.bus(0).device(101).registers
@@ -322,26 +300,19 @@ def limp_wrist_dangles(story: Story) -> None:
 def rough_stream_that_works(story: Story) -> None:
     """A client streams goals to the arms by a bad wireless link: they come at uneven times, 15 to 90 ms
     apart, with a noise of tenths of a degree, but never so late that the lease of 0.3 s runs out."""
-    controllers = story.spec["controllers"]
-    controllers["body"]["joints"] = list(others(*ARMS))
-    controllers["arms"] = {"type": "joint_group_position_controller", "joints": list(ARMS)}
-    story.motion = story.swing()
     story.clients = ("teleop",)
-    t_s = 0.6
-    while t_s < 5.95:
-        goal = [
-            (0.25 + 0.05 * place) * math.sin(1.3 * (t_s - 0.6)) + story.random.gauss(0.0, 0.004)
-            for place in range(len(ARMS))
-        ]
-        story.asks.append((t_s, "arms", "positions", {"positions": goal}))
-        t_s += story.random.uniform(0.015, 0.09)
 
-    def lease() -> None:
-        asks = story.virtual.robot.loop.steering.inbox._asks
-        for place, (at_s, command) in enumerate(asks):
-            asks[place] = (at_s, replace(command, lease_ns=300 * MS))
+    def goals() -> Iterator[tuple[float, list[float]]]:
+        t_s = 0.6
+        while t_s < 5.95:
+            swing = math.sin(1.3 * (t_s - 0.6))
+            yield (
+                t_s,
+                [(0.25 + 0.05 * at) * swing + story.random.gauss(0.0, 0.004) for at in range(len(ARMS))],
+            )
+            t_s += story.random.uniform(0.015, 0.09)
 
-    story.prepared.append(lease)
+    stream_to_arms(story, 300, goals())
     goals_move(story, 4.0)
 
 
@@ -362,8 +333,7 @@ def steps_and_rests(story: Story) -> None:
 def warms_up_as_all_do(story: Story) -> None:
     """A cold robot is switched on and warms up as it works: all servos go from 24 to 36 degrees C, the
     knees to 41, far from any limit."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 4}
+    read_slowly(story)
 
     def warm(t_s: float) -> None:
         for name in JOINTS:

@@ -9,7 +9,7 @@ from tests.analysis.stranger.expectation import HARDWARE, LATE, MACHINE, SILENT,
 from tests.analysis.stranger.kit import JOINTS, MS, Story
 from tests.analysis.stranger.live import compile_jobs, hog_on_the_core_of_the_loop, stop_for_moments
 from tests.analysis.stranger.proof import said
-from tests.analysis.stranger.world import late_wakes, supply, voltages_often
+from tests.analysis.stranger.world import late_wakes, read_slowly, supply, voltages_often
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -19,8 +19,7 @@ case = collector(CASES)
 def blocked_knee_drags_the_supply(story: Story) -> None:
     """A knee is blocked and draws stall current; the weak battery's voltage falls for all, and all get
     slower."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 5}
+    read_slowly(story, 5)
     story.fault("sag ohms=0.6 at=1s")
     story.fault("jam servo={id} at=2500ms", "left_knee")
 

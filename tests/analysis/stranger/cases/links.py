@@ -136,7 +136,7 @@ def tuning_gui_on_the_same_line(story: Story) -> None:
 )
 def script_reads_by_our_adapter(story: Story) -> None:
     """A script for logging temperatures has the same adapter open and reads all servos in turn, 25 times a
-    second: of that only the replies are seen here, which nobody here asked for."""
+    second: of that only the replies are seen here, which nothing here asked for."""
     numbers = [0]
 
     def read(t_s: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from tests.analysis.stranger.expectation import LATE, SOFT, STUCK, Case, collector
 from tests.analysis.stranger.kit import S, Story, freeze
 from tests.analysis.stranger.proof import column, lags
-from tests.analysis.stranger.world import late_wakes, poke, shove, voltages_often
+from tests.analysis.stranger.world import late_wakes, poke, read_slowly, shove, voltages_often
 
 from dxlrun.log.reader import Log
 
@@ -76,8 +76,7 @@ def blocked_without_load(story: Story) -> None:
 @case("movement", "ax_single x_sync", subject=("left_knee",), cause=LATE + r"|hot|warm|temperature")
 def late_when_hot(story: Story) -> None:
     """A knee warms up in the run; above 55 degrees its replies come late, more and more."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 4}
+    read_slowly(story)
 
     def warm(t_s: float) -> None:
         story.servo("left_knee").temperature = 32 + 7.5 * (t_s - 1)
@@ -148,8 +147,7 @@ def torque_limit_lowered(story: Story) -> None:
 )
 def knee_gets_hot(story: Story) -> None:
     """A knee carries too much for long, and gets hotter and hotter until it trips."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 4}
+    read_slowly(story)
 
     def warm(t_s: float) -> None:
         servo = story.servo("left_knee")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from msgspec.structs import replace
 from tests.analysis.stranger.expectation import SOFT, Case, collector, others
-from tests.analysis.stranger.kit import ARMS, JOINTS, MS, Broken, Story
+from tests.analysis.stranger.kit import ARMS, JOINTS, Broken, Story
 from tests.analysis.stranger.proof import column, said
+from tests.analysis.stranger.world import read_slowly, stream_to_arms
 
 from dxlrun.log.reader import Log
 
@@ -102,8 +102,7 @@ def falls_over_a_limp_knee(story: Story) -> None:
 @case("robot", "mx_bulk x_fast", cause=r"batter|voltage", first=0, innocents=JOINTS)
 def battery_runs_down(story: Story) -> None:
     """The battery is nearly empty: all voltages fall, and the battery controller ends the run."""
-    for bus in story.spec["buses"].values():
-        bus["slow_registers"] = {"rate": 5}
+    read_slowly(story, 5)
     story.spec["controllers"]["battery"] = {
         "type": "battery_state_broadcaster",
         "voltages": ["left_knee/voltage", "right_knee/voltage"],
@@ -319,21 +318,15 @@ def controllers_flap(story: Story) -> None:
 def stream_gasps(story: Story) -> None:
     """The program that streams goals to the arms collects its garbage: three times it sends nothing for
     0.4 s, though its lease is 0.2 s; each time the arms stop dead, and jump on after it."""
-    controllers = story.spec["controllers"]
-    controllers["body"]["joints"] = list(others(*ARMS))
-    controllers["arms"] = {"type": "joint_group_position_controller", "joints": list(ARMS)}
-    story.motion = story.swing()
-    for t_s in np.arange(0.5, 5.2, 0.03).tolist():
-        if not any(at_s < t_s < at_s + 0.4 for at_s in (2.4, 3.3, 4.1)):
-            goal = [(0.35 + 0.1 * place) * math.sin(2.4 * (t_s - 0.5)) for place in range(len(ARMS))]
-            story.asks.append((t_s, "arms", "positions", {"positions": goal}))
-
-    def lease() -> None:
-        asks = story.virtual.robot.loop.steering.inbox._asks
-        for place, (at_s, command) in enumerate(asks):
-            asks[place] = (at_s, replace(command, lease_ns=200 * MS))
-
-    story.prepared.append(lease)
+    stream_to_arms(
+        story,
+        200,
+        (
+            (t_s, [(0.35 + 0.1 * place) * math.sin(2.4 * (t_s - 0.5)) for place in range(len(ARMS))])
+            for t_s in np.arange(0.5, 5.2, 0.03).tolist()
+            if not any(at_s < t_s < at_s + 0.4 for at_s in (2.4, 3.3, 4.1))
+        ),
+    )
     said(story, "stream", 3)
 
 

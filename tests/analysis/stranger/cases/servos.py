@@ -15,11 +15,9 @@ from tests.analysis.stranger.expectation import (
     collector,
     others,
 )
-from tests.analysis.stranger.kit import S, Story
-from tests.analysis.stranger.proof import column, lags, seen, start_refused, unread
+from tests.analysis.stranger.kit import Story
+from tests.analysis.stranger.proof import lags, load_changes, seen, start_refused, unread
 from tests.analysis.stranger.world import carry, hard_stop, poke, set_before, shove
-
-from dxlrun.log.reader import Log
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -191,12 +189,7 @@ def horn_slips(story: Story) -> None:
     story.motion = story.swing(left_shoulder="0.7 + 0.25 * sin(1.9 * t)")
     story.at(3.2, lambda: carry(story, "left_shoulder", 0.0), "left_shoulder")
 
-    def check(log: Log) -> None:
-        times, effort = log.cycles["scheduled_ns"] / S, np.abs(column(log, "effort", "left_shoulder"))
-        before = np.nanmean(effort[(times > 2.0) & (times < 3.1)])
-        story.evidence["lighter"] += np.nanmean(effort[(times > 3.6) & (times < 4.6)]) < before / 2
-
-    story.checks.append(check)
+    load_changes(story, "left_shoulder", "lighter", 3.2, lambda before, after: after < before / 2)
 
 
 @case("servo", "mx_bulk x_fast", subject=("left_elbow",), cause=FOLLOWS + r"|slip|gear|tooth|teeth|" + LOAD)

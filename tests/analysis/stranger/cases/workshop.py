@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 from tests.analysis.stranger.expectation import HOST, LATE, STUCK, Case, collector, others
-from tests.analysis.stranger.kit import JOINTS, S, Spec, Story
+from tests.analysis.stranger.kit import JOINTS, S, Story
 from tests.analysis.stranger.proof import lags, seen
-from tests.analysis.stranger.world import poke, supply, voltages_often
+from tests.analysis.stranger.world import foot_board, poke, supply, voltages_often
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -270,17 +270,7 @@ def return_delay_at_factory(story: Story) -> None:
 def foot_board_hangs(story: Story) -> None:
     """The board in a foot answers every read, but its converter has hung: all its forces, which trembled by
     some steps before, are the same to the bit from then on."""
-    if story.kind.protocol == 1.0:
-        model, middle, noise = "OP-FSR", 4.0, 0.02
-        cells = [f"force.{number}" for number in range(1, 5)]
-    else:
-        model, middle, noise = "bitbots-foot", 80_000.0, 400.0
-        cells = [f"pressure.{side}_{end}" for side in ("left", "right") for end in ("front", "back")]
-    forces: Spec = {
-        "values": {cell: middle * (1 + 0.1 * place) for place, cell in enumerate(cells)},
-        "noise": dict.fromkeys(cells, noise),
-    }
-    story.spec["devices"] = {"foot": {"bus": "main", "id": 101, "model": model, "simulation": forces}}
+    foot_board(story)
 
     def hang() -> None:
         registers = story.bus(0).device(101).registers
