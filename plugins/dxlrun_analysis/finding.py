@@ -55,3 +55,8 @@ class Finding:
     def line(self) -> str:
         """The sentence, and the remedy behind it."""
         return f"{self.sentence} {self.remedy}".rstrip()
+
+
+def cause(code: str, subject: str, sentence: str, remedy: str = "", share: float = 1.0) -> Finding:
+    """Return a finding that leads to what makes a run not good, see Rank.CAUSE."""
+    return Finding(code, subject, sentence, remedy, Rank.CAUSE, share)

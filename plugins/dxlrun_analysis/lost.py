@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
 from dxlrun.errors import counted
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, Rank, cause
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals
 
@@ -270,7 +270,7 @@ def implausible(totals: RunTotals) -> Iterable[Finding]:
         if group.code == EventCode.IMPLAUSIBLE and movers and not named & {group.source, movers[0].bus.name}:
             sentence = f"{last_line(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
             fix = "Turn it by hand without torque, and watch its position."
-            yield Finding("position_jumped", group.source, sentence, fix, Rank.CAUSE, 4.0)
+            yield cause("position_jumped", group.source, sentence, fix, 4.0)
 
 
 def missing_replies(totals: RunTotals) -> Iterable[Finding]:

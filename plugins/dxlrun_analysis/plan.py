@@ -76,6 +76,11 @@ class LoggedBus(msgspec.Struct):
         joints = {servo.servo_id: servo.own_name for servo in self.servos}
         return joints | {device.servo_id: device.name for device in self.devices}
 
+    def called(self, servo_id: int) -> tuple[str, str]:
+        """Return what findings call a servo: its name, and the same with its ID and its bus."""
+        name = self.names.get(servo_id) or f"servo {servo_id}"
+        return name, f"{name} (servo {servo_id} on bus {self.name})"
+
 
 class Mover(NamedTuple):
     """A servo that moves a joint."""

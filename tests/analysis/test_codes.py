@@ -14,7 +14,7 @@ from dxlrun_analysis.lost import CODES
 
 PAGE = Path(__file__).parents[2] / "docs" / "analyze.md"
 FILES = Path(next(iter(dxlrun_analysis.__path__))).rglob("*.py")
-MADE_BY = ("Finding", "Failing", "_Rule")
+MADE_BY = ("Finding", "Failing", "_Rule", "cause", "slow_servo")
 """Calls whose first argument is a code, or is computed by what else is looked at."""
 
 

@@ -15,7 +15,7 @@ from dxlrun.output.table import microseconds
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
 from dxlrun_analysis.cycles.worst import Cause, CauseKind
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 
 LEAST_CYCLES = 3
 MOST_OF_IT = 0.5
@@ -71,22 +71,21 @@ def cause_findings(causes: Causes, wake_up_remedy: str) -> Iterable[Finding]:
             continue
         cycles = counted(min(one.cycles, causes.long), "cycle", "cycles")
         took = f"{microseconds(one.long_ns / 1e3)} of {microseconds(total_ns / 1e3)} in {cycles}"
-        yield Finding(
+        yield cause(
             rule.code,
             _accused(one),
             _capital(rule.sentence.format(subject=one.subject, took=took)),
             _REMEDIES.get(one.subject) or rule.remedy.format(subject=one.subject) or wake_up_remedy,
-            Rank.CAUSE,
             one.long_ns / total_ns,
         )
     if causes.throttled and causes.late + causes.long >= LEAST_CYCLES:
         samples = counted(causes.throttled, "second", "seconds")
-        yield Finding(
+        yield cause(
             "throttled_processor",
             "machine",
             f"The processor was hot and slow for {samples}, and cycles were late.",
             "Check fan and heat sink, or lower the load beside the loop.",
-            Rank.CAUSE,
+            share=0.0,
         )
 
 

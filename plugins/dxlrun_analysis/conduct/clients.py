@@ -23,7 +23,7 @@ from dxlrun.channels.events import Event, EventCode, GoalReport
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, Rank, cause
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _SOON_NS = 2_000_000_000
@@ -157,14 +157,12 @@ class Clients:
         turned = f"Controllers took turns: {' and '.join(turns[:_MOST_NAMED])} were"
         if len(turns) == 1:
             turned = f"Controller {turns[0]} was deactivated again and again, and"
-        yield Finding(
+        yield cause(
             "controllers_flap",
             turns[0],
             f"{turned} activated {len(changes)} times {when}, "
             f"every {usual / 1e9:.2f} s{asked}{'; goals were cut off' if cut else ''}.",
             "Let one program alone decide which controller has these joints.",
-            Rank.CAUSE,
-            1.0,
         )
 
     def _at_s(self, at_ns: int) -> float:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.log.reader import Log
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins, Series
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 
@@ -155,35 +155,29 @@ class Trends:
         error = int(self._errors[index])
         where = f"{joint.name} ({joint.servos})"
         if hottest - coldest > _NONSENSE_C or hottest > _NONSENSE_C:
-            yield Finding(
+            yield cause(
                 "temperature_sensor",
                 joint.name,
                 f"{where} reads temperatures that it cannot have: from {coldest:.0f} to {hottest:.0f} deg C.",
                 "Feel it: where it is not hot, its temperature sensor is broken, and does not protect it.",
-                Rank.CAUSE,
-                1.0,
             )
             return
         limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
         if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
             shut = ", and reported overheating" if error & _HEAT else ""
             measured = f"was hot, at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
-            yield Finding(
+            yield cause(
                 "hot_joint",
                 joint.name,
                 f"{where} {measured}{shut}.",
                 "Let it cool; give it less load, pauses or air, and look for what makes it work at rest.",
-                Rank.CAUSE,
-                1.0,
             )
         if error & _OVERLOAD and not moves_badly:
-            yield Finding(
+            yield cause(
                 "overload",
                 joint.name,
                 f"{where} reported overload: its load is more than its torque.",
                 "Take load off the joint, or move it slower; a reboot clears the error.",
-                Rank.CAUSE,
-                1.0,
             )
 
     def _power(
@@ -196,27 +190,25 @@ class Trends:
         above = highest > np.array([joint.highest_volts for joint in joints]) + _STEP_V / 2
         if 2 * above.sum() > len(members):
             limit = min(joint.highest_volts for joint in joints)
-            yield Finding(
+            yield cause(
                 "overvoltage",
                 bus,
                 f"The supply of bus {bus} is too high: up to {highest.max():.1f} V, and its servos may have "
                 f"{limit:.1f} V; the lowest in the run was {lowest.min():.1f} V.",
                 "Take it off, and check the supply, its setting, or the charger and the number of cells.",
-                Rank.CAUSE,
                 4.0,
             )
             return
         falls = lowest < (1 - _SAG) * highest
         samples = [one for one in self._samples if one.joint in members]
         if 2 * falls.sum() > len(members) > 1 and _falls_with_load(samples):
-            yield Finding(
+            yield cause(
                 "sagging_supply",
                 bus,
                 f"The supply of bus {bus} {_how_it_falls(samples)}: from {highest.max():.1f} V to "
                 f"{lowest.min():.1f} V.",
                 "Use a stronger supply or a fresh battery, thicker and shorter cables, and feed the bus "
                 "at more than one end.",
-                Rank.CAUSE,
                 2.0,
             )
             return
@@ -234,14 +226,13 @@ class Trends:
             )
             where = f"bus {bus}" if 2 * len(names) > len(members) > 1 else ", ".join(names)
             known = np.isfinite(lowest[reported]).any()
-            yield Finding(
+            yield cause(
                 "undervoltage",
                 names[0] if alone else bus,
                 f"The voltage of {where} is out of its limits"
                 + (f" of {low:.1f} to {high:.1f} V" if math.isfinite(high - low) else "")
                 + (f": {lowest[reported].min():.1f} to {highest[reported].max():.1f} V." if known else "."),
                 "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
-                Rank.CAUSE,
                 4.0,
             )
 
@@ -272,13 +263,12 @@ class Trends:
         loaded = falls > 1 and all(loads) and np.mean(loads[0]) > _LOADED * np.mean(loads[1])
         if self._errors[index] & _VOLTAGE and not loaded:
             return None
-        return Finding(
+        return cause(
             "own_supply",
             joint.name,
             f"The voltage at {joint.name} ({joint.servos}) falls{' with its load' if loaded else ''} to "
             f"{np.nanmin(volts[dips]):.1f} V while the others of bus {joint.bus} stay at {usual[at]:.1f} V.",
             "Check its plug and the cable that leads to it alone: contacts with a high resistance.",
-            Rank.CAUSE,
             4.0,
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from dxlrun.errors import counted
 from dxlrun_analysis.counts import has_them_alone
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
@@ -62,19 +62,18 @@ class BrokenReplies:
         behind = broken - head >= max(_FEWEST, _ALONE * (total - head))
         if not behind and not has_them_alone(broken, total - broken):
             return ()
-        name, asked = bus.names.get(servo_id) or f"servo {servo_id}", lost.asked + lost.broken_off
+        (name, named), asked = bus.called(servo_id), lost.asked + lost.broken_off
         end = self._cut[index * IDS + servo_id] >= _ALONE * broken
         cut = "; or the end of the status packet that all share, which is its part, is lost" if end else ""
         return (
-            Finding(
+            cause(
                 "broken_replies",
                 name,
-                f"The replies of {name} (servo {servo_id} on bus {bus.name}) come broken, "
+                f"The replies of {named} come broken, "
                 f"{counted(broken, 'time', 'times')} of {asked}, and those of the others do not: two "
                 f"servos have its ID, or its own driver or plug is bad{cut}.",
                 f"Unplug {name} and run `dxlrun scan {bus.port or 'PORT'}`: if ID {servo_id} still answers, "
                 "two servos have it; else check its plugs, and exchange it where a new cable does not help.",
-                Rank.CAUSE,
                 broken / max(asked, 1),
             ),
         )

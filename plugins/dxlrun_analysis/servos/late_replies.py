@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from dxlrun.errors import counted
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.reply_times import slow_servo
 
 _FEWEST = 5
 """Late replies from which they are no chance."""
@@ -88,14 +89,13 @@ class LateReplies:
                 "Connect their adapters to ports of the machine itself; if that does not help, look for what "
                 "else runs there (`dxlrun doctor`)."
             )
-        return Finding(
+        return cause(
             "late_replies_everywhere",
             "machine",
             f"Replies on buses {', '.join(named[:-1])} and {named[-1]} came late at the same moments, "
             f"{counted(moments, 'time', 'times')}, up to {max(map(self._ms, indices))} ms: it is "
             "what they share, a USB hub or the host.",
             remedy,
-            Rank.CAUSE,
             1.2,
         )
 
@@ -107,18 +107,14 @@ class LateReplies:
             return ()
         late = f"came after they were given up, up to {self._ms(index)} ms after the request"
         alone = servo_id in bus.names and len(bus.names) > 1 and mine[servo_id] >= _ALONE * total
-        if alone:
-            name, count = bus.names[servo_id], counted(int(mine[servo_id]), "reply", "replies")
-            what = f"{name} (servo {servo_id} on bus {bus.name}) answers too late: {count} {late}."
-            remedy = (
-                "Compare its firmware and Return Delay Time with those of the others, and check its supply."
-            )
-        else:
-            name = bus.name
-            what = f"Replies on bus {name} come too late: {counted(total, 'reply', 'replies')} {late}."
-            remedy = "Check adapter, driver and USB hub, and what else runs on the machine (`dxlrun doctor`)."
         share = total / max(int(self._exchanges[index]), 1)
-        return (Finding("slow_servo" if alone else "late_replies", name, what, remedy, Rank.CAUSE, share),)
+        if alone:
+            seen = f"answers too late: {counted(int(mine[servo_id]), 'reply', 'replies')} {late}"
+            fix = "Compare its firmware and Return Delay Time with those of the others, and check its supply."
+            return (slow_servo(bus, servo_id, seen, share, fix),)
+        what = f"Replies on bus {bus.name} come too late: {counted(total, 'reply', 'replies')} {late}."
+        fix = "Check adapter, driver and USB hub, and what else runs on the machine (`dxlrun doctor`)."
+        return (cause("late_replies", bus.name, what, fix, share),)
 
     def _ms(self, index: int) -> int:
         return round(int(self._longest_ns[index]) / 1e6)

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from dxlrun.errors import counted
 from dxlrun_analysis.counts import has_them_alone
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss, Numbers
 from dxlrun_analysis.servos.joint_states import (
@@ -237,64 +237,48 @@ class Losses:
         together, times = self._group(index)
         if together:
             *before, last = (names.get(servo_id) or str(servo_id) for servo_id in together)
-            yield Finding(
+            yield cause(
                 "shared_cable",
                 bus.name,
                 f"{', '.join(before)} and {last} on bus {bus.name} were lost together {times} times while "
                 "the other servos answered: the cable that leads to them, or a plug there.",
                 "Check the cable and the plug through which they are connected, and their supply.",
-                Rank.CAUSE,
                 0.5,
             )
             losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
-        loose: dict[int, AngleRange | Fast] = {}
-        for servo_id, each in losses.items():
-            if (angles := each.angles) is None:
-                continue
-            loose[servo_id] = angles
-            where = self._states.range_text(index * IDS + servo_id, angles.low, angles.high)
-            name = names.get(servo_id, "")
-            yield Finding(
-                "loose_cable",
-                name,
-                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies {where}: "
-                f"{counted(angles.episodes, 'time', 'times')} there, where it spent "
-                f"{angles.time_share:.0%} of the time.",
-                "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
-                Rank.CAUSE,
-                1.0,
-            )
+        loose = set()
         all_lost = sum(each.lost for each in losses.values())
         for servo_id, each in losses.items():
-            if each.fast is None or servo_id in loose or each.lost < _ALONE * all_lost:
+            name, named = bus.called(servo_id)
+            if (angles := each.angles) is not None:
+                where = self._states.range_text(index * IDS + servo_id, angles.low, angles.high)
+                seen = f"{where}: {counted(angles.episodes, 'time', 'times')} there, where it spent "
+                seen += f"{angles.time_share:.0%} of the time."
+                fix = "Move the joint there by hand, and check its cable and plugs,"
+            elif (fast := each.fast) is not None and each.lost >= _ALONE * all_lost:
+                share = self._states.share[self._states.joint_of[index * IDS + servo_id]]
+                factor, unit = (math.degrees(1.0), "deg/s") if share == 1.0 else (share * 1e3, "mm/s")
+                above = f"{fast.rad_s * factor:.0f} {unit}"
+                seen = (
+                    f"when it is fast: {fast.lost_share:.0%} of {each.lost} above {above}, where it was for "
+                )
+                seen += f"{fast.time_share:.0%} of the time: a contact that shakes."
+                fix = "Shake its plugs and its cable while it is read,"
+            else:
                 continue
-            loose[servo_id] = each.fast
-            name, share = (
-                names.get(servo_id, ""),
-                self._states.share[self._states.joint_of[index * IDS + servo_id]],
-            )
-            factor, unit = (math.degrees(1.0), "deg/s") if share == 1.0 else (share * 1e3, "mm/s")
-            yield Finding(
-                "loose_cable",
-                name,
-                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies when it is fast: "
-                f"{each.fast.lost_share:.0%} of {each.lost} above {each.fast.rad_s * factor:.0f} {unit}, "
-                f"where it was for {each.fast.time_share:.0%} of the time: a contact that shakes.",
-                "Shake its plugs and its cable while it is read, and those on the way to it.",
-                Rank.CAUSE,
-                1.0,
-            )
+            loose.add(servo_id)
+            sentence = f"{named} loses its replies {seen}"
+            yield cause("loose_cable", name, sentence, f"{fix} and those on the way to it.")
         rest = {servo_id: each for servo_id, each in losses.items() if servo_id not in loose}
         noisy, exchanges = int(self._noisy[index]), int(self._exchanges[index])
         if noisy >= max(_FEWEST_NOISY, _NOISY_SHARE * exchanges):
-            yield Finding(
+            yield cause(
                 "noise",
                 bus.name,
                 f"Noise disturbs bus {bus.name}: bytes that belong to no packet came after "
                 f"{counted(noisy, 'instruction', 'instructions')} of {exchanges}.",
                 "Check its shield, ground and termination; unplug one servo after the other to find one that "
                 "sends unasked.",
-                Rank.CAUSE,
                 noisy / exchanges if exchanges else 0.0,
             )
             return
@@ -310,17 +294,10 @@ class Losses:
         if worst is not None and len(losses) > 1:
             servo_id, each = worst
             if has_them_alone(each.episodes, total - each.episodes):
-                name = names.get(servo_id) or f"servo {servo_id}"
-                yield Finding(
-                    "lossy_servo",
-                    name,
-                    f"{name} (servo {servo_id} on bus {bus.name}) lost {each.lost} of {each.asked} replies, "
-                    f"in {counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
-                    f"{total - each.episodes}.",
-                    "Check its plugs and its cable; exchange the servo where a new cable does not help.",
-                    Rank.CAUSE,
-                    each.lost / max(each.asked, 1),
-                )
+                lost = f"lost {each.lost} of {each.asked} replies, in "
+                lost += f"{counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
+                lost += f"{total - each.episodes}"
+                yield _lossy(bus, servo_id, lost, each.lost / max(each.asked, 1))
                 return
         if head := tuple(self._head(index, bus)):
             yield from head
@@ -342,12 +319,11 @@ class Losses:
                 how += f"; of {single} of single servos {most[1].lost} are of {name}" if lost else ""
             else:
                 how = f"replies of its servos evenly: {lost} replies of single servos, in {line} episodes"
-            yield Finding(
+            yield cause(
                 "lossy_line",
                 bus.name,
                 f"Bus {bus.name} loses {how}.",
                 "Check adapter, plugs, termination, ground and the cable's length, or lower baud_rate.",
-                Rank.CAUSE,
                 lost / max(asked, 1),
             )
 
@@ -366,17 +342,11 @@ class Losses:
         as_often = _SHORTER * silent / max(asked, 1) * others
         if as_often < max(_FEWEST, 10 * theirs):
             return
-        name = bus.names.get(servo_id) or f"servo {servo_id}"
-        yield Finding(
-            "lossy_servo",
-            name,
-            f"{name} (servo {servo_id} on bus {bus.name}) is silent now and then: nothing came of "
-            f"{silent} of {asked} reads in which it answers first, while {others} instructions to single "
-            f"servos behind it lost {theirs} replies.",
-            "Check its plugs and its cable; exchange the servo where a new cable does not help.",
-            Rank.CAUSE,
-            silent / asked,
+        seen = (
+            f"is silent now and then: nothing came of {silent} of {asked} reads in which it answers first, "
         )
+        seen += f"while {others} instructions to single servos behind it lost {theirs} replies"
+        yield _lossy(bus, servo_id, seen, silent / asked)
 
     def _group(self, index: int) -> tuple[tuple[int, ...], int]:
         """Return the servos of a bus that are lost together, most of the time that any is, and how often."""
@@ -396,6 +366,12 @@ class Losses:
         all_of_bus = np.count_nonzero(self._states.joint_of[index * IDS : (index + 1) * IDS] >= 0)
         named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
         return (tuple(sorted(members)), len(several)) if named else ((), 0)
+
+
+def _lossy(bus: LoggedBus, servo_id: int, seen: str, share: float) -> Finding:
+    name, named = bus.called(servo_id)
+    fix = "Check its plugs and its cable; exchange the servo where a new cable does not help."
+    return cause("lossy_servo", name, f"{named} {seen}.", fix, share)
 
 
 def _noisy(exchanges: Exchanges) -> NDArray[np.bool_]:

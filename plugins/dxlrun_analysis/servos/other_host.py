@@ -16,7 +16,7 @@ from dxlrun.errors import counted
 from dxlrun.log.columns import PacketColumns
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Loss, Numbers, instruction_of
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
@@ -82,13 +82,12 @@ class OtherHosts:
         echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
             return (
-                Finding(
+                cause(
                     "echo",
                     bus.name,
                     f"The adapter of bus {bus.name} echoes now and then: {echoes} of {asked} own "
                     "instructions came back.",
                     "Check what switches its direction: the adapter, or its driver's RS-485 settings.",
-                    Rank.CAUSE,
                     1.5,
                 ),
             )
@@ -108,14 +107,13 @@ class OtherHosts:
             kinds.append("others")
         wrote = f"; it wrote {written}" if written else ""
         return (
-            Finding(
+            cause(
                 "another_host",
                 bus.name,
                 f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} "
                 f"that this run did not send ({', '.join(kinds)}){wrote}.",
                 f"Stop the other program{where}, or unplug the other adapter: its packets collide with those "
                 "of the run, and its commands move the same servos.",
-                Rank.CAUSE,
                 5.0 if failed else 1.5 if self.explains(index) else 0.0,
             ),
         )
@@ -126,13 +124,12 @@ class OtherHosts:
         if (total := int(counts.sum())) < _FEWEST_UNASKED:
             return
         one = ", or that servo sends by itself" if len(ids) == 1 else ""
-        yield Finding(
+        yield cause(
             "another_host",
             bus.name,
             f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did not "
             f"ask for (of {_ids(ids.tolist())}){one}.",
             f"Stop the other program{where}: it takes replies of the run, and the replies to it spoil them.",
-            Rank.CAUSE,
             1.5 if self.explains(index) else 0.0,
         )
 

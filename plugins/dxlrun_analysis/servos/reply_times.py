@@ -29,7 +29,7 @@ import numpy as np
 from dxlrun.errors import counted
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, has_them_alone, median, quantile
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
 from dxlrun_analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
@@ -193,18 +193,11 @@ class ReplyTimes:
             later = angles or heat
             if later is None:
                 continue
-            name, where = _name_of(bus, servo % IDS)
             doubt = "; the log does not show which of the two it is" if len(causes) > 1 else ""
-            yield Finding(
-                "slow_servo",
-                name,
-                f"{name} ({where}) answers {later[2]:.0f} us later {' or '.join(causes)} than elsewhere, "
-                f"while the other servos of its bus do not{doubt}.",
-                "Check its cable, its supply and its load there"
-                + (", and let it cool." if heat is not None else "."),
-                Rank.CAUSE,
-                later[3],
-            )
+            seen = f"answers {later[2]:.0f} us later {' or '.join(causes)} than elsewhere, while the other "
+            seen += f"servos of its bus do not{doubt}"
+            fix = f"Check its cable, its supply and its load there{', and let it cool' if heat else ''}."
+            yield slow_servo(bus, servo % IDS, seen, later[3], fix)
 
     def _places(self) -> dict[int, tuple[int, list[int]]]:
         """Return of which kind most of a servo's replies are, and at which places it had such."""
@@ -315,6 +308,18 @@ def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Values]]) -> Iter
             yield from _now_and_then(bus, servo_id, kinds, shared)
 
 
+def slow_servo(
+    bus: LoggedBus,
+    servo_id: int,
+    seen: str,
+    share: float = 1.0,
+    remedy: str = "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
+) -> Finding:
+    """Return the finding about a servo whose replies are late; `seen`: what it does, behind its name."""
+    name, named = bus.called(servo_id)
+    return cause("slow_servo", name, f"{named} {seen}.", remedy, share)
+
+
 def _usual(others: list[_Values]) -> float:
     """Return the median of what some servos need, us."""
     return float(np.median([median(*each) for each in others]))
@@ -327,7 +332,6 @@ def _always_later(own: _Values, others: list[_Values]) -> bool:
 
 
 def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) -> Iterable[Finding]:
-    name, where = _name_of(bus, servo_id)
     planned_us = bus.return_delay_ns / 1e3
     # what adapter and host add to every reply is not this servo's
     delay_us = median(*own) - max(0.0, usual_us - planned_us)
@@ -335,26 +339,20 @@ def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) ->
     if steady and delay_us - planned_us < _ODD_US:
         return  # the others answer sooner than planned
     if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:
-        yield Finding(
+        name, named = bus.called(servo_id)
+        command = (
+            f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time {round(planned_us / 2)}`"
+        )
+        yield cause(
             "return_delay",
             name,
-            f"{name} ({where}) answers after {delay_us:.0f} us, and {planned_us:g} us were planned: its "
-            "Return Delay Time is another.",
-            f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time {round(planned_us / 2)}` "
-            "corrects it.",
-            Rank.CAUSE,
-            1.0,
+            f"{named} answers after {delay_us:.0f} us, and {planned_us:g} us were planned: its Return Delay "
+            "Time is another.",
+            f"{command} corrects it.",
         )
         return
-    yield Finding(
-        "slow_servo",
-        name,
-        f"{name} ({where}) answers {median(*own) - usual_us:.0f} us later than the other servos of its bus, "
-        f"which need {usual_us:.0f} us beside their bytes.",
-        "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
-        Rank.CAUSE,
-        1.0,
-    )
+    seen = f"answers {median(*own) - usual_us:.0f} us later than the other servos of its bus, which need "
+    yield slow_servo(bus, servo_id, f"{seen}{usual_us:.0f} us beside their bytes")
 
 
 def _now_and_then(
@@ -364,23 +362,12 @@ def _now_and_then(
     rest = {kind: sum(_late(each, others) for each in others) for kind, others in shared.items()}
     mine, theirs = sum(own.values()), sum(rest.values())
     if has_them_alone(mine, theirs) and all(own[kind] > rest[kind] for kind in shared):
-        name, where = _name_of(bus, servo_id)
-        servos = max(len(others) for others in shared.values())
-        yield Finding(
-            "slow_servo",
-            name,
-            f"{name} ({where}) answers late now and then: {mine} of {mine + theirs} late replies of its bus "
-            f"are its, the other {counted(servos, 'servo', 'servos')} have {theirs}.",
-            "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
-            Rank.CAUSE,
-            mine / int(sum(kinds[kind][1].sum() for kind in shared)),
-        )
+        servos = counted(max(len(others) for others in shared.values()), "servo", "servos")
+        seen = f"answers late now and then: {mine} of {mine + theirs} late replies of its bus are its, the "
+        share = mine / int(sum(kinds[kind][1].sum() for kind in shared))
+        yield slow_servo(bus, servo_id, f"{seen}other {servos} have {theirs}", share)
 
 
 def _late(times: _Values, others: list[_Values]) -> int:
     values, counts = times
     return int(counts[values > _usual(others) + _LATE_US].sum())
-
-
-def _name_of(bus: LoggedBus, servo_id: int) -> tuple[str, str]:
-    return bus.names.get(servo_id, "") or f"servo {servo_id}", f"servo {servo_id} on bus {bus.name}"

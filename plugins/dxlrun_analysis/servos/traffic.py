@@ -14,7 +14,7 @@ from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.log.reader import Log
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, median, quantile
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Numbers, Pairing
@@ -22,7 +22,7 @@ from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
-from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested
+from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested, slow_servo
 
 _BYTES = 256
 LATE_US = 2000
@@ -203,24 +203,17 @@ class Traffic:
         if bus.late_share < _NOW_AND_THEN:
             return
         if alone and len(names) >= _FEWEST_SERVOS:
-            name = names.get(one) or f"servo {one}"
-            yield Finding(
-                "slow_servo",
-                name,
-                f"{name} (servo {one} on bus {plan.name}) answers late: {mine.sum()} times where it was "
-                f"asked alone, by up to {bus.late_us / 1e3:.0f} ms; the others never.",
-                "Compare its Return Delay Time and firmware with those of the others, and check its supply.",
-                Rank.CAUSE,
-                bus.late_share,
-            )
+            seen = f"answers late: {mine.sum()} times where it was asked alone, by up to "
+            seen += f"{bus.late_us / 1e3:.0f} ms; the others never"
+            fix = "Compare its Return Delay Time and firmware with those of the others, and check its supply."
+            yield slow_servo(plan, one, seen, bus.late_share, fix)
         elif moments >= _FEWEST_MOMENTS:
-            yield Finding(
+            yield cause(
                 "late_now_and_then",
                 plan.name,
                 f"Replies on bus {plan.name} come late now and then: {moments} times, by up to "
                 f"{bus.late_us / 1e3:.0f} ms; the log does not show whether it is one servo or the adapter.",
                 "Check adapter and USB hub, and what else runs on the machine (`dxlrun doctor`).",
-                Rank.CAUSE,
                 bus.late_share,
             )
 
@@ -368,7 +361,7 @@ def _late_replies(bus: BusTraffic) -> Finding:
             f"`adapter: {{latency: {math.ceil(late_us / 1e3)} ms}}`."
         )
     )
-    return Finding(code, bus.name, sentence, remedy, Rank.CAUSE, bus.late_share)
+    return cause(code, bus.name, sentence, remedy, bus.late_share)
 
 
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:
