@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.joints.kinds import COMMANDED, MOVES_WORSE
-from dxlrun_analysis.lost import CODES, HURTS, SPOILT, severe_of, subject_of, waited_in_vain
+from dxlrun_analysis.lost import CODES, SPOILT, severe_of, subject_of, waited_in_vain
 from dxlrun_analysis.tally import RealTime, RunTotals
 
 _REPLIES = (

@@ -5,8 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
+from dxlrun.channels.events import EventCode
+
 ROBOT = "robot"
 """The code of the first line: what the robot did. It accuses nothing, and stands before all others."""
+
+
+HURTS = {
+    EventCode.SERVO_REBOOTED: "rebooted",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_LIMP: "lost its torque",
+}
+"""What happens to servos, and what is said of them."""
 
 
 @unique
@@ -47,9 +57,9 @@ class Finding:
     """Findings of one rank are sorted by it, the greatest first; those of one share keep their order."""
 
     @property
-    def order(self) -> tuple[bool, int, float]:
+    def order(self) -> tuple[int, float]:
         """By it findings are sorted."""
-        return self.code != ROBOT, self.rank, -self.share
+        return self.rank, -self.share
 
     @property
     def line(self) -> str:

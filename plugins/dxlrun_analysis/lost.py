@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
 from dxlrun.errors import counted
-from dxlrun_analysis.finding import Finding, Rank, cause
+from dxlrun_analysis.finding import HURTS, Finding, Rank, cause
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals
 
@@ -38,13 +38,6 @@ def lost_lines(totals: RunTotals) -> Iterable[Finding]:
         line = last_line(group)
         sentence = f"Bus {group.source} was lost{times}: {line}" + ("" if line.endswith("?") else ".")
         yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
-
-
-HURTS = {
-    EventCode.SERVO_REBOOTED: "rebooted",
-    EventCode.SERVO_LOST: "was lost",
-    EventCode.SERVO_LIMP: "lost its torque",
-}
 
 
 CODES = {

@@ -22,7 +22,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import InitVar, dataclass, field
+
+import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.errors import counted
@@ -31,9 +32,8 @@ from dxlrun_analysis.accused import accused, wake_up_remedy
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.causes.rules import cause_findings
 from dxlrun_analysis.conduct.steering import Act, Pause
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.lost import (
-    HURTS,
     implausible,
     invalid_states,
     last_line,
@@ -70,26 +70,16 @@ _OF_LOOP = (
 """Kinds of commands that the loop does itself."""
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What the robot did, then findings, the most severe first; `good`: nothing that a run may not have."""
+class Verdict(msgspec.Struct, frozen=True):
+    """What the robot did, then findings, the most severe first."""
 
-    good: bool = field(init=False)
-    word: str = field(init=False)
+    good: bool
+    """Nothing was found that a run may not have."""
+    word: str
     """The verdict in words: good; good, with fallbacks; not good."""
-    sentences: tuple[str, ...] = field(init=False)
+    sentences: tuple[str, ...]
     """Of the findings, with their remedies."""
-    findings: tuple[Finding, ...] = ()
-    fallbacks: InitVar[bool] = False
-    """Controllers took over for others."""
-
-    def __post_init__(self, fallbacks: bool) -> None:
-        ordered = sorted(self.findings, key=lambda finding: finding.order)
-        object.__setattr__(self, "findings", tuple(ordered))
-        object.__setattr__(self, "good", all(finding.rank >= Rank.CAUSE for finding in ordered))
-        word = "not good" if not self.good else "good, with fallbacks" if fallbacks else "good"
-        object.__setattr__(self, "word", word)
-        object.__setattr__(self, "sentences", tuple(finding.line for finding in ordered))
+    findings: tuple[Finding, ...]
 
 
 def judge(totals: RunTotals) -> Verdict:
@@ -119,9 +109,11 @@ def judge(totals: RunTotals) -> Verdict:
         *_log(totals),
     )
     judged = accused(totals, found)
-    fallbacks = bool(totals.conduct.takeovers)
-    verdict = Verdict(judged, fallbacks)
-    return Verdict((robot_line(totals, verdict.word, verdict.findings), *judged), fallbacks)
+    ordered = sorted(judged, key=lambda finding: finding.order)
+    good = all(finding.rank >= Rank.CAUSE for finding in ordered)
+    word = "not good" if not good else "good, with fallbacks" if totals.conduct.takeovers else "good"
+    findings = (robot_line(totals, word, ordered), *ordered)
+    return Verdict(good, word, tuple(finding.line for finding in findings), findings)
 
 
 def _robot(totals: RunTotals) -> Iterable[Finding]:

@@ -38,7 +38,7 @@ from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RealTime, RunTotals, Tally, totals_of
-from dxlrun_analysis.verdict import Verdict, judge
+from dxlrun_analysis.verdict import judge
 
 Make = Callable[..., Any]
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
@@ -242,23 +242,23 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
 
 def test_findings_are_sorted_and_say_whether_a_run_was_good() -> None:
     remark, cause, loss = (
-        Finding(code, "elbow", f"{code}.", remedy, rank)
-        for code, remedy, rank in (
-            ("remark", "", Rank.REMARK),
-            ("cause", "Mend it.", Rank.CAUSE),
-            ("loss", "", Rank.SERVO),
+        Finding(code, subject, f"{code}.", remedy, rank)
+        for code, subject, remedy, rank in (
+            ("remark", "elbow", "", Rank.REMARK),
+            ("cause", "wrist", "Mend it.", Rank.CAUSE),
+            ("loss", "elbow", "", Rank.SERVO),
         )
     )
-    verdict = Verdict((remark, cause))
-    assert verdict.good
-    assert verdict.sentences == ("cause. Mend it.", "remark.")
-    assert not Verdict((remark, cause, loss)).good
-    assert Verdict((remark, cause, loss)).findings == (loss, cause, remark)
+    verdict, bad = (judge(totals(findings=found)) for found in ((remark, cause), (remark, cause, loss)))
+    assert (verdict.good, bad.good) == (True, False)
+    assert verdict.sentences[1] == "cause. Mend it."
+    assert "remark." in verdict.sentences[2:]
+    assert [one for one in bad.findings if one in {loss, cause, remark}] == [loss, cause, remark]
     shown = json.loads(json_text(verdict))
     assert list(shown) == ["good", "word", "sentences", "findings"]
-    assert shown["findings"][0] == {
+    assert shown["findings"][1] == {
         "code": "cause",
-        "subject": "elbow",
+        "subject": "wrist",
         "sentence": "cause.",
         "remedy": "Mend it.",
         "rank": 8,

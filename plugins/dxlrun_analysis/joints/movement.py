@@ -189,8 +189,7 @@ class Movement:
                 "Look at what they share: the line, the supply, the load, the motion.",
                 Rank.SERVO,
             )
-        for seen in worn(followed(self._joints, self._trail.samples()), named):
-            yield finding(seen.code, self._joints[seen.row], seen.text, seen.since_s)
+        yield from worn(followed(self._joints, self._trail.samples()), named)
 
     def _windows(self, seconds: float) -> list[Windows]:
         length_s, *values = self.bins.joined(seconds)

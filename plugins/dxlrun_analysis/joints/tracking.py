@@ -70,15 +70,6 @@ class JointTracking:
     """Where it was when its servo was lost for the first time; None: it was not, or it is not known."""
 
 
-def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return which states of cycles are not valid, shape (cycles, joints).
-
-    Those of a servo that reboots because a client requested it are not missing.
-    """
-    missing: NDArray[np.bool_] = ~cycles["valid"] & (cycles["torque"] != Torque.REBOOTING)
-    return missing
-
-
 def tracking(log: Log) -> tuple[JointTracking, ...]:
     """Return freshness and tracking of each joint; rows in the order of the log."""
     collected = Tracking()
@@ -343,7 +334,8 @@ class _Row:
     def take(self, cycles: NDArray[np.void], known: int) -> Floats:
         """Take cycles; the first `known` of them were taken before. Return the reachable trajectory."""
         new = cycles[known:]
-        self.invalid += int(np.count_nonzero(missing_states(new)[:, self.row]))
+        missing = ~new["valid"][:, self.row] & (new["torque"][:, self.row] != Torque.REBOOTING)
+        self.invalid += int(np.count_nonzero(missing))
         self.oldest_ns = max(self.oldest_ns, int(new["age_ns"][:, self.row].max(initial=0)))
         self.clamped += int(np.count_nonzero(new["clamped"][:, self.row]))
         lost = np.flatnonzero(new["torque"][:, self.row] == Torque.LOST)

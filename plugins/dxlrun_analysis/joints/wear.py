@@ -24,7 +24,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
+from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.following import STROKE_RAD, Bend, Followed, Turn, Visit
+from dxlrun_analysis.joints.kinds import finding
 
 _OTHERS = 3.0
 """So many times what any other joint shows."""
@@ -61,16 +63,6 @@ _SWINGS = 10
 """In a row, to and fro being two"""
 
 
-class Worn(NamedTuple):
-    """What one joint shows."""
-
-    code: str
-    row: int
-    since_s: float
-    text: str
-    """What it does, behind its name"""
-
-
 class _Seen(NamedTuple):
     """One joint that no other rule names."""
 
@@ -82,6 +74,10 @@ class _Seen(NamedTuple):
     bend: Bend
     most: dict[str, float]
     """The most that it shows of each quantity, 0.0 at least"""
+
+    def does(self, code: str, since_s: float, text: str) -> Finding:
+        """Return the finding about it; `text`: what it does, behind its name."""
+        return finding(code, self.one.joint, text, since_s)
 
 
 class _Others(NamedTuple):
@@ -105,7 +101,7 @@ class _Others(NamedTuple):
         return f" (other joints: at most {_deg(theirs)})" if self.all else ""
 
 
-def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Worn]:
+def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
     """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
     seen = [_seen(one) for one in joints if one.row not in named]
     for mine in seen:
@@ -136,7 +132,7 @@ def _plain(seen: _Seen) -> str:
     return _SIDE.sub("", seen.one.joint.name)
 
 
-def _turns_badly(mine: _Seen, others: _Others) -> Worn | None:
+def _turns_badly(mine: _Seen, others: _Others) -> Finding | None:
     one, turns = mine.one, mine.turns
     theirs = others.most("behind")
     least = max(_BEHIND_RAD, _OTHERS * theirs)
@@ -152,12 +148,12 @@ def _turns_badly(mine: _Seen, others: _Others) -> Worn | None:
     if stands and (usual or one.alike >= _FEWEST_ALIKE):
         text += f", and stands still at each turn until its goal is {_deg(stood)} back"
         code, takes = _rubs(worst, usual, [turn.load for each in others.all for turn in each.turns])
-        return Worn(code, one.row, bad[0].at_s, text + takes)
+        return mine.does(code, bad[0].at_s, text + takes)
     late_s, *before_s = (one.lag_s + turn.behind / turn.speed for turn in (worst, *usual))
     once = len(bad) < _FEWEST_TURNS and worst.behind < 2 * least
     if stands or once or not before_s or late_s < max(_SOFTER * max(before_s), max(before_s) + _LATE_S):
         return None
-    return Worn("softer_joint", one.row, bad[0].at_s, f"{text}, and was not at its first turns")
+    return mine.does("softer_joint", bad[0].at_s, f"{text}, and was not at its first turns")
 
 
 def _rubs(worst: Turn, usual: list[Turn], others: list[float]) -> tuple[str, str]:
@@ -171,14 +167,14 @@ def _rubs(worst: Turn, usual: list[Turn], others: list[float]) -> tuple[str, str
     return ("friction" if rubs else "play"), takes
 
 
-def _takes_more(mine: _Seen, others: _Others) -> Worn | None:
+def _takes_more(mine: _Seen, others: _Others) -> Finding | None:
     theirs = others.most("takes")
     bad = [each for each in _loaded(mine.turns) if each[2] > max(_LOAD, each[1], _OTHERS * theirs)]
     if len(bad) < _FEWEST_TURNS:
         return None
     worst, before, _ = max(bad, key=lambda each: each[2])
     text = f"takes {worst.load:.0%} of its torque in both directions (before: {before:.0%})"
-    return Worn("friction", mine.one.row, bad[0][0].at_s, text)
+    return mine.does("friction", bad[0][0].at_s, text)
 
 
 def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
@@ -190,8 +186,8 @@ def _loaded(turns: list[Turn]) -> Iterator[tuple[Turn, float, float]]:
             yield turn, most, turn.load - most
 
 
-def _pulled(mine: _Seen, others: _Others) -> Worn | None:
-    one, visits = mine.one, mine.visits
+def _pulled(mine: _Seen, others: _Others) -> Finding | None:
+    visits = mine.visits
     rubs = 2 * max((abs(turn.behind) for turn in mine.turns[:2]), default=0.0)
     theirs = others.most("off")
     least = max(_OFF_RAD, rubs, _OTHERS * theirs)
@@ -208,15 +204,15 @@ def _pulled(mine: _Seen, others: _Others) -> Worn | None:
     alike = abs(load - was) > _LOAD / 2 and abs(grew.sum()) >= _ALIKE * np.abs(grew).sum()
     takes = f"takes {load:.0%} of its torque at places where it took {was:.0%} before"
     if alike and load < _NOTHING * was:
-        return Worn("carries_nothing", one.row, since_s, takes)
+        return mine.does("carries_nothing", since_s, takes)
     if bad is loaded:
-        return Worn("off_its_way", one.row, since_s, takes) if alike else None
+        return mine.does("off_its_way", since_s, takes) if alike else None
     most = _deg(max(each.change for each in bad))
     text = f"is off by up to {most} more than before at the same places{others.beside(theirs)}"
     side = _one_side(bad, [each for each in visits if each.at_s > since_s and each.change < least / 2])
     text += f", the more the further it goes {side}" if side else ""
     text += f", with {load:.0%} of its torque instead of {was:.0%}" if alike else ""
-    return Worn("pulled_joint" if side else "off_its_way", one.row, since_s, text)
+    return mine.does("pulled_joint" if side else "off_its_way", since_s, text)
 
 
 def _lasts(visits: list[Visit]) -> bool:
@@ -238,17 +234,17 @@ def _one_side(bad: list[Visit], good: list[Visit]) -> str:
     return f"below {math.degrees(places.max()):.0f} deg" if below and along < -_ALONG else ""
 
 
-def _bent(mine: _Seen, others: _Others) -> Worn | None:
+def _bent(mine: _Seen, others: _Others) -> Finding | None:
     bend = mine.bend
     theirs = others.most("bend")
     if abs(bend.off) < max(_OFF_RAD, _OTHERS * theirs):
         return None
     side = f"{'beyond' if bend.above else 'below'} {math.degrees(bend.place):.0f} deg"
     text = f"is off by {_deg(abs(bend.off))}, the more the further it goes {side}, and nowhere else"
-    return Worn("pulled_joint", mine.one.row, bend.since_s, text + others.beside(theirs))
+    return mine.does("pulled_joint", bend.since_s, text + others.beside(theirs))
 
 
-def _jerked(mine: _Seen, others: _Others) -> Worn | None:
+def _jerked(mine: _Seen, others: _Others) -> Finding | None:
     one, jerks = mine.one, mine.jerks
     theirs = others.most("jerk")
     times = one.at_s[np.nan_to_num(jerks) > max(_JERK_RAD, _OTHERS * theirs)]
@@ -257,17 +253,17 @@ def _jerked(mine: _Seen, others: _Others) -> Worn | None:
         return None
     most = _deg(float(np.nanmax(jerks)))
     text = f"is thrown off its way {count} times while its goals are even, by up to {most} within 80 ms"
-    return Worn("jerked_joint", one.row, float(times[0]), text + others.beside(theirs))
+    return mine.does("jerked_joint", float(times[0]), text + others.beside(theirs))
 
 
-def _hunts(mine: _Seen, others: _Others) -> Worn | None:
+def _hunts(mine: _Seen, others: _Others) -> Finding | None:
     at_s = mine.swings
     theirs = others.most("swings")
     if len(at_s) < max(_SWINGS, _OTHERS * theirs):
         return None
     hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
     text = f"swings to and fro around its goal {hertz:.0f} times a second, {len(at_s) // 2} times in a row"
-    return Worn("hunting_joint", mine.one.row, float(at_s[0]), text)
+    return mine.does("hunting_joint", float(at_s[0]), text)
 
 
 def _deg(rad: float) -> str:

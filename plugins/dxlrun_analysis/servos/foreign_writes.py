@@ -15,13 +15,9 @@ from dxlrun.channels.packets import LoggedPacket
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.plan.transaction import BROADCAST_ID
+from dxlrun_analysis.finding import HURTS
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 
-_FAILED = {
-    EventCode.SERVO_REBOOTED: "rebooted",
-    EventCode.SERVO_LOST: "was lost",
-    EventCode.SERVO_LIMP: "lost its torque",
-}
 _AFTER_NS = 2_000_000_000
 """A servo that fails so soon after it was written to fails by that."""
 _MOST_KEPT = 1000
@@ -61,7 +57,7 @@ class ForeignWrites:
 
     def failed(self, event: Event) -> None:
         """Note an event where it says that a servo failed."""
-        if event.code in _FAILED and len(self._failures) < _MOST_KEPT:
+        if event.code in HURTS and len(self._failures) < _MOST_KEPT:
             self._failures.append(event)
 
     def of(self, bus: int) -> tuple[str, bool]:
@@ -84,7 +80,7 @@ class ForeignWrites:
                 f"{one.what}{'' if one.value is None else f' = {one.value}'}" for one in shown
             )
             if (name := shown[-1].name) in ends:
-                then = _FAILED[EventCode(ends[name].code)]
+                then = HURTS[EventCode(ends[name].code)]
                 parts.append(f"{items} to {name} (ID {servo_id}), which {then} then")
             else:
                 by_items.setdefault(" and ".join(last), []).append((servo_id, items))

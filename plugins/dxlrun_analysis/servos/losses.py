@@ -294,10 +294,10 @@ class Losses:
         if worst is not None and len(losses) > 1:
             servo_id, each = worst
             if has_them_alone(each.episodes, total - each.episodes):
-                lost = f"lost {each.lost} of {each.asked} replies, in "
-                lost += f"{counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
-                lost += f"{total - each.episodes}"
-                yield _lossy(bus, servo_id, lost, each.lost / max(each.asked, 1))
+                seen = f"lost {each.lost} of {each.asked} replies, in "
+                seen += f"{counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
+                seen += f"{total - each.episodes}"
+                yield _lossy(bus, servo_id, seen, each.lost / max(each.asked, 1))
                 return
         if head := tuple(self._head(index, bus)):
             yield from head
