@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.joints.kinds import COMMANDED, MOVES_WORSE
-from dxlrun_analysis.lost import CODES, SPOILT, severe_of, subject_of, waited_in_vain
+from dxlrun_analysis.lost import CODES, SPOILT, severe_of, waited_in_vain
 from dxlrun_analysis.tally import RealTime, RunTotals
 
 _REPLIES = (
@@ -87,24 +87,20 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
     missing goes where anything else is known of its bus. Servos that failed, or followed worse, are then not
     accused besides; nor those that followed worse while replies before theirs were missing.
     """
-    bus_of = {subject_of(servo): servo.bus for servo in totals.servos}
     named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
     kept: list[Finding] = []
     for one in named:
-        bus = bus_of.get(one.subject, one.subject)
+        bus = totals.bus_of(one.subject)
         whole = {"machine", bus, one.subject}
-        same_bus = {other.subject for other in kept if bus_of.get(other.subject, other.subject) == bus}
+        same_bus = {other.subject for other in kept if totals.bus_of(other.subject) == bus}
         if not any(other.subject in whole for other in kept) and not (one.code in _WEAK and same_bus):
             kept.append(one)
-    whole = {one.subject for one in kept if one.subject not in bus_of}
+    whole = {one.subject for one in kept if totals.bus_of(one.subject) == one.subject}
     whole |= {one.subject for one in found if one.code in ("busy_machine", "bus_lost")}
     waited = waited_in_vain(totals)
     return tuple(
         replace(one, remedy="")
-        if (
-            one.code in (*CODES.values(), *MOVES_WORSE)
-            and {"machine", bus_of.get(one.subject, one.subject)} & whole
-        )
+        if (one.code in (*CODES.values(), *MOVES_WORSE) and {"machine", totals.bus_of(one.subject)} & whole)
         or (one.code in MOVES_WORSE and one.subject in waited)
         else one
         for one in found
@@ -140,16 +136,15 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
     failed |= {finding.subject for finding in found if finding.rank == Rank.SERVO}
     failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
     worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
-    bus_of = {subject_of(servo): servo.bus for servo in totals.servos}
     # where replies are spoilt, goals wait for a torque that is known again, and other joints follow worse
-    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code in MOVES_WORSE}
+    behind = {totals.bus_of(one.subject) for one in found if one.code in MOVES_WORSE}
     return tuple(
         finding
         if finding.rank != Rank.CAUSE
         else replace(finding, rank=Rank.SERVO_CAUSE)
         if finding.subject in failed
         or (failed and finding.code == "late_replies_everywhere")
-        or (finding.code in SPOILT and bus_of.get(finding.subject, finding.subject) in behind)
+        or (finding.code in SPOILT and totals.bus_of(finding.subject) in behind)
         else replace(finding, rank=Rank.SHARE_CAUSE)
         if worse
         else finding

@@ -54,7 +54,7 @@ _FIXES = {
 _REFUSED = (
     "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
 )
-_QUESTION = re.compile(r": [^:?]*\?.*")
+_CABLES = re.compile(r"\?.*")
 _FEWEST_OF_BUS = 2
 _AT_ONCE_NS = 500_000_000
 
@@ -85,9 +85,9 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
         sentence = f"{sentence[:-1]}, at {math.degrees(at):.0f} deg."
     if len(by_source) <= _FEWEST_OF_BUS:  # of more it is what they share
         for source, (*_, why) in totals.returns.items():
-            # a question, and what is behind it, is about the plugs of a real servo
-            seen = _QUESTION.sub("", why) if totals.plan.is_simulated(source) else why
-            sentence += f" {source} {seen}."
+            # what is behind the question is about the plugs of a real servo
+            seen = _CABLES.sub("?", why) if totals.plan.is_simulated(source) else why
+            sentence += f" {source} {seen}" + ("" if seen.endswith("?") else ".")
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
     rebooted = first == EventCode.SERVO_REBOOTED
@@ -225,7 +225,7 @@ def _why_missing(totals: RunTotals, buses: Sequence[str]) -> str:
     heads = [one for one in totals.servos if one.bus in buses and one.losses and one.losses.broken_off]
     name = _name(heads[0]) if len(heads) == 1 else ""
     accused = {one.subject for one in totals.findings if one.code in _OF_A_SERVO}
-    if name and subject_of(heads[0]) in accused:
+    if name and heads[0].subject in accused:
         return f" behind {name}"
     first = f"the first servo of the chain{f', {name},' if name else ''}"
     return f": either {first} is silent, or the instruction is lost on the line"
@@ -287,7 +287,7 @@ def missing_replies(totals: RunTotals) -> Iterable[Finding]:
     rest = len(asked) - len(losers)
     others = f"; {rest} of {len(asked)} {_kinds(asked)} answered every time" if rest else ""
     sentence = f"Replies are missing: {named}{more}{others}."
-    yield Finding("missing_replies", subject_of(losers[0]), sentence)
+    yield Finding("missing_replies", losers[0].subject, sentence)
 
 
 def _all(asked: Sequence[ServoTraffic]) -> str:
@@ -310,7 +310,7 @@ def servo_errors(totals: RunTotals) -> Iterable[Finding]:
     )
     more = _more("; and", len(troubled))
     sentence = f"Servos reported errors: {named}{more}."
-    yield Finding("servo_errors", subject_of(troubled[0]), sentence, rank=Rank.ERROR)
+    yield Finding("servo_errors", troubled[0].subject, sentence, rank=Rank.ERROR)
 
 
 def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
@@ -322,11 +322,6 @@ def _more(joining: str, count: int, one: str = "more servo", many: str = "more s
 def _name(servo: ServoTraffic) -> str:
     kind = "device" if servo.device else "servo"
     return f"{kind} {servo.servo_id} ({servo.joint or servo.bus})"
-
-
-def subject_of(servo: ServoTraffic) -> str:
-    """Return what findings about a servo accuse: its joint, or its bus and ID."""
-    return servo.joint or f"{servo.bus} {servo.servo_id}"
 
 
 def last_line(group: EventGroup) -> str:

@@ -83,6 +83,10 @@ class RunTotals:
     findings: tuple[Finding, ...] = ()
     """What the accumulators of each room found by rules of their own."""
 
+    def bus_of(self, subject: str) -> str:
+        """Return the bus of a servo that a finding accuses; of another subject itself."""
+        return next((servo.bus for servo in self.servos if servo.subject == subject), subject)
+
 
 class Tally:
     """Counts a log, whole or slice by slice, in memory that does not grow with it."""

@@ -43,7 +43,6 @@ from dxlrun_analysis.lost import (
     missing_replies,
     servo_errors,
     severe_of,
-    subject_of,
     whole_buses,
 )
 from dxlrun_analysis.robot_line import robot_line
@@ -182,10 +181,9 @@ def _causes(totals: RunTotals) -> Iterable[Finding]:
     if totals.plan.loop.schedule == "sequential":
         return
     explained = {finding.subject for finding in totals.findings if finding.rank == Rank.CAUSE}
-    explained |= {servo.bus for servo in totals.servos if subject_of(servo) in explained}
-    bus_of = {subject_of(servo): servo.bus for servo in totals.servos}
+    explained |= {servo.bus for servo in totals.servos if servo.subject in explained}
     for finding in cause_findings(totals.causes, wake_up_remedy(totals.real_time)):
-        if bus_of.get(finding.subject, finding.subject) not in explained:
+        if totals.bus_of(finding.subject) not in explained:
             yield finding
 
 

@@ -112,17 +112,6 @@ def test_a_joint_that_is_held_back_on_one_side_the_more_the_further_it_goes_is_p
     assert "of its torque instead of" in one.sentence
 
 
-@pytest.mark.parametrize("side", [1, -1])
-def test_a_spring_that_was_always_there_bends_too_sharply_for_a_weight(side: int) -> None:
-    sprung = Joint(side * SWING, side * (behind(SWING) - 0.12 * FAR), PEER.load)
-    (one,) = found(sprung)
-    assert (one.code, one.rank) == ("pulled_joint", Rank.REMARK)
-    assert f"the more the further it goes {'beyond' if side > 0 else 'below -'}" in one.sentence
-    assert "and nowhere else (other joints: at most 0." in one.sentence
-    stopped = Joint(np.minimum(SWING, 0.55), np.minimum(behind(SWING), 0.5), PEER.load)
-    assert [one.code for one in found(stopped)] == ["pulled_joint"]
-
-
 WEIGHTS = {
     "a little spring": behind(SWING) - np.where(FAULT, 0.05 * FAR, 0.0),
     "a weight": behind(SWING) - 0.15 * np.cos(behind(SWING)),

@@ -48,9 +48,6 @@ _BENDS_RAD_S = 0.6
 _BENDS_S, _BENT_S = 0.1, 0.16
 """So long before and behind it that is measured, and so long it is thrown off."""
 _NEAR_RAD = 0.006
-_FEWEST_BENT, _MOSTLY = 2, 0.8
-_FLAT_RAD, _FLAT_OFF_RAD, _BENDS_IN_RAD = 0.2, 0.012, 0.35
-"""So far a joint is on its way, by 0.7 deg, and so near behind it is off."""
 _SWING_RAD, _SWING_TICKS = 0.01, 4
 """0.6 deg, or as many ticks"""
 _SWING_S = 0.2
@@ -97,17 +94,6 @@ class Visit(NamedTuple):
         """By how much its load differs; 0 where that is not read, or its speed changes."""
         change = abs(self.load - self.load_was)
         return change if self.even and math.isfinite(change) else 0.0
-
-
-class Bend(NamedTuple):
-    """Where a joint begins to be off, the more the further it goes, and is not on the other side."""
-
-    off: float = 0.0
-    """rad, at most; 0.0: nowhere"""
-    place: float = 0.0
-    above: bool = True
-    """It is off beyond that place; else below"""
-    since_s: float = 0.0
 
 
 class _Stay(NamedTuple):
@@ -235,50 +221,6 @@ class Followed(NamedTuple):
         moved = float(speed @ speed)
         taken = float(speed @ (load - load.mean())) / moved if moved else 0.0
         return self.load - taken * self.speed
-
-    def bend(self) -> Bend:
-        """Return where it bends away from its way each time, on one side of a range where it is on it.
-
-        No weight does so within 0.35 rad: it comes and goes by the sine of the angle.
-        """
-        place = np.floor(self.goal / _PLACE_RAD)
-        both: dict[float, float] = {}
-        for here in np.unique(place[np.isfinite(self.off)]).tolist():
-            ways = [self.off[(place == here) & (sign * self.speed > 0)] for sign in (1, -1)]
-            known = [way[np.isfinite(way)] for way in ways]
-            if all(map(len, known)):  # what rubs is off as much in both directions
-                both[here] = sum(float(np.median(way)) for way in known) / 2
-        best = Bend()
-        for above in (True, False):
-            cells = sorted(both, reverse=not above)
-            offs = np.array([both[cell] for cell in cells])
-            way = np.abs(np.array(cells) - cells[0]) * _PLACE_RAD if cells else offs
-            for at in np.flatnonzero(way >= _FLAT_RAD).tolist():
-                usual = float(np.median(offs[: at + 1]))
-                behind = offs[(way > way[at]) & (way <= way[at] + _BENDS_IN_RAD)] - usual
-                if len(behind) and abs(behind[-1]) > abs(best.off):
-                    begin = (cells[at] + (1 if above else 0)) * _PLACE_RAD
-                    off, since_s = (
-                        float(behind[-1]),
-                        self._bent_since_s(begin, usual, behind[-1], above=above),
-                    )
-                    best = best if since_s is None else Bend(off, begin, above, since_s)
-        return best
-
-    def _bent_since_s(self, begin: float, usual: float, off: float, *, above: bool) -> float | None:
-        """Return since when it is off beyond a place, each time and on its way between; None: it is not."""
-        beyond, known = (self.goal > begin) == above, np.isfinite(self.off)
-        bent = known & beyond & ((self.off - usual) * np.sign(off) > abs(off) / 2)
-        if not bent.any():
-            return None
-        since = int(np.argmax(bent))
-        edges = np.flatnonzero(np.diff(beyond[since:], prepend=False, append=False)) + since
-        times = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-        each = [bool(bent[first:last].any()) for first, last in times if known[first:last].any()]
-        between = known & ~beyond & (np.arange(len(known)) > since)
-        there = np.abs(self.off[between] - usual) < _FLAT_OFF_RAD
-        often = sum(each) >= _FEWEST_BENT and sum(each) >= _MOSTLY * len(each)
-        return float(self.at_s[since]) if often and there.size and there.mean() >= _MOSTLY else None
 
     def swings(self) -> Floats:
         """Return when it turned in its longest series of even swings, s; of none where its goal swings."""

@@ -15,8 +15,12 @@ from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
-_LIMITS = ("temperature_limit", "motor_temperature_limit")
-_LOWEST_VOLTS, _HIGHEST_VOLTS = ("min_voltage_limit",), ("max_voltage_limit",)
+_NEAREST = (
+    (np.fmin, ("temperature_limit", "motor_temperature_limit")),
+    (np.fmax, ("min_voltage_limit",)),
+    (np.fmin, ("max_voltage_limit",)),
+)
+"""Of a joint's servos the first that reaches it counts"""
 _GAINS = ("position_p_gain", "p_gain")
 _SOFTEST = 3.0
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
@@ -64,18 +68,18 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
         if not mine:
             found.append(PlannedJoint(name))
             continue
+        hottest, lowest, highest = (
+            float(nearest.reduce([_register(one, names, math.nan, shipped=True) for one in mine]))
+            for nearest, names in _NEAREST
+        )
         found.append(
             PlannedJoint(
                 name,
                 mine[0].bus.name,
                 ", ".join(f"servo {one.servo.servo_id} on bus {one.bus.name}" for one in mine),
-                np.fmin.reduce([_register(one, _LIMITS, math.nan, shipped=True) for one in mine]).item(),
-                np.fmax.reduce(
-                    [_register(one, _LOWEST_VOLTS, math.nan, shipped=True) for one in mine]
-                ).item(),
-                np.fmin.reduce(
-                    [_register(one, _HIGHEST_VOLTS, math.nan, shipped=True) for one in mine]
-                ).item(),
+                hottest,
+                lowest,
+                highest,
                 1.0 if joint.top_effort is None else joint.top_effort,
                 joint.highest_speed,
                 sum(one.share * _register(one, _ACCELERATIONS, math.inf) for one in mine),

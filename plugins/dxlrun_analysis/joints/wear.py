@@ -25,7 +25,7 @@ import numpy as np
 
 from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.finding import Finding
-from dxlrun_analysis.joints.following import STROKE_RAD, Bend, Followed, Turn, Visit
+from dxlrun_analysis.joints.following import STROKE_RAD, Followed, Turn, Visit
 from dxlrun_analysis.joints.kinds import finding
 
 _OTHERS = 3.0
@@ -71,7 +71,6 @@ class _Seen(NamedTuple):
     visits: list[Visit]
     jerks: Floats
     swings: Floats
-    bend: Bend
     most: dict[str, float]
     """The most that it shows of each quantity, 0.0 at least"""
 
@@ -113,7 +112,7 @@ def worn(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
 
 def _seen(one: Followed) -> _Seen:
     turns, visits = one.turns(), list(one.visits(_OFF_RAD / 2, _LOAD / 2))
-    jerks, swings, bend = one.jerks(), one.swings(), one.bend()
+    jerks, swings = one.jerks(), one.swings()
     shown: dict[str, Iterable[float]] = {
         "behind": (turn.behind for turn in turns),
         "stood": (turn.stood for turn in turns),
@@ -122,10 +121,9 @@ def _seen(one: Followed) -> _Seen:
         "load": (visit.load_change for visit in visits),
         "jerk": jerks[np.isfinite(jerks)].tolist(),
         "swings": (float(len(swings)),),
-        "bend": (abs(bend.off),),
     }
     most = {quantity: max(0.0, max(values, default=0.0)) for quantity, values in shown.items()}
-    return _Seen(one, turns, visits, jerks, swings, bend, most)
+    return _Seen(one, turns, visits, jerks, swings, most)
 
 
 def _plain(seen: _Seen) -> str:
@@ -234,16 +232,6 @@ def _one_side(bad: list[Visit], good: list[Visit]) -> str:
     return f"below {math.degrees(places.max()):.0f} deg" if below and along < -_ALONG else ""
 
 
-def _bent(mine: _Seen, others: _Others) -> Finding | None:
-    bend = mine.bend
-    theirs = others.most("bend")
-    if abs(bend.off) < max(_OFF_RAD, _OTHERS * theirs):
-        return None
-    side = f"{'beyond' if bend.above else 'below'} {math.degrees(bend.place):.0f} deg"
-    text = f"is off by {_deg(abs(bend.off))}, the more the further it goes {side}, and nowhere else"
-    return mine.does("pulled_joint", bend.since_s, text + others.beside(theirs))
-
-
 def _jerked(mine: _Seen, others: _Others) -> Finding | None:
     one, jerks = mine.one, mine.jerks
     theirs = others.most("jerk")
@@ -270,5 +258,5 @@ def _deg(rad: float) -> str:
     return f"{math.degrees(rad):.1f} deg"
 
 
-_RULES = (_turns_badly, _takes_more, _hunts, _pulled, _bent, _jerked)
+_RULES = (_turns_badly, _takes_more, _hunts, _pulled, _jerked)
 """The most direct evidence first"""

@@ -73,6 +73,11 @@ class ServoTraffic:
     device: bool = False
     """It is a device of the plan, and no servo."""
 
+    @property
+    def subject(self) -> str:
+        """What findings accuse: its joint, or its bus and ID."""
+        return self.joint or f"{self.bus} {self.servo_id}"
+
 
 @dataclass(frozen=True, slots=True)
 class BusTraffic:
