@@ -12,8 +12,7 @@ from dxlrun.channels.commands import TakenCommand
 from dxlrun.channels.events import Event, EventCode
 from dxlrun.log.reader import UNREADABLE, Log
 
-POLICY = "policy"
-"""Kind of the command that the loop leaves in the log when it begins a policy's steps."""
+POLICY = "policy"  # Kind of the command that the loop leaves in the log when it begins a policy's steps
 _LOOP = "loop"
 
 
@@ -21,8 +20,7 @@ class ClientCommand(msgspec.Struct, frozen=True):
     """One command that is not in the plan."""
 
     command: TakenCommand
-    refusal: str
-    """Why nothing was done; empty where it was done, or where the event with the refusal is lost."""
+    refusal: str  # Why nothing was done; empty where it was done, or where the event with the refusal is lost
 
 
 def client_commands(log: Log) -> tuple[ClientCommand, ...]:

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.int64]
 
-_GROUP = 40
-"""Bits of a value, shifted so that none is negative; above them its group."""
+_GROUP = 40  # Bits of a value, shifted so that none is negative; above them its group
 _ZERO = 1 << (_GROUP - 1)
 _MOST_PENDING = 1 << 18
 _FEWEST = 10

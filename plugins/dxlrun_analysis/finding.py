@@ -23,20 +23,15 @@ HURTS = {
 class Rank(IntEnum):
     """Severity of a finding; the first is the worst."""
 
-    NEVER_RAN = 0
-    """Nor to its end, where a process of the run failed."""
+    NEVER_RAN = 0  # Nor to its end, where a process of the run failed
     LINE = 1
-    SERVO_CAUSE = 2
-    """Explains why a servo failed."""
+    SERVO_CAUSE = 2  # Explains why a servo failed
     SERVO = 3
-    SHARE_CAUSE = 4
-    """Explains invalid states, skipped periods or errors."""
-    SHARE = 5
-    """Of the time: joints and periods, the largest share first."""
+    SHARE_CAUSE = 4  # Explains invalid states, skipped periods or errors
+    SHARE = 5  # Of the time: joints and periods, the largest share first
     ERROR = 6
     LOG = 7
-    CAUSE = 8
-    """Leads to any of these, but has not yet: the run may be good."""
+    CAUSE = 8  # Leads to any of these, but has not yet: the run may be good
     REMARK = 9
 
 
@@ -46,12 +41,9 @@ class Finding:
 
     code: str
     """A word for programs: `latency_timer`, `slow_servo` ..."""
-    subject: str
-    """The bus, servo, joint, controller or process that it accuses; empty: none."""
-    sentence: str
-    """What was found, for a person."""
-    remedy: str = ""
-    """What to do about it: a sentence or a command; empty: nothing is known to help."""
+    subject: str  # The bus, servo, joint, controller or process that it accuses; empty: none
+    sentence: str  # What was found, for a person
+    remedy: str = ""  # What to do about it: a sentence or a command; empty: nothing is known to help
     rank: Rank = Rank.REMARK
     share: float = 0.0
     """Findings of one rank are sorted by it, the greatest first; those of one share keep their order."""

@@ -12,13 +12,11 @@ from dxlrun_analysis.finding import HURTS, Finding, Rank, cause
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals
 
-INVALID_SHARE = 0.01
-"""More invalid states of a joint than this, and the run was not good."""
+INVALID_SHARE = 0.01  # More invalid states of a joint than this, and the run was not good
 _FEW_INVALID = 2
 """So few are tolerated however short the run: a servo that misses three replies in a row is lost."""
 _MOST_NAMED = 3
-SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
-"""Codes of what spoils replies."""
+SPOILT = ("power_lost", "another_host", "noise", "broken_replies")  # Codes of what spoils replies
 _OF_A_SERVO = ("lossy_servo", "slow_servo", "broken_replies", "loose_cable")
 """Codes that accuse a servo of replies that are missing."""
 
@@ -154,8 +152,7 @@ def whole_buses(totals: RunTotals) -> Iterable[Finding]:
     """Report what happened to all servos of a bus, which share supply and adapter, or of several at once."""
     gone = {group.source for group in severe_of(totals.events, EventCode.PORT_LOST)}
     servos = [servo for servo in totals.servos if servo.joint and not servo.device]
-    silent: dict[str, int] = {}
-    """When the first servo was lost, ns, of each bus that lost all."""
+    silent: dict[str, int] = {}  # When the first servo was lost, ns, of each bus that lost all
     for bus in sorted({servo.bus for servo in servos} - gone):
         joints = {servo.joint for servo in servos if servo.bus == bus}
         if _all_at_once(totals, EventCode.SERVO_REBOOTED, joints) is not None:

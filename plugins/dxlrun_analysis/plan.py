@@ -32,10 +32,8 @@ class LoggedServo(msgspec.Struct):
     rad_s_per_tick: float = 0.0
     registers: list[LoggedRegister] = []
     row: int = -1
-    name: str = ""
-    """Its own, where several servos move one joint."""
-    ratio: float = 1.0
-    """rad of its joint, or m, for each rad of the servo."""
+    name: str = ""  # Its own, where several servos move one joint
+    ratio: float = 1.0  # rad of its joint, or m, for each rad of the servo
 
     @property
     def own_name(self) -> str:
@@ -87,8 +85,7 @@ class Mover(NamedTuple):
 
     bus: LoggedBus
     servo: LoggedServo
-    share: float
-    """rad of the joint, or m, for each rad of the servo, without its sign"""
+    share: float  # rad of the joint, or m, for each rad of the servo, without its sign
 
 
 NO_LOOP = LoopPlan(0, SchedulerPlan("other", 0, lock_memory=False), (), (), (), None)

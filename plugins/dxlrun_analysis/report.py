@@ -55,8 +55,7 @@ class EventCount(msgspec.Struct, frozen=True):
     name: str
     severity: int
     count: int
-    first: str
-    """Source and text of the first one."""
+    first: str  # Source and text of the first one
 
 
 class TopicCount(msgspec.Struct, frozen=True):
@@ -65,8 +64,7 @@ class TopicCount(msgspec.Struct, frozen=True):
     name: str
     type: str
     messages: int
-    rate: float | None
-    """Hz; None for fewer than two."""
+    rate: float | None  # Hz; None for fewer than two
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -76,24 +74,19 @@ class Report(msgspec.Struct, frozen=True):
     robot: str
     verdict: Verdict
     periods: Periods
-    latency: Latency | None
-    """None where the loop never ran a cycle."""
+    latency: Latency | None  # None where the loop never ran a cycle
     steps: tuple[Duration, ...]
     controllers: tuple[Duration, ...]
-    causes: Causes
-    """Why cycles were late or too long, and the worst ones."""
+    causes: Causes  # Why cycles were late or too long, and the worst ones
     servos: tuple[ServoTraffic, ...]
     buses: tuple[BusTraffic, ...]
     joints: tuple[JointTracking, ...]
-    trends: tuple[Trend, ...]
-    """Temperature, voltage and load of each joint over the run."""
+    trends: tuple[Trend, ...]  # Temperature, voltage and load of each joint over the run
     events: tuple[EventCount, ...]
-    steering: tuple[Act, ...]
-    """Commands from outside, a stream as one."""
+    steering: tuple[Act, ...]  # Commands from outside, a stream as one
     pauses: tuple[Pause, ...]
     topics: tuple[TopicCount, ...]
-    gaps: int
-    """Records that the recorder did not get."""
+    gaps: int  # Records that the recorder did not get
     complete: bool
     damage: tuple[str, ...]
 

@@ -17,8 +17,7 @@ from dxlrun_analysis.finding import ROBOT, Finding, Rank
 from dxlrun_analysis.tally import RunTotals
 
 _MOST_NAMED = 3
-_AT_ONCE_NS = 500_000_000
-"""What happens to joints within that time has one time."""
+_AT_ONCE_NS = 500_000_000  # What happens to joints within that time has one time
 _NOTICED_RAD = math.radians(0.05)
 _FAILED = {
     EventCode.SERVO_LIMP: "went limp",
@@ -43,8 +42,7 @@ _REASONS = {
 }
 """By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
 _RELEASED = "torque off: "
-_RUN_ENDED = "the run ended"
-"""The text of a goal that was aborted because of it."""
+_RUN_ENDED = "the run ended"  # The text of a goal that was aborted because of it
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100
 

@@ -32,19 +32,16 @@ from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
-_ANSWERS = " answers "
-"""What a servo does that is lost all the same: it cannot be taken back."""
+_ANSWERS = " answers "  # What a servo does that is lost all the same: it cannot be taken back
 
 
 @dataclass(frozen=True, slots=True)
 class RealTime:
     """The real-time scheduling that the loop requested, and whether it was granted."""
 
-    requested: bool = False
-    """A real-time scheduler."""
+    requested: bool = False  # A real-time scheduler
     granted: bool = False
-    kernel: bool = False
-    """The kernel is a real-time one."""
+    kernel: bool = False  # The kernel is a real-time one
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +49,9 @@ class RunTotals:
     """One run in numbers: all that the rules of the verdict read."""
 
     periods: Periods
-    latency: Latency | None = None
-    """None where the loop never ran a cycle, and without a log."""
+    latency: Latency | None = None  # None where the loop never ran a cycle, and without a log
     slowest: Slowest | None = None
-    causes: Causes = NO_CAUSES
-    """Why cycles were late or too long."""
+    causes: Causes = NO_CAUSES  # Why cycles were late or too long
     virtual: bool = False
     plan: LoggedPlan = field(default_factory=LoggedPlan)
     real_time: RealTime = RealTime()
@@ -65,23 +60,18 @@ class RunTotals:
     """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
     servos: tuple[ServoTraffic, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
-    events: tuple[EventGroup, ...] = ()
-    """In the order of the first of each."""
+    events: tuple[EventGroup, ...] = ()  # In the order of the first of each
     returns: dict[str, list[str]] = field(default_factory=dict)
     """Why servos that were lost and answer again were not taken back, by joint."""
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
-    failures: tuple[str, ...] = ()
-    """What failed outside of the loop, one sentence each."""
-    gaps: int = 0
-    """Records that the recorder did not get."""
+    failures: tuple[str, ...] = ()  # What failed outside of the loop, one sentence each
+    gaps: int = 0  # Records that the recorder did not get
     damage: tuple[str, ...] = ()
-    tracking: tuple[JointTracking, ...] = ()
-    """How each joint followed; in the order of `joints`."""
+    tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
     trends: tuple[Trend, ...] = ()
     conduct: Conduct = NO_CONDUCT
-    findings: tuple[Finding, ...] = ()
-    """What the accumulators of each room found by rules of their own."""
+    findings: tuple[Finding, ...] = ()  # What the accumulators of each room found by rules of their own
 
     def bus_of(self, subject: str) -> str:
         """Return the bus of a servo that a finding accuses; of another subject itself."""

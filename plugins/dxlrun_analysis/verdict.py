@@ -51,8 +51,7 @@ from dxlrun_analysis.tally import RunTotals
 _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
-_OFTEN = 0.01
-"""Of the cycles: a goal beyond a limit now and then is what limits are for."""
+_OFTEN = 0.01  # Of the cycles: a goal beyond a limit now and then is what limits are for
 _OF_LOOP = (
     "switch",
     "rate",
@@ -72,12 +71,9 @@ _OF_LOOP = (
 class Verdict(msgspec.Struct, frozen=True):
     """What the robot did, then findings, the most severe first."""
 
-    good: bool
-    """Nothing was found that a run may not have."""
-    word: str
-    """The verdict in words: good; good, with fallbacks; not good."""
-    sentences: tuple[str, ...]
-    """Of the findings, with their remedies."""
+    good: bool  # Nothing was found that a run may not have
+    word: str  # The verdict in words: good; good, with fallbacks; not good
+    sentences: tuple[str, ...]  # Of the findings, with their remedies
     findings: tuple[Finding, ...]
 
 

@@ -66,8 +66,7 @@ class Cause:
     code: str
     inject: Inject
     of_bus: bool = False
-    of: str = ""
-    """What else it is of."""
+    of: str = ""  # What else it is of
     protocols: tuple[float, ...] = (1.0, 2.0)
     robots: tuple[str, ...] = tuple(ROBOTS)
 

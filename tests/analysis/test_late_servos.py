@@ -15,10 +15,8 @@ from dxlrun_analysis.cycles.late_servos import overruns_by_servos, transactions,
 
 PERIOD_US = 20_000
 ASKED = b"\xff\xff\x05\x04\x02\x24\x02\xcc"
-LATE = 15
-"""The cycle that overran; the one after it is the last."""
-GONE = 3
-"""Periods that were left out behind it."""
+LATE = 15  # The cycle that overran; the one after it is the last
+GONE = 3  # Periods that were left out behind it
 
 
 def entry(direction: str, at_us: float, data: bytes = ASKED, late_us: int = 0) -> LedgerEntry:

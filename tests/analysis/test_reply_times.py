@@ -25,8 +25,7 @@ from dxlrun_analysis.servos.traffic import ServoTraffic
 
 IDS = (1, 2, 3)
 CYCLES = 300
-PERIOD = 10_000
-"""us, as all times here."""
+PERIOD = 10_000  # us, as all times here
 SIZE = 4
 CHAIN = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])
 REPLY = 11 + SIZE
@@ -152,8 +151,7 @@ def test_a_return_delay_that_is_another_is_told_with_its_value(slow: int) -> Non
 
 
 LONG = 600
-SWING = 60 * np.sin(np.arange(LONG) * 0.13)
-"""deg"""
+SWING = 60 * np.sin(np.arange(LONG) * 0.13)  # deg
 IN_RANGE = (SWING >= 20) & (SWING < 40)
 WARM = np.linspace(30, 62, LONG)
 PLAN = LoggedPlan(buses=[BUS])

@@ -16,8 +16,7 @@ from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.finding import Rank
 
 Floats = npt.NDArray[np.floating[Any]]
-TIME = np.arange(600) * 0.01
-"""6 s"""
+TIME = np.arange(600) * 0.01  # 6 s
 NOISE = np.random.default_rng(1).normal(size=600)
 MOVES = np.sin(TIME)
 HANGS = np.where(TIME < 2.0, NOISE, NOISE[199])

@@ -18,8 +18,7 @@ COUNT = 900
 RANDOM = np.random.default_rng(3)
 TREMBLES = 4.0 + 0.02 * RANDOM.normal(size=COUNT)
 OTHER = 5.0 + 0.02 * RANDOM.normal(size=COUNT)
-SOME = np.arange(COUNT) % 17 == 5
-"""53 samples, one by one."""
+SOME = np.arange(COUNT) % 17 == 5  # 53 samples, one by one
 BURSTS = np.where(np.arange(COUNT) % 60 < 15, RANDOM.uniform(-8.0, 8.0, COUNT), 0.0)
 
 

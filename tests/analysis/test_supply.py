@@ -14,8 +14,7 @@ from dxlrun_analysis.joints.trends import Trends
 
 Floats = npt.NDArray[np.float64]
 COUNT = 4
-TIME = np.arange(1000) * 0.02
-"""20 s"""
+TIME = np.arange(1000) * 0.02  # 20 s
 LOADS = np.array([0.4 * (1 + np.sin(0.9 * TIME + joint)) for joint in range(COUNT)]).T
 PLAN = {
     "buses": [

@@ -16,16 +16,14 @@ from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.traffic import error_names
 
-BYTE_NS = 10_000_000_000
-"""Ten bits a byte, over the rate in bit/s."""
+BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s
 BROADCAST_ID = 0xFE
 HEADER_2 = b"\xff\xff\xfd\x00"
 PING, READ = 0x01, 0x02
 SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 
 Row = dict[str, object]
-Asked = dict[int, int]
-"""The servos that an instruction asks, each with its bytes of data; 0: not known."""
+Asked = dict[int, int]  # The servos that an instruction asks, each with its bytes of data; 0: not known
 
 
 class Reply(NamedTuple):
@@ -60,13 +58,10 @@ class Line:
     extra_us: list[int] = field(default_factory=list)
     """How much longer than wire and return delay each complete exchange took."""
     sizes: list[tuple[int, int]] = field(default_factory=list)
-    open: set[int] = field(default_factory=set)
-    """Servos that have not answered yet."""
+    open: set[int] = field(default_factory=set)  # Servos that have not answered yet
     asked_ns: int = 0
-    free_ns: int = 0
-    """When the line has carried all that was sent."""
-    awaited_ns: int = 0
-    """When all that was asked could be there, by the wire and the return delay alone."""
+    free_ns: int = 0  # When the line has carried all that was sent
+    awaited_ns: int = 0  # When all that was asked could be there, by the wire and the return delay alone
 
     def take(self, packet: LoggedPacket) -> None:
         wire_ns = len(packet.data) * BYTE_NS // max(self.plan.baud_rate, 1)

@@ -44,13 +44,10 @@ class _Exchange(NamedTuple):
     bus: int
     servo_ids: tuple[int, ...]
     asked: int
-    blocked: int
-    """How long the write() of the instruction took beyond the wire's time."""
-    following: int
-    """When the next instruction of the bus was sent."""
+    blocked: int  # How long the write() of the instruction took beyond the wire's time
+    following: int  # When the next instruction of the bus was sent
     planned_end: int
-    last: int
-    """When the last reply was there; 0: none was."""
+    last: int  # When the last reply was there; 0: none was
     lacks: int | None
     """The servo that is waited for: the first without a reply; -1: none of several came; None: all came."""
 

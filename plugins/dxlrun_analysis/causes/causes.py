@@ -46,18 +46,12 @@ Cycles = NDArray[np.void]
 class Causes:
     """All late and long cycles of a run."""
 
-    late: int = 0
-    """Cycles that woke late, long ones too."""
-    long: int = 0
-    """Cycles that took longer than their period, or ended so late that periods were skipped."""
-    excess_ns: int = 0
-    """Of the worst of them; the sum of the causes."""
-    causes: tuple[Cause, ...] = ()
-    """The largest first."""
-    worst: tuple[WorstCycle, ...] = ()
-    """The worst first."""
-    throttled: int = 0
-    """Samples of the machine with a core that was hot and slow."""
+    late: int = 0  # Cycles that woke late, long ones too
+    long: int = 0  # Cycles that took longer than their period, or ended so late that periods were skipped
+    excess_ns: int = 0  # Of the worst of them; the sum of the causes
+    causes: tuple[Cause, ...] = ()  # The largest first
+    worst: tuple[WorstCycle, ...] = ()  # The worst first
+    throttled: int = 0  # Samples of the machine with a core that was hot and slow
     load: MachineLoad = field(default_factory=MachineLoad)
 
 
@@ -68,8 +62,7 @@ class _Kept(NamedTuple):
     """One of the worst cycles so far."""
 
     cycle: np.void
-    before: np.void | None
-    """The cycle before it; None: it is the first."""
+    before: np.void | None  # The cycle before it; None: it is the first
     packets: PacketColumns
 
 
@@ -79,12 +72,9 @@ class CycleCauses:
     def __init__(self) -> None:
         self._late = self._long = 0
         self._sequential = False
-        self._newest: Cycles | None = None
-        """The next one declares what was skipped behind it."""
-        self._before: Cycles | None = None
-        """The cycle before that."""
-        self._packets: list[PacketColumns] = []
-        """Those since its read."""
+        self._newest: Cycles | None = None  # The next one declares what was skipped behind it
+        self._before: Cycles | None = None  # The cycle before that
+        self._packets: list[PacketColumns] = []  # Those since its read
         self._buses: tuple[LoggedBus, ...] = ()
         self._controllers: tuple[str, ...] = ()
         self._machine = MachineHistory()

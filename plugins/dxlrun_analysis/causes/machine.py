@@ -23,15 +23,11 @@ THROTTLED_SHARE = 0.6
 _WAITING_SHARE = 0.001
 _INTERRUPTS_SHARE = 0.05
 """Shares of a second that a well machine takes, too [i]: /proc/stat counts in steps of 10 ms."""
-HOT = 80.0
-"""deg C from which processors are throttled [i]."""
-_IDLE_SHARE = 0.05
-"""Of a second; less is no idle core: /proc/stat counts in steps of 10 ms."""
+HOT = 80.0  # deg C from which processors are throttled [i]
+_IDLE_SHARE = 0.05  # Of a second; less is no idle core: /proc/stat counts in steps of 10 ms
 _STOLEN_SHARE = 0.05
-_KEPT_WAITING_SHARE = 0.01
-"""Of a second; a loop at 1 kHz misses ten cycles in it."""
-_PART_NS = 500_000_000
-"""A shorter sample, as at the end, is not counted."""
+_KEPT_WAITING_SHARE = 0.01  # Of a second; a loop at 1 kHz misses ten cycles in it
+_PART_NS = 500_000_000  # A shorter sample, as at the end, is not counted
 _FEWEST_BUSY_S = 3
 _BUSY_PART = 0.1
 Numbers = NDArray[np.int64]
@@ -43,12 +39,9 @@ class MachineLoad:
 
     seconds: int = 0
     no_idle_core: int = 0
-    stolen: int = 0
-    """The host kept more than 5 % of a core back."""
-    waited: int = 0
-    """The loop was runnable without a core for more than 10 ms."""
-    busy: int = 0
-    """Any of these."""
+    stolen: int = 0  # The host kept more than 5 % of a core back
+    waited: int = 0  # The loop was runnable without a core for more than 10 ms
+    busy: int = 0  # Any of these
 
     @property
     def share(self) -> float:
@@ -73,8 +66,7 @@ class MachineSample:
 
     begin_ns: int
     end_ns: int
-    taken_ns: tuple[int, ...]
-    """Beyond what a well machine takes, by TAKERS."""
+    taken_ns: tuple[int, ...]  # Beyond what a well machine takes, by TAKERS
 
 
 @dataclass(slots=True)
@@ -82,8 +74,7 @@ class MachineHistory:
     """Reads the samples."""
 
     _fastest: float = 0.0
-    slow: int = 0
-    """Samples with a core that was hot and far below its highest frequency."""
+    slow: int = 0  # Samples with a core that was hot and far below its highest frequency
     load: MachineLoad = field(default_factory=MachineLoad)
 
     def new(self, log: Log, begin_ns: int | None) -> list[MachineSample]:

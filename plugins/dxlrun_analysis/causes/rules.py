@@ -23,10 +23,8 @@ MOST_OF_IT = 0.5
 
 class _Rule(NamedTuple):
     code: str
-    sentence: str
-    """With `subject`, and with `took`: how much of how much, in how many cycles."""
-    remedy: str = ""
-    """Empty: what makes wake-ups punctual."""
+    sentence: str  # With `subject`, and with `took`: how much of how much, in how many cycles
+    remedy: str = ""  # Empty: what makes wake-ups punctual
 
 
 _RULES: dict[CauseKind, _Rule] = {

@@ -15,8 +15,7 @@ from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 if TYPE_CHECKING:
     from dxlrun.log.reader import LogReader
 
-MOST_WORST = 10
-"""Cycles of which the analysis keeps the packets."""
+MOST_WORST = 10  # Cycles of which the analysis keeps the packets
 
 
 def analyze(

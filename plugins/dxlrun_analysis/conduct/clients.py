@@ -26,13 +26,10 @@ from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.finding import Finding, Rank, cause
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
-_SOON_NS = 2_000_000_000
-"""A client that goes on later has begun anew."""
+_SOON_NS = 2_000_000_000  # A client that goes on later has begun anew
 _QUICK_NS = 700_000_000
-_TURNS, _FEWEST = 2, 6
-"""Activations of each controller, and of all, from which they flap."""
-_CYCLE_NS = 50_000_000
-"""So long after a cycle woke it has refused a set-point."""
+_TURNS, _FEWEST = 2, 6  # Activations of each controller, and of all, from which they flap
+_CYCLE_NS = 50_000_000  # So long after a cycle woke it has refused a set-point
 _MOST_KEPT = 10_000
 _MOST_NAMED = 3
 
@@ -40,8 +37,7 @@ _MOST_NAMED = 3
 class _Gap(NamedTuple):
     """A time in which a stream had run out."""
 
-    begin_ns: int
-    """Of the last set-point before it."""
+    begin_ns: int  # Of the last set-point before it
     ns: int
     lease_ns: int
     origin: str
@@ -57,14 +53,10 @@ class Clients:
         self._gaps: dict[str, list[_Gap]] = {}
         self._ended: dict[str, list[int]] = {}
         """When the loop noted that a stream had ended, ns: where the loop itself stalled it did not."""
-        self._refused: dict[str, list[int]] = {}
-        """When a controller's commands were refused, ns."""
-        self._changes: list[tuple[int, str]] = []
-        """When which controller was activated after the start, ns."""
-        self._switches: list[tuple[int, str]] = []
-        """When which client requested one, ns."""
-        self._cut: list[int] = []
-        """When goals were aborted, ns."""
+        self._refused: dict[str, list[int]] = {}  # When a controller's commands were refused, ns
+        self._changes: list[tuple[int, str]] = []  # When which controller was activated after the start, ns
+        self._switches: list[tuple[int, str]] = []  # When which client requested one, ns
+        self._cut: list[int] = []  # When goals were aborted, ns
 
     def take(self, log: Log) -> None:
         """Take the next slice."""

@@ -23,10 +23,8 @@ from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _FALLEN_RAD = math.radians(60.0)
-_SOME = 50
-"""Cycles at the begin and at the end whose median gravity is compared."""
-_MOST_KEPT = 100
-"""Goals that were not reached, and takeovers."""
+_SOME = 50  # Cycles at the begin and at the end whose median gravity is compared
+_MOST_KEPT = 100  # Goals that were not reached, and takeovers
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
 
 Floats = NDArray[np.float64]
@@ -35,12 +33,9 @@ Floats = NDArray[np.float64]
 class Takeover(NamedTuple):
     """Controllers took over: for one that failed, or because one requested it."""
 
-    time_s: float
-    """Since the first deadline."""
-    controller: str
-    """Which failed, or requested it."""
-    by: str
-    """The fallback; empty: it was requested."""
+    time_s: float  # Since the first deadline
+    controller: str  # Which failed, or requested it
+    by: str  # The fallback; empty: it was requested
     text: str
     fell: bool = False
 
@@ -49,23 +44,16 @@ class Takeover(NamedTuple):
 class Conduct:
     """What the robot did in a run."""
 
-    begin_ns: int = 0
-    """The first deadline, on the run's clock."""
-    goals: int = 0
-    """Accepted, but for those that a client cancelled or replaced."""
+    begin_ns: int = 0  # The first deadline, on the run's clock
+    goals: int = 0  # Accepted, but for those that a client cancelled or replaced
     reached: int = 0
     cancelled: int = 0
-    origins: frozenset[str] = frozenset()
-    """Of the goals."""
-    failed: tuple[GoalReport, ...] = ()
-    """Goals that were missed or aborted."""
+    origins: frozenset[str] = frozenset()  # Of the goals
+    failed: tuple[GoalReport, ...] = ()  # Goals that were missed or aborted
     takeovers: tuple[Takeover, ...] = ()
-    unanswered: tuple[str, ...] = ()
-    """Controllers that failed without a fallback that took over."""
-    turned_rad: float | None = None
-    """How far gravity turned from the start to the end; None: no IMU."""
-    lies: bool = False
-    """At the end."""
+    unanswered: tuple[str, ...] = ()  # Controllers that failed without a fallback that took over
+    turned_rad: float | None = None  # How far gravity turned from the start to the end; None: no IMU
+    lies: bool = False  # At the end
 
 
 NO_CONDUCT = Conduct()
@@ -80,10 +68,8 @@ class ConductHistory:
         self._origins: set[str] = set()
         self._failed: list[GoalReport] = []
         self._takeovers: list[Takeover] = []
-        self._pending: list[Event] = []
-        """Controllers that failed, for which nothing has taken over yet."""
-        self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))
-        """Gravity in the frame of the IMU."""
+        self._pending: list[Event] = []  # Controllers that failed, for which nothing has taken over yet
+        self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
 
     def take(self, log: Log) -> None:
         """Take the next slice."""

@@ -26,17 +26,14 @@ from dxlrun_analysis.plan import LoggedPlan, plan_of
 _HANGS_S = 1.0
 _TIMES_LONGER = 10
 """Than ever before: those of a switch stay for long, and of a simulated sensor without noise at rest."""
-_MOVED_RAD = 0.1
-"""A robot at rest may have a sensor, a simulated one, that measures the same."""
+_MOVED_RAD = 0.1  # A robot at rest may have a sensor, a simulated one, that measures the same
 _RESTED_RAD = 0.02
 _CHANGES = 40
 """So many of the last ones show whether a value trembles ..."""
 _REVERSALS = 16
 """... as so many of them go back: a measured movement goes one way for longer."""
-_FEWEST_VALUES = 4
-"""A voltage between two steps has two."""
-_FEWEST_ALONE = 8
-"""Of one value, while others still tremble."""
+_FEWEST_VALUES = 4  # A voltage between two steps has two
+_FEWEST_ALONE = 8  # Of one value, while others still tremble
 _MOST_NAMED = 4
 
 Times = NDArray[np.int64]
@@ -48,30 +45,21 @@ class _Stay:
 
     hung_s: float = 0.0
     from_s: float = 0.0
-    usual_s: float = 0.0
-    """The longest time before."""
-    moved: bool = False
-    """Joints did, meanwhile."""
-    values: int = 0
-    """That it had in the changes before, where it trembled; 0: it did not."""
-    inside: bool = False
-    """It had greater and smaller values, and is not 0."""
-    rested: bool = False
-    """It trembled while no joint moved."""
+    usual_s: float = 0.0  # The longest time before
+    moved: bool = False  # Joints did, meanwhile
+    values: int = 0  # That it had in the changes before, where it trembled; 0: it did not
+    inside: bool = False  # It had greater and smaller values, and is not 0
+    rested: bool = False  # It trembled while no joint moved
 
 
 @dataclass(slots=True)
 class _Watched:
     """One value, or all of a source: when it changed, and how long it stayed."""
 
-    since_ns: int
-    """The last change."""
-    position: Floats
-    """Of the joints, at that change."""
-    moved: bool = False
-    """Since then."""
-    longest_ns: int = 0
-    """Between two changes."""
+    since_ns: int  # The last change
+    position: Floats  # Of the joints, at that change
+    moved: bool = False  # Since then
+    longest_ns: int = 0  # Between two changes
     low: float = np.inf
     high: float = -np.inf
     recent: Floats = field(default_factory=lambda: np.zeros(0))

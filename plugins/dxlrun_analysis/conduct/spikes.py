@@ -19,16 +19,13 @@ from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan import LoggedDevice, plan_of
 
 _BLOCK = 256
-_SHORTEST = 64
-"""Samples of the last block."""
+_SHORTEST = 64  # Samples of the last block
 _WINDOW = 5
 _TIMES_NOISE = 30
 _TOGETHER = 1 / 8
-_FEWEST_VALUES = 16
-"""In a block, of one that trembles."""
+_FEWEST_VALUES = 16  # In a block, of one that trembles
 _FEWEST = 10
-_ALONE = 0.8
-"""Share of the jumps of a value in which no other of its device jumps."""
+_ALONE = 0.8  # Share of the jumps of a value in which no other of its device jumps
 
 
 class _Device:

@@ -41,31 +41,24 @@ class _Data(msgspec.Struct):
 class Act:
     """One command from outside, or a stream of set-points."""
 
-    time_s: float
-    """Since the loop's first deadline."""
+    time_s: float  # Since the loop's first deadline
     cycle: int
     kind: str
-    what: str
-    """In words."""
+    what: str  # In words
     origin: str
-    refusal: str
-    """Why it was not done; empty: it was."""
-    set_points: int = 0
-    """Of a stream; 0: this is none."""
-    controller: str = ""
-    """Of a stream."""
+    refusal: str  # Why it was not done; empty: it was
+    set_points: int = 0  # Of a stream; 0: this is none
+    controller: str = ""  # Of a stream
     ended_s: float | None = None
     """When its lease ran out, of a stream that none went on for its controller; None: it did not."""
-    held: bool = False
-    """The controller held its joints from then on, to the end of the run."""
+    held: bool = False  # The controller held its joints from then on, to the end of the run
 
 
 @dataclass(frozen=True, slots=True)
 class Pause:
     """One pause of the controllers' time."""
 
-    begin_s: float
-    """Since the loop's first deadline."""
+    begin_s: float  # Since the loop's first deadline
     end_s: float
     periods: int
 

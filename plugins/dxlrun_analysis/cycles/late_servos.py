@@ -33,14 +33,10 @@ Sent = Sequence[tuple[int, int]]
 class LedgerTransaction(NamedTuple):
     """An instruction that was answered."""
 
-    handed_ns: int
-    """When the host was given the end of the last reply."""
-    late_ns: int
-    """How much sooner that could have been."""
-    taken: int
-    """Bytes that went to the servos until then, since the ledger began."""
-    given: int
-    """Bytes that came back."""
+    handed_ns: int  # When the host was given the end of the last reply
+    late_ns: int  # How much sooner that could have been
+    taken: int  # Bytes that went to the servos until then, since the ledger began
+    given: int  # Bytes that came back
 
 
 def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, Longs]:

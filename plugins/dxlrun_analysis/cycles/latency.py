@@ -20,17 +20,12 @@ ROUGH_NS = 150_000
 DISORDER_NS = RING_SECONDS * 1_000_000_000
 """A log has the records of several rings in the order in which the recorder got them: no further apart."""
 _MS = 1_000_000
-LATE_BINS_US = 100_000
-"""Wake-ups are counted in bins of 1 us; what is later is in the last one."""
+LATE_BINS_US = 100_000  # Wake-ups are counted in bins of 1 us; what is later is in the last one
 _TENTH_NS = 100
-_MOST_RATES = 4
-"""More are not listed one by one."""
-_MOST_KEPT = 1000
-"""So many different rates are kept."""
-_LATEST_NS = 1 << 43
-"""Two hours and more; a wake-up that is later by damaged times counts as so late."""
-_LOW = 20
-"""Bits of the lower of two parts that are squared separately, so that sums fit 64 bits."""
+_MOST_RATES = 4  # More are not listed one by one
+_MOST_KEPT = 1000  # So many different rates are kept
+_LATEST_NS = 1 << 43  # Two hours and more; a wake-up that is later by damaged times counts as so late
+_LOW = 20  # Bits of the lower of two parts that are squared separately, so that sums fit 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +34,8 @@ class Latency:
 
     max_us: float
     mean_us: float
-    deviation_us: float
-    """Standard deviation of the population."""
-    mode_us: int
-    """Lower edge of the fullest bin of 1 us; the smallest where several are as full."""
+    deviation_us: float  # Standard deviation of the population
+    mode_us: int  # Lower edge of the fullest bin of 1 us; the smallest where several are as full
     share_over_150_us: float
     share_over_1_ms: float
     share_over_period: float
@@ -91,19 +84,13 @@ class Periods:
 
     elapsed: int
     records: int
-    skipped: int
-    """Declared skipped by the loop."""
-    missing: int
-    """Elapsed, but neither recorded nor declared skipped; 0 in a whole log."""
-    agree: bool
-    """records + skipped = elapsed, and each record declares what is missing right before it."""
-    rate_hz: float
-    """At the start."""
+    skipped: int  # Declared skipped by the loop
+    missing: int  # Elapsed, but neither recorded nor declared skipped; 0 in a whole log
+    agree: bool  # records + skipped = elapsed, and each record declares what is missing right before it
+    rate_hz: float  # At the start
     seconds: float
-    rates_hz: tuple[float, ...] = ()
-    """Every rate at which cycles ran, in the order in which they came first."""
-    begin_ns: int = 0
-    """The first deadline; in a log without cycles the first event."""
+    rates_hz: tuple[float, ...] = ()  # Every rate at which cycles ran, in the order in which they came first
+    begin_ns: int = 0  # The first deadline; in a log without cycles the first event
 
     @property
     def rates(self) -> str:
@@ -175,8 +162,7 @@ class Durations:
     """Measures the steps of the cycles and the updates of the controllers, slice by slice of a log."""
 
     def __init__(self) -> None:
-        self._took = Counts()
-        """In steps of 0.1 us: of each step, then of each controller."""
+        self._took = Counts()  # In steps of 0.1 us: of each step, then of each controller
         self._controllers: tuple[str, ...] = ()
 
     def take(self, log: Log) -> None:
@@ -210,12 +196,10 @@ class Punctuality:
     """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
 
     def __init__(self) -> None:
-        self._held: NDArray[np.void] | None = None
-        """The newest cycle: its period ends with the next one."""
+        self._held: NDArray[np.void] | None = None  # The newest cycle: its period ends with the next one
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
-        self._start = 0
-        """Number of the first period that counts."""
+        self._start = 0  # Number of the first period that counts
         self._first = True
         self._begin_ns = self._from_ns = self._end_ns = 0
         self._nominal_ns = self._period_ns = 1
@@ -223,8 +207,7 @@ class Punctuality:
         self._over = [0, 0, 0]
         self._bins = np.zeros(LATE_BINS_US + 1, np.int64)
         self._rates: dict[int, None] = {}
-        self.slowest: Slowest | None = None
-        """The cycle that exceeded its period most; None where none did."""
+        self.slowest: Slowest | None = None  # The cycle that exceeded its period most; None where none did
 
     def take(self, log: Log) -> None:
         """Count the cycles of the next slice."""

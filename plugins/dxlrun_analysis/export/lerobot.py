@@ -104,12 +104,9 @@ class _Stretch(msgspec.Struct, frozen=True, eq=False):
     """Frames that follow each other."""
 
     log: Log
-    states: Frames
-    """Shape (frames, joints)."""
-    actions: Frames
-    """Shape (frames, commanded joints)."""
-    begins: bool
-    """They do not follow those before: an episode begins."""
+    states: Frames  # Shape (frames, joints)
+    actions: Frames  # Shape (frames, commanded joints)
+    begins: bool  # They do not follow those before: an episode begins
 
 
 @dataclass(slots=True)

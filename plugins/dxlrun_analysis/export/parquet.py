@@ -15,10 +15,8 @@ from dxlrun_analysis.export.tables import tables_of
 _NAMES = {"/cycle": "cycles"}
 _ODD = re.compile(r"[^\w.-]|^\.")
 """What a log that others made may have in a topic's name, and a file's name better has not."""
-_LONGEST = 100
-"""Characters of a file's name: 255 bytes of UTF-8, and its suffix."""
-_GROUP_BYTES = 32 << 20
-"""Of a table in memory; so much becomes one row group."""
+_LONGEST = 100  # Characters of a file's name: 255 bytes of UTF-8, and its suffix
+_GROUP_BYTES = 32 << 20  # Of a table in memory; so much becomes one row group
 
 
 def write_parquet(reader: LogReader, directory: Path) -> int:

@@ -22,8 +22,7 @@ from mcap.summary import Summary
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 
-VERSION = 8
-"""Of the metadata: the last one with the quality of service as text, which readers of 9 take too."""
+VERSION = 8  # Of the metadata: the last one with the quality of service as text, which readers of 9 take too
 _ROS_DISTRO = "jazzy"
 
 

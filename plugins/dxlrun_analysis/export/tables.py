@@ -27,8 +27,7 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import parse, short_name
 
 CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
-PACKETS = "/packets"
-"""The packets of all buses; `/bus/NAME` are those of one."""
+PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one
 _ROWS = 4096
 """Cycles that become one table: a slice of a log may have a few, and a table costs some time a column."""
 
@@ -62,8 +61,7 @@ _KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
 class Rows(msgspec.Struct, frozen=True, eq=False):
     """Some rows of one table."""
 
-    name: str
-    """The topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, that of a controller."""
+    name: str  # The topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, that of a controller
     table: pa.Table
 
 

@@ -19,10 +19,8 @@ from matplotlib.figure import Figure
 from dxlrun.channels.cycle import Floats
 from dxlrun.output import html
 
-_COLUMNS = 900
-"""About as many as a figure has pixels across."""
-WIDTH = 9.0
-"""Inches of 72 points; the page scales it."""
+_COLUMNS = 900  # About as many as a figure has pixels across
+WIDTH = 9.0  # Inches of 72 points; the page scales it
 
 INK, MUTED, GRID, PAPER = "#0a0a01", "#0a0a02", "#0a0a03", "#0a0a04"
 BLUE, ORANGE, GREEN, PURPLE = "#0a0a05", "#0a0a06", "#0a0a07", "#0a0a08"

@@ -26,8 +26,7 @@ from dxlrun_analysis.figures.drawing import (
 )
 
 _HEIGHT = 2.6
-_PARTS_SHOWN = 4
-"""So many times the longest response time is shown of steps."""
+_PARTS_SHOWN = 4  # So many times the longest response time is shown of steps
 
 
 class Mark(NamedTuple):

@@ -24,13 +24,11 @@ _EXPLAINED = 0.25
 class DelayFit:
     """Mean square differences between positions and goals that were sent earlier, by delay."""
 
-    step: int = 0
-    """Cycles from one delay to the next."""
+    step: int = 0  # Cycles from one delay to the next
     period_s: float = 0.0
     squares: Floats = field(default_factory=lambda: np.zeros(_DELAYS))
     counts: Floats = field(default_factory=lambda: np.zeros(_DELAYS))
-    goals: Floats = field(default_factory=lambda: np.zeros(0))
-    """The newest, as far back as delays go."""
+    goals: Floats = field(default_factory=lambda: np.zeros(0))  # The newest, as far back as delays go
     lowest: float = math.inf
     highest: float = -math.inf
 

@@ -37,32 +37,22 @@ STILL_RAD = 0.01
 _STILL_S = 0.5
 MOVED_RAD = 0.16
 """9 deg: so far the trajectory of a joint goes that should not stand still, and so far it is behind."""
-AWAY_RAD = 0.08
-"""4.6 deg: a joint that follows is nearer."""
-_DOUBTFUL = 1.5
-"""So much worse than before is not compared with: it may be the beginning of it."""
+AWAY_RAD = 0.08  # 4.6 deg: a joint that follows is nearer
+_DOUBTFUL = 1.5  # So much worse than before is not compared with: it may be the beginning of it
 WORSE = 3.0
-_FASTER = 1.5
-"""So much faster than ever before a joint may err by the square of that, and not be worse."""
-_FEWEST = 4
-"""Windows with torque, from which a joint has a time before."""
-BAD_S = 1.0
-"""A joint that did not do what it was told for so long makes a run not good."""
+_FASTER = 1.5  # So much faster than ever before a joint may err by the square of that, and not be worse
+_FEWEST = 4  # Windows with torque, from which a joint has a time before
+BAD_S = 1.0  # A joint that did not do what it was told for so long makes a run not good
 _LOADED = 2.0
 """So many times its usual load is more load ..."""
 _STRONG = 0.3
 """... or, where no usual one is known, so much of what the servo can."""
-_WEAK = 0.6
-"""Part of its torque below which one that is always the same is limited."""
+_WEAK = 0.6  # Part of its torque below which one that is always the same is limited
 _MOSTLY = 0.8
-_LAG_S = 0.1
-"""So late a joint may be at its goals without being far from them."""
-_CATCH_UP_S = 2.0
-"""After it had no torque, or was not read."""
-_SHAKES_HZ = 12.0
-"""Swings a second, two of them to and fro."""
-_SHAKES_BY_EFFORT_HZ = 8.0
-"""The same where a controller moves it with an effort: it is slower than a servo's."""
+_LAG_S = 0.1  # So late a joint may be at its goals without being far from them
+_CATCH_UP_S = 2.0  # After it had no torque, or was not read
+_SHAKES_HZ = 12.0  # Swings a second, two of them to and fro
+_SHAKES_BY_EFFORT_HZ = 8.0  # The same where a controller moves it with an effort: it is slower than a servo's
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +60,9 @@ class Failing:
     """A time in which one joint did not do what it was told; rad or m, and NaN what is not known."""
 
     code: str
-    when: NDArray[np.bool_]
-    """The windows in which it did not."""
-    seconds: float
-    """That they last."""
-    usual: NDArray[np.bool_]
-    """The windows with which they are compared."""
+    when: NDArray[np.bool_]  # The windows in which it did not
+    seconds: float  # That they last
+    usual: NDArray[np.bool_]  # The windows with which they are compared
 
 
 @dataclass(frozen=True, slots=True)

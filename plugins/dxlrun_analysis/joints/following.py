@@ -19,40 +19,30 @@ from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Samples
 
-STROKE_RAD = 0.1
-"""6 deg: by less to and fro a joint does not turn."""
+STROKE_RAD = 0.1  # 6 deg: by less to and fro a joint does not turn
 _LAGS_S = np.arange(0.0, 0.31, 0.01)
 _MOVES_RAD_S = 0.05
-_FEWEST = 20
-"""Samples that move, from which a lag is known."""
-_LOST = 0.02
-"""Of the samples: where more are missing, goals are missing too, and the joint is not to blame."""
-_QUICK = 0.6
-"""Part of the model's speed above which a servo follows as it can."""
+_FEWEST = 20  # Samples that move, from which a lag is known
+_LOST = 0.02  # Of the samples: where more are missing, goals are missing too, and the joint is not to blame
+_QUICK = 0.6  # Part of the model's speed above which a servo follows as it can
 _SETTLES_S = 0.3
 _GONE_S = 0.16
 """So long without a position are no lost replies: it had no torque ..."""
 _NEAR_AGAIN_RAD = 0.035
 """... and has to come so near to its way first."""
 _PLACE_RAD = 0.05
-_AGAIN_S = 0.5
-"""A joint that was at a place so long ago comes there again."""
-_CREEPS_RAD_S = 0.1
-"""By less it is nearly at rest, and may be on either side of what rubs."""
+_AGAIN_S = 0.5  # A joint that was at a place so long ago comes there again
+_CREEPS_RAD_S = 0.1  # By less it is nearly at rest, and may be on either side of what rubs
 _FASTER = 1.5
-_MOST_BEFORE = 12
-"""Stays at a place that later ones are compared with: the first ones of a run"""
+_MOST_BEFORE = 12  # Stays at a place that later ones are compared with: the first ones of a run
 _AT_ONCE_S = 0.08
 _BENDS_RAD_S = 0.6
 """A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
-_BENDS_S, _BENT_S = 0.1, 0.16
-"""So long before and behind it that is measured, and so long it is thrown off."""
+_BENDS_S, _BENT_S = 0.1, 0.16  # So long before and behind it that is measured, and so long it is thrown off
 _NEAR_RAD = 0.006
-_SWING_RAD, _SWING_TICKS = 0.01, 4
-"""0.6 deg, or as many ticks"""
+_SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or as many ticks
 _SWING_S = 0.2
-_UNEVEN = 0.4
-"""What swings by itself does so evenly."""
+_UNEVEN = 0.4  # What swings by itself does so evenly
 
 Flags = NDArray[np.bool_]
 
@@ -61,14 +51,10 @@ class Turn(NamedTuple):
     """Where a joint turns: what differs between its ways there and back, over the same places."""
 
     at_s: float
-    behind: float
-    """rad, more than joints of its kind, in each direction"""
-    load: float
-    """More of it forth than back, halved: what the movement itself takes"""
-    stood: float
-    """rad that its goal went back before it did"""
-    speed: float
-    """rad/s, on the two ways"""
+    behind: float  # rad, more than joints of its kind, in each direction
+    load: float  # More of it forth than back, halved: what the movement itself takes
+    stood: float  # rad that its goal went back before it did
+    speed: float  # rad/s, on the two ways
 
 
 class Visit(NamedTuple):
@@ -81,8 +67,7 @@ class Visit(NamedTuple):
     was: float
     load: float
     load_was: float
-    even: bool
-    """Its speed stays nearly the same: more or less of it takes no load"""
+    even: bool  # Its speed stays nearly the same: more or less of it takes no load
 
     @property
     def change(self) -> float:
@@ -100,8 +85,7 @@ class _Stay(NamedTuple):
     """How a joint was at a place."""
 
     end_s: float
-    direction: int
-    """0: nearly at rest"""
+    direction: int  # 0: nearly at rest
     speed: float
     off: float
     load: float
@@ -119,20 +103,15 @@ class Followed(NamedTuple):
 
     row: int
     joint: PlannedJoint
-    alike: int
-    """Joints of its kind that moved, itself among them"""
-    lag_s: float
-    """Of its kind"""
-    step_s: float
-    """Between two samples"""
+    alike: int  # Joints of its kind that moved, itself among them
+    lag_s: float  # Of its kind
+    step_s: float  # Between two samples
     at_s: Floats
-    goal: Floats
-    """Where a joint like it would be"""
+    goal: Floats  # Where a joint like it would be
     position: Floats
     off: Floats
     """Position minus goal; NaN where it can be anything: not read, as fast as it can, or catching up"""
-    load: Floats
-    """As a part of its torque"""
+    load: Floats  # As a part of its torque
     speed: Floats
 
     def turns(self) -> list[Turn]:

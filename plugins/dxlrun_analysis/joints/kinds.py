@@ -33,19 +33,13 @@ class Kind(NamedTuple):
     """One kind of finding about the movement of a joint."""
 
     remedy: str
-    says: Says | None = None
-    """None: the rule that finds it says it itself."""
-    may_be: str = ""
-    """What it may come from, behind the sentence"""
-    rank: Rank = Rank.SERVO
-    """Where it lasted for a second or more"""
+    says: Says | None = None  # None: the rule that finds it says it itself
+    may_be: str = ""  # What it may come from, behind the sentence
+    rank: Rank = Rank.SERVO  # Where it lasted for a second or more
     share: float = 3.0
-    shared: bool = False
-    """A joint that is not at fault may show it too, where others do."""
-    of_replies: bool = False
-    """Where replies are spoilt, goals wait, and joints do it that are not at fault."""
-    commanded: bool = False
-    """Its commands are the matter, whatever its servo is."""
+    shared: bool = False  # A joint that is not at fault may show it too, where others do
+    of_replies: bool = False  # Where replies are spoilt, goals wait, and joints do it that are not at fault
+    commanded: bool = False  # Its commands are the matter, whatever its servo is
 
 
 def finding_of(one: Windows, failing: Failing, others: float) -> Finding:

@@ -24,12 +24,9 @@ from dxlrun_analysis.joints.trail import Trail
 from dxlrun_analysis.joints.wear import worn
 
 _WINDOW_S = 0.5
-_JUMP_S = 0.5
-"""Positions that are further apart in time are not compared: it may have been moved."""
-_TOO_FAST = 1.25
-"""A supply at its limit and a load that pulls make a servo a little faster than its model."""
-_SWING_RAD = 0.035
-"""2 deg: by less between two turns a joint does not shake."""
+_JUMP_S = 0.5  # Positions that are further apart in time are not compared: it may have been moved
+_TOO_FAST = 1.25  # A supply at its limit and a load that pulls make a servo a little faster than its model
+_SWING_RAD = 0.035  # 2 deg: by less between two turns a joint does not shake
 _FULL_SPEED = 0.8
 """A joint that moves to its goal at this part of the greatest speed it ever had does what it can ..."""
 _SLOWEST_TOP = 0.4

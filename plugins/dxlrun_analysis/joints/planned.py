@@ -13,8 +13,7 @@ from dxlrun.log.reader import Log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 
-_TICK_RAD = math.tau / 4096
-"""Where the log's plan does not have the servo's"""
+_TICK_RAD = math.tau / 4096  # Where the log's plan does not have the servo's
 _NEAREST = (
     (np.fmin, ("temperature_limit", "motor_temperature_limit")),
     (np.fmax, ("min_voltage_limit",)),
@@ -32,29 +31,18 @@ class PlannedJoint:
 
     name: str = ""
     bus: str = ""
-    servos: str = ""
-    """As sentences name them"""
-    hottest: float = math.nan
-    """The temperature limit, deg C"""
+    servos: str = ""  # As sentences name them
+    hottest: float = math.nan  # The temperature limit, deg C
     lowest_volts: float = math.nan
-    highest_volts: float = math.nan
-    """The limits of its servos' supply, V"""
-    top_effort: float = math.nan
-    """In the unit of its effort"""
-    speed: float = math.inf
-    """rad/s"""
-    acceleration: float = math.inf
-    """rad/s^2, of the profile that the robot file declares in its `registers`"""
-    tick: float = _TICK_RAD
-    """rad"""
-    slowest: float = 0.0
-    """rad/s; a speed of 0 would be none"""
-    share: float = 1.0
-    """m of a linear joint for each rad of its servo; 1 of one that turns"""
-    softness: float = 1.0
-    """So many times lower than its model's is the gain in the robot file, from 1 to 3"""
-    alike: str = ""
-    """Models and registers: joints that have the same ones follow alike"""
+    highest_volts: float = math.nan  # The limits of its servos' supply, V
+    top_effort: float = math.nan  # In the unit of its effort
+    speed: float = math.inf  # rad/s
+    acceleration: float = math.inf  # rad/s^2, of the profile that the robot file declares in its `registers`
+    tick: float = _TICK_RAD  # rad
+    slowest: float = 0.0  # rad/s; a speed of 0 would be none
+    share: float = 1.0  # m of a linear joint for each rad of its servo; 1 of one that turns
+    softness: float = 1.0  # So many times lower than its model's is the gain in the robot file, from 1 to 3
+    alike: str = ""  # Models and registers: joints that have the same ones follow alike
     logged: JointPlan = UNKNOWN_JOINT
 
 

@@ -24,16 +24,12 @@ from dxlrun_analysis.joints.delay import DelayFit
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 
-_REST_S = 0.3
-"""A reachable trajectory that does not change for so long is at rest: its joint is to settle."""
+_REST_S = 0.3  # A reachable trajectory that does not change for so long is at rest: its joint is to settle
 _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 """Settled: so near to where it stays, as a part of the way or in ticks, whichever is more."""
-_MOVED_TICKS = 4
-"""Shorter ways give no lag: positions are read in ticks."""
-_BLOCK = 1 << 16
-"""Cycles that are worked on at once, times joints; of eight for a robot of fewer."""
-_LONGEST_REST_S = 20.0
-"""What rests longer is counted as two rests."""
+_MOVED_TICKS = 4  # Shorter ways give no lag: positions are read in ticks
+_BLOCK = 1 << 16  # Cycles that are worked on at once, times joints; of eight for a robot of fewer
+_LONGEST_REST_S = 20.0  # What rests longer is counted as two rests
 
 Flags = NDArray[np.bool_]
 
@@ -43,12 +39,9 @@ class JointTracking:
     """One joint over all cycles."""
 
     name: str
-    invalid: int
-    """Cycles without an intact reply; those of a requested reboot do not count."""
-    oldest_ms: float
-    """Greatest age of a state."""
-    clamped: int
-    """Cycles in which the last gate changed the command."""
+    invalid: int  # Cycles without an intact reply; those of a requested reboot do not count
+    oldest_ms: float  # Greatest age of a state
+    clamped: int  # Cycles in which the last gate changed the command
     rms_rad: float | None
     """Of position minus the reachable trajectory; None where there was no goal or no position.
 
@@ -60,12 +53,10 @@ class JointTracking:
     settling_ms: float | None
     """The longest time from the end of a reachable trajectory until the joint stayed near where it rests,
     within 2 % of the way or two ticks; None where none ended."""
-    rest_rad: float | None
-    """The greatest error with which it came to rest; None where it never did."""
+    rest_rad: float | None  # The greatest error with which it came to rest; None where it never did
     delay_ms: float | None = None
     """The delay with which the joint follows the goals as they were sent; None where none explains it."""
-    unit: str = "rad"
-    """In which its errors are; m of a linear joint, whatever their names say"""
+    unit: str = "rad"  # In which its errors are; m of a linear joint, whatever their names say
     lost_at: float | None = None
     """Where it was when its servo was lost for the first time; None: it was not, or it is not known."""
 
@@ -138,14 +129,10 @@ def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
 class _Sent:
     """What was sent to a joint in each cycle, and where it was."""
 
-    goal: Floats
-    """rad"""
-    speed: Floats
-    """rad/s, of the way to it"""
-    position: Floats
-    """rad, NaN where it was not read"""
-    steps: Floats
-    """s since the cycle before"""
+    goal: Floats  # rad
+    speed: Floats  # rad/s, of the way to it
+    position: Floats  # rad, NaN where it was not read
+    steps: Floats  # s since the cycle before
 
 
 def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) -> int:
@@ -189,12 +176,10 @@ class Rest:
     """A time in which a joint was to rest."""
 
     begin: int
-    end: int
-    """Its cycles, the last one included"""
+    end: int  # Its cycles, the last one included
     settling_s: float | None
     """From its begin until the joint stayed near where it rests; None where nothing moved before"""
-    error_rad: float
-    """With which it rests"""
+    error_rad: float  # With which it rests
 
 
 def rests(times: Floats, way: Floats, error: Floats, tick: float) -> Iterator[Rest]:
@@ -214,8 +199,7 @@ class _OpenRest:
     way: Floats = field(default_factory=lambda: np.zeros(0))
     error: Floats = field(default_factory=lambda: np.zeros(0))
     lowest: float = math.inf
-    highest: float = -math.inf
-    """Of the desired positions since the last rest, before those that are kept."""
+    highest: float = -math.inf  # Of the desired positions since the last rest, before those that are kept
 
     def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[Rest]:
         """Yield the rests that have ended; with `final` the last one too."""
@@ -269,8 +253,7 @@ class Tracking:
         self._held: NDArray[np.void] | None = None
         """The last two cycles of those that are done: the next ones depend on them."""
         self._rows: list[_Row] = []
-        self.movement = Movement()
-        """Of all that was taken, once it is finished."""
+        self.movement = Movement()  # Of all that was taken, once it is finished
 
     def take(self, log: Log) -> None:
         """Take the cycles of the next slice."""
@@ -320,12 +303,9 @@ class _Row:
     squares: float = 0.0
     worst: float = 0.0
     lowest: float = math.inf
-    highest: float = -math.inf
-    """Of the trajectory, where its velocity is known."""
-    across: float = 0.0
-    """Sum of error times velocity."""
-    moved: float = 0.0
-    """Sum of the squares of the velocity."""
+    highest: float = -math.inf  # Of the trajectory, where its velocity is known
+    across: float = 0.0  # Sum of error times velocity
+    moved: float = 0.0  # Sum of the squares of the velocity
     rest: _OpenRest = field(default_factory=_OpenRest)
     settled_s: float | None = None
     rest_rad: float | None = None

@@ -10,21 +10,16 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 
 STEP_S = 0.02
-_MOST = 8_192
-"""Samples kept, nearly three minutes: of a longer run the first half of them, and the newest."""
+_MOST = 8_192  # Samples kept, nearly three minutes: of a longer run the first half of them, and the newest
 
 
 class Samples(NamedTuple):
     """Quantities by time; NaN where they are not known, and where samples were left out."""
 
-    step_s: float
-    """Between two of them: of a loop below 50 Hz its period"""
-    at_s: Floats
-    """Since the first one, shape (samples,)"""
-    way: Floats
-    """The reachable trajectory, here and in the others of shape (samples, joints)"""
-    position: Floats
-    """Only with torque, in control of a position"""
+    step_s: float  # Between two of them: of a loop below 50 Hz its period
+    at_s: Floats  # Since the first one, shape (samples,)
+    way: Floats  # The reachable trajectory, here and in the others of shape (samples, joints)
+    position: Floats  # Only with torque, in control of a position
     load: Floats
 
 

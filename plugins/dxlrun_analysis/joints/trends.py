@@ -30,21 +30,15 @@ _QUANTITIES = ("temperature", "voltage", "effort")
 
 _VOLTAGE, _HEAT, _OVERLOAD = 0x01, 0x04, 0x20
 _NONSENSE_C = 120.0
-_NEAR_LIMIT_C = 10.0
-"""The run warns at this distance from Temperature Limit, too."""
-_SAG = 0.03
-"""Part of its voltage by which a supply that sags falls."""
-_STEP_V = 0.1
-"""Voltages are read in such steps."""
+_NEAR_LIMIT_C = 10.0  # The run warns at this distance from Temperature Limit, too
+_SAG = 0.03  # Part of its voltage by which a supply that sags falls
+_STEP_V = 0.1  # Voltages are read in such steps
 _LEAST_V = 0.3
 _FEWEST_VOLTAGES = 6
 _FEWEST_OTHERS = 2
-_DIPS_S = 1.5
-"""So long a servo's voltage has to be lower than the others': each is read about once a second."""
-_LOADED = 1.3
-"""So many times the load with which it is not lower is load that pulls it down."""
-_MOST_SAMPLES = 100_000
-"""Voltages kept."""
+_DIPS_S = 1.5  # So long a servo's voltage has to be lower than the others': each is read about once a second
+_LOADED = 1.3  # So many times the load with which it is not lower is load that pulls it down
+_MOST_SAMPLES = 100_000  # Voltages kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +46,12 @@ class Trend:
     """One joint over the run."""
 
     joint: str
-    begin_s: float
-    """Of the first bin, on the run's clock."""
+    begin_s: float  # Of the first bin, on the run's clock
     bin_s: float
-    temperature: Series
-    """deg C"""
-    voltage: Series
-    """V"""
-    effort: Series
-    """Magnitude, in the unit of the joint's effort."""
-    error: Series
-    """Position minus the reachable trajectory, rad or m; only with torque"""
+    temperature: Series  # deg C
+    voltage: Series  # V
+    effort: Series  # Magnitude, in the unit of the joint's effort
+    error: Series  # Position minus the reachable trajectory, rad or m; only with torque
 
 
 class _Sample(NamedTuple):

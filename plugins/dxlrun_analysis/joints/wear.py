@@ -28,39 +28,27 @@ from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.following import STROKE_RAD, Followed, Turn, Visit
 from dxlrun_analysis.joints.kinds import finding
 
-_OTHERS = 3.0
-"""So many times what any other joint shows."""
+_OTHERS = 3.0  # So many times what any other joint shows
 _FEWEST_OTHERS = 4
 _SIDE = re.compile("left|right|(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
-_BEHIND_RAD = 0.03
-"""1.7 deg"""
+_BEHIND_RAD = 0.03  # 1.7 deg
 _FEWEST_TURNS = 2
 _FASTER = 1.2
-_STOOD = 1.2
-"""Part of how far it is behind by which the goal goes back before a joint that has play does."""
-_FEWEST_ALIKE = 3
-"""With so many of its kind a joint needs no time before."""
-_SOFTER = 2.0
-"""So many times its delay at its first turns."""
+_STOOD = 1.2  # Part of how far it is behind by which the goal goes back before a joint that has play does
+_FEWEST_ALIKE = 3  # With so many of its kind a joint needs no time before
+_SOFTER = 2.0  # So many times its delay at its first turns
 _LATE_S = 0.03
-_OFF_RAD = 0.035
-"""2 deg"""
-_LOAD = 0.12
-"""Of its torque"""
+_OFF_RAD = 0.035  # 2 deg
+_LOAD = 0.12  # Of its torque
 _PULLED_S = 0.5
 _FEWEST_VISITS = 3
-_ALIKE = 0.8
-"""Part of the changes of its load that are of one sense"""
-_NOTHING = 1 / 3
-"""Part of its load below which it carries nothing any more."""
-_ALONG = 0.5
-"""Correlation"""
-_JERK_RAD = 0.021
-"""1.2 deg"""
+_ALIKE = 0.8  # Part of the changes of its load that are of one sense
+_NOTHING = 1 / 3  # Part of its load below which it carries nothing any more
+_ALONG = 0.5  # Correlation
+_JERK_RAD = 0.021  # 1.2 deg
 _JERKS = 4
 _APART_S = 0.15
-_SWINGS = 10
-"""In a row, to and fro being two"""
+_SWINGS = 10  # In a row, to and fro being two
 
 
 class _Seen(NamedTuple):
@@ -71,8 +59,7 @@ class _Seen(NamedTuple):
     visits: list[Visit]
     jerks: Floats
     swings: Floats
-    most: dict[str, float]
-    """The most that it shows of each quantity, 0.0 at least"""
+    most: dict[str, float]  # The most that it shows of each quantity, 0.0 at least
 
     def does(self, code: str, since_s: float, text: str) -> Finding:
         """Return the finding about it; `text`: what it does, behind its name."""
@@ -258,5 +245,4 @@ def _deg(rad: float) -> str:
     return f"{math.degrees(rad):.1f} deg"
 
 
-_RULES = (_turns_badly, _takes_more, _hunts, _pulled, _jerked)
-"""The most direct evidence first"""
+_RULES = (_turns_badly, _takes_more, _hunts, _pulled, _jerked)  # The most direct evidence first

@@ -19,8 +19,7 @@ REAL_TIME: Policy = "round_robin"
 
 SHORTEST_NS, LONGEST_NS = 10_000, 1_000_000_000
 """Of a period: from the highest rate of a robot file, 100 kHz, to the lowest that a run takes."""
-MOST_ITERATIONS = 10_000_000
-"""Of a condition; 16 bytes each."""
+MOST_ITERATIONS = 10_000_000  # Of a condition; 16 bytes each
 LONGEST_S = 24 * 3600.0
 MOST_BLOCKS = 1000
 
@@ -29,8 +28,7 @@ MOST_BLOCKS = 1000
 class Condition:
     """One way to wait for a deadline: dxlrun's own with a policy, or the program in C with one."""
 
-    name: str
-    """As it is written in --compare: other, round_robin, fifo, c."""
+    name: str  # As it is written in --compare: other, round_robin, fifo, c
     policy: Policy
 
     @property
@@ -48,18 +46,15 @@ class Condition:
 class Settings:
     """A measurement: wake-ups of each condition, in blocks."""
 
-    iterations: int
-    """Of each condition, in all blocks together."""
+    iterations: int  # Of each condition, in all blocks together
     period_ns: int
     priority: int
     conditions: tuple[Condition, ...]
     blocks: int
-    cores: tuple[int, ...] = ()
-    """Where all conditions run; empty: anywhere."""
+    cores: tuple[int, ...] = ()  # Where all conditions run; empty: anywhere
     polling_ns: int | None = None
     """Longest time that the clock is polled before a deadline; None: a tenth of the period, as in a run."""
-    idle_latency: bool = False
-    """Cores are kept from deep idle states meanwhile."""
+    idle_latency: bool = False  # Cores are kept from deep idle states meanwhile
 
     @property
     def seconds(self) -> float:

@@ -30,10 +30,8 @@ from dxlrun.run.run_log import epoch_offset_ns
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 
-ROBOT = "latency"
-"""Stands where the logs of runs have the robot's name."""
-METADATA_NAME = "latency"
-"""The metadata record that makes a log one of a measurement."""
+ROBOT = "latency"  # Stands where the logs of runs have the robot's name
+METADATA_NAME = "latency"  # The metadata record that makes a log one of a measurement
 _TOPIC = "/latency/"
 _PACKAGE = "dxlrun_msgs"
 _AT_ONCE = 10_000

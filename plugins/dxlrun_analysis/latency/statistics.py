@@ -24,16 +24,12 @@ Times = NDArray[np.int64]
 class Block:
     """Wake-ups that one process measured in a row."""
 
-    condition: str
-    """Name."""
+    condition: str  # Name
     number: int
     times: Times
-    cpu_ns: int = 0
-    """Processor time of the process meanwhile."""
-    wall_ns: int = 0
-    """The same in time that passed; 0 where the block was broken off."""
-    margin_ns: int = 0
-    """How long the clock was polled before each deadline."""
+    cpu_ns: int = 0  # Processor time of the process meanwhile
+    wall_ns: int = 0  # The same in time that passed; 0 where the block was broken off
+    margin_ns: int = 0  # How long the clock was polled before each deadline
 
     @property
     def late_us(self) -> NDArray[np.float64]:
@@ -47,8 +43,7 @@ class Interval:
     """Mean of the blocks' values, with the 95 % confidence interval of Student's t."""
 
     mean: float
-    low: float | None
-    """None with a single block."""
+    low: float | None  # None with a single block
     high: float | None
 
 
@@ -60,25 +55,20 @@ class Figures:
     label: str
     policy: str
     wake_ups: int
-    skipped: int
-    """Deadlines that had passed before the wait for them could begin."""
+    skipped: int  # Deadlines that had passed before the wait for them could begin
     max_us: float
     mean_us: float
-    deviation_us: float
-    """Standard deviation of the population."""
-    mode_us: int
-    """Lower edge of the fullest bin of 1 us; the smallest where several are as full."""
+    deviation_us: float  # Standard deviation of the population
+    mode_us: int  # Lower edge of the fullest bin of 1 us; the smallest where several are as full
     share_over_150_us: float
     share_over_1_ms: float
     median_us: float
     p99_us: float
     p999_us: float
-    processor_share: float | None
-    """Of one core, over the blocks that were finished; None: none was."""
+    processor_share: float | None  # Of one core, over the blocks that were finished; None: none was
     polling_us: float
     """How long before each deadline the clock was polled, on average over the blocks; 0: never."""
-    over_blocks: dict[str, Interval]
-    """mean_us, median_us, p99_us of each whole block, or of what there is."""
+    over_blocks: dict[str, Interval]  # mean_us, median_us, p99_us of each whole block, or of what there is
     ratios: dict[str, Interval]
     """mean_us, p99_us of each block divided by those of the reference in the same block."""
 
@@ -91,12 +81,9 @@ class Result:
     period_us: float
     priority: int
     blocks: int
-    load: str
-    """In words; empty: none."""
-    reference: str
-    """Name of the condition that the others are divided by; empty: there is only one."""
-    conditions: tuple[Figures, ...]
-    """Those that have wake-ups."""
+    load: str  # In words; empty: none
+    reference: str  # Name of the condition that the others are divided by; empty: there is only one
+    conditions: tuple[Figures, ...]  # Those that have wake-ups
     remarks: tuple[str, ...]
 
 

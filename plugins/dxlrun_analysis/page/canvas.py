@@ -38,19 +38,14 @@ BLUE, ORANGE, GREEN, PURPLE = "#1f66cc", "#d9620a", "#12896b", "#8248b8"
 WARNING, ERROR = "#a86a00", "#c0241b"
 MANY = (BLUE, ORANGE, GREEN, PURPLE, ERROR, "#0e8aa8", "#8a5a2b", "#c23c86", "#6b7f00", INK)
 _DASHES = ("solid", "dashed", "dotted", "dotdash")
-TIME = "time"
-"""Name of the range that all plots of the run's time share."""
+TIME = "time"  # Name of the range that all plots of the run's time share
 _TIME_LABEL = "time since the first deadline, s"
 _TOOLS = "xpan,xwheel_zoom,reset,save"
-_LEFT = 78
-"""Pixels left of all plots, so that their times stand above one another."""
+_LEFT = 78  # Pixels left of all plots, so that their times stand above one another
 _ALIKE = 0.95
-_DURATIONS = tuple(10**exponent for exponent in range(8))
-"""us, from 1 us to 10 s."""
-_FEW_BANDS = 5
-"""More bands over one another would hide the curves."""
-_FEW_ROWS = 60
-"""So few rows are drawn with a dot each."""
+_DURATIONS = tuple(10**exponent for exponent in range(8))  # us, from 1 us to 10 s
+_FEW_BANDS = 5  # More bands over one another would hide the curves
+_FEW_ROWS = 60  # So few rows are drawn with a dot each
 _FONT = "DejaVu Sans, Verdana, system-ui, sans-serif"
 _START = """
 const plots = JSON.parse(document.getElementById("plots").textContent);
@@ -68,10 +63,8 @@ document.addEventListener("click", ({target}) => {
 class Line:
     """A curve in a plot."""
 
-    curve: str
-    """Its name among the curves."""
-    name: str
-    """For the legend."""
+    curve: str  # Its name among the curves
+    name: str  # For the legend
     colour: str
     dash: str = "solid"
     width: float = 1.2
@@ -109,8 +102,7 @@ class Plot:
     title: str
     label: str
     """What it shows, for readers who cannot see it, where it has no title: at first its vertical axis'."""
-    text: str
-    """Its caption: what is drawn and what is found."""
+    text: str  # Its caption: what is drawn and what is found
     model: bokeh_figure
     _legend: list[Element] = field(default_factory=list)
 
@@ -176,15 +168,11 @@ class Plot:
 class Canvas:
     """The plots of one page. Times are ns of the run's clock; plots show s since the first deadline."""
 
-    start_ns: int
-    """The first deadline."""
+    start_ns: int  # The first deadline
     begin_ns: int
-    end_ns: int
-    """From `begin_ns` to `end_ns` the plots show the run at first."""
-    pauses: Sequence[tuple[float, float]] = ()
-    """Shaded: begin and end, s."""
-    changes: Sequence[float] = ()
-    """When the run was steered, s: a dotted line each."""
+    end_ns: int  # From `begin_ns` to `end_ns` the plots show the run at first
+    pauses: Sequence[tuple[float, float]] = ()  # Shaded: begin and end, s
+    changes: Sequence[float] = ()  # When the run was steered, s: a dotted line each
     time: Range1d = field(init=False)
     _plots: list[Plot] = field(default_factory=list)
     _sources: list[tuple[Curves, ColumnDataSource]] = field(default_factory=list)

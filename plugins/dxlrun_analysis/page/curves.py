@@ -19,27 +19,20 @@ BYTES_OF_CURVES = 7_000_000
 """Of all curves of the cycles in a page, before they are text: 4 bytes a number, two numbers a row."""
 _FEWEST_ROWS, _MOST_ROWS = 100, 6000
 _BYTES_A_VALUE = 8
-_PART_OF_WINDOWS = 2 / 3
-"""Of the rows; the rest are bins of the whole run."""
-_AT_ONCE = 4096
-"""So many cycles are laid in bins together."""
+_PART_OF_WINDOWS = 2 / 3  # Of the rows; the rest are bins of the whole run
+_AT_ONCE = 4096  # So many cycles are laid in bins together
 _GAP_NS = 500_000_000
-_GAP_PERIODS = 3
-"""A longer time without cycles is a gap in the curves."""
-_WINDOW_NS = 1_000_000_000
-"""Around a worst cycle."""
-LEAST_US = 1.0
-"""Earlier wake-ups are drawn here: the axis is logarithmic."""
-_LEAST_NS = 100
-"""Steps that took less, or no time at all on virtual time, are drawn here."""
+_GAP_PERIODS = 3  # A longer time without cycles is a gap in the curves
+_WINDOW_NS = 1_000_000_000  # Around a worst cycle
+LEAST_US = 1.0  # Earlier wake-ups are drawn here: the axis is logarithmic
+_LEAST_NS = 100  # Steps that took less, or no time at all on virtual time, are drawn here
 _QUANTITIES = ("position", "velocity", "effort")
 _JOINT_FIELDS = (
     *(f"{kind}{quantity}" for quantity in _QUANTITIES for kind in ("", "goal_", "command_")),
     "temperature",
     "voltage",
 )
-_GOAL = "goal_position"
-"""Fields of a cycle with a number a joint that become curves of that name."""
+_GOAL = "goal_position"  # Fields of a cycle with a number a joint that become curves of that name
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +75,7 @@ class CurvesOfRun:
     windows: tuple[tuple[int, int], ...]
     """Where the curves of the cycles have every sample: begin and end, ns of the run's clock."""
     begin_ns: int
-    end_ns: int
-    """From the first cycle to the last, by their deadlines."""
+    end_ns: int  # From the first cycle to the last, by their deadlines
 
 
 def joint_curve(field: str, joint: str) -> str:

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Samples = NDArray[np.float32]
-"""Shape (rows, curves); NaN: no value."""
-Times = NDArray[np.int64]
-"""Shape (rows,), ns."""
+Samples = NDArray[np.float32]  # Shape (rows, curves); NaN: no value
+Times = NDArray[np.int64]  # Shape (rows,), ns
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,7 @@ from dxlrun.errors import counted
 from dxlrun.log.reader import Log
 from dxlrun_analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
 
-MOST_EVENTS = 1500
-"""Of each grade the first are kept."""
+MOST_EVENTS = 1500  # Of each grade the first are kept
 _LONGEST = 200
 _GRADES = (
     ("information", "circle", BLUE, 5),

@@ -17,8 +17,7 @@ from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope
 
 MOST_ROWS = 600
-MOST_CORES = 10
-"""Curves of cores in a plot: the loop's and those that are the busiest."""
+MOST_CORES = 10  # Curves of cores in a plot: the loop's and those that are the busiest
 _BIN_NS = 1_000_000_000
 _GAP_NS = 5_000_000_000
 _OF_A_CORE = ("busy", "interrupts", "steal", "frequency")
@@ -42,8 +41,7 @@ class MachineCollector:
     def __init__(self) -> None:
         self._cores = 0
         self._envelope: Envelope | None = None
-        self._loop: dict[int, int] = {}
-        """On which cores the loop ran, and in how many samples."""
+        self._loop: dict[int, int] = {}  # On which cores the loop ran, and in how many samples
 
     def take(self, log: Log) -> None:
         """Take the samples of the next slice. Raises LogError when one cannot be read."""

@@ -32,8 +32,7 @@ from dxlrun_analysis.report import (
 
 _MOST_EVENTS = 100
 _MARKED = ("switch", "rate", "load", "unload", "policy")
-_FEW_CHANGES = 60
-"""More lines would bury the curves."""
+_FEW_CHANGES = 60  # More lines would bury the curves
 
 
 def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> tuple[Report, str]:
@@ -64,13 +63,11 @@ def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
 class _Run(NamedTuple):
     """What the page shows of a log."""
 
-    log: Log
-    """Without cycles, and with the events that a page can name."""
+    log: Log  # Without cycles, and with the events that a page can name
     curves: CurvesOfRun
     replies: Curves
     machine: Curves
-    cores: tuple[int, ...]
-    """Those that are drawn."""
+    cores: tuple[int, ...]  # Those that are drawn
     canvas: Canvas
 
 

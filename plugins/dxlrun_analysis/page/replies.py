@@ -11,12 +11,10 @@ from dxlrun_analysis.page.envelope import Envelope
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges
 
-BYTES_OF_REPLIES = 1_000_000
-"""In a page, before they are text: 4 bytes a number, two numbers a row and curve."""
+BYTES_OF_REPLIES = 1_000_000  # In a page, before they are text: 4 bytes a number, two numbers a row and curve
 _FEWEST_ROWS, _MOST_ROWS = 50, 1500
 _BYTES_A_VALUE = 8
-_BIN_NS = 1_000_000
-"""Of a bin at first."""
+_BIN_NS = 1_000_000  # Of a bin at first
 
 
 class ReplyCollector:

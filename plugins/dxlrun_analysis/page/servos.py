@@ -12,8 +12,7 @@ from dxlrun_analysis.page.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
-_ROW = 17
-"""Pixels a servo."""
+_ROW = 17  # Pixels a servo
 
 
 def reply_plots(canvas: Canvas, replies: Curves, servos: Sequence[ServoTraffic]) -> list[Plot]:

@@ -25,10 +25,8 @@ _SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.9
 class WakeUps(NamedTuple):
     """Wake-ups that belong together."""
 
-    line: Line
-    """Of their lateness in us, among the curves."""
-    bins: NDArray[np.int64]
-    """As `late_bins` returns them."""
+    line: Line  # Of their lateness in us, among the curves
+    bins: NDArray[np.int64]  # As `late_bins` returns them
 
 
 def wake_up_plots(

@@ -13,12 +13,9 @@ from dxlrun_analysis.cycles.worst import TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import BLUE, ERROR, GREEN, INK, MUTED, ORANGE, WARNING, Canvas, Plot
 
 MOST_CYCLES = 5
-MOST_PACKETS = 400
-"""Of one cycle: noise may come in any number of pieces."""
-_ROW = 17
-"""Pixels a row."""
-_MS = 10_000
-"""us; longer cycles are drawn in ms."""
+MOST_PACKETS = 400  # Of one cycle: noise may come in any number of pieces
+_ROW = 17  # Pixels a row
+_MS = 10_000  # us; longer cycles are drawn in ms
 _KINDS = (
     ("instruction", "instruction", ORANGE),
     ("status", "reply", BLUE),

@@ -45,8 +45,7 @@ _TYPES: Mapping[str, tuple[What, Codec]] = {
 BAG_FILE = "metadata.yaml"
 _MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _JUST_BEFORE_S = 1e-6
-_CDR = b"\x00\x01"
-"""CDR, little-endian; the two bytes behind it count the padding at the end."""
+_CDR = b"\x00\x01"  # CDR, little-endian; the two bytes behind it count the padding at the end
 
 
 class _Found(NamedTuple):
@@ -54,8 +53,7 @@ class _Found(NamedTuple):
 
     topic: str
     type: str
-    t_ns: int
-    """When it was recorded."""
+    t_ns: int  # When it was recorded
     data: bytes
 
 
@@ -64,10 +62,8 @@ class _Recording(msgspec.Struct, frozen=True):
 
     path: Path
     messages: list[_Found]
-    topics: dict[str, str]
-    """All topics, with their types."""
-    remarks: list[str]
-    """A sentence for each thing that could not be read."""
+    topics: dict[str, str]  # All topics, with their types
+    remarks: list[str]  # A sentence for each thing that could not be read
 
 
 class _Moments(NamedTuple):
@@ -77,10 +73,8 @@ class _Moments(NamedTuple):
     what: What
     start_ns: int
     joints: tuple[str, ...]
-    after_s: Floats
-    """Since the start, shape (moments,)"""
-    position: Floats
-    """Shape (moments, joints), rad"""
+    after_s: Floats  # Since the start, shape (moments,)
+    position: Floats  # Shape (moments, joints), rad
 
 
 def is_foreign(path: Path) -> bool:

@@ -20,18 +20,15 @@ from dxlrun.plan.robot_plan import from_json
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import PINION_M, SplinePath, fit
 
-LEAD_S = 1.0
-"""Before the first point: controllers lead their joints there meanwhile, as in the thesis."""
-_STEP_S = 0.02
-"""Between two points of a controller that takes single positions."""
+LEAD_S = 1.0  # Before the first point: controllers lead their joints there meanwhile, as in the thesis
+_STEP_S = 0.02  # Between two points of a controller that takes single positions
 
 
 class MotionFile(msgspec.Struct, frozen=True):
     """What is written."""
 
     text: str
-    points: Mapping[str, int]
-    """By controller."""
+    points: Mapping[str, int]  # By controller
 
 
 class _Part(msgspec.Struct, frozen=True):
@@ -39,10 +36,8 @@ class _Part(msgspec.Struct, frozen=True):
 
     controller: str
     joints: tuple[str, ...]
-    trajectory: bool
-    """It takes points with their velocities; else one position after the other."""
-    speeds: bool = False
-    """It takes a speed beside each single position."""
+    trajectory: bool  # It takes points with their velocities; else one position after the other
+    speeds: bool = False  # It takes a speed beside each single position
 
 
 def motion_file(
@@ -99,8 +94,7 @@ def _points(part: _Part, path: SplinePath, linear: Set[str]) -> Iterator[str]:
         yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, linear)}}}}}"
 
 
-_SLOWEST = 0.05
-"""rad/s beside a single position: at 0 a servo would not get there."""
+_SLOWEST = 0.05  # rad/s beside a single position: at 0 a servo would not get there
 
 
 def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, linear: Set[str]) -> str:

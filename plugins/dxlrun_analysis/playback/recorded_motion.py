@@ -19,23 +19,18 @@ What: TypeAlias = Literal["goals", "states"]
 
 LONGEST_HOLE_S = 1.0
 """Between two moments of a joint: where nothing is known for longer, there is no motion to play."""
-MOST_NUMBERS = 8_000_000
-"""Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour."""
+MOST_NUMBERS = 8_000_000  # Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour
 
 
 class Series(msgspec.Struct, frozen=True, eq=False):
     """The positions of one joint."""
 
-    time_s: Floats
-    """Shape (moments,), s since the recording's beginning."""
-    position: Floats
-    """Shape (moments,), rad."""
-    what: What
-    """Goals that it was sent, or states that were measured."""
+    time_s: Floats  # Shape (moments,), s since the recording's beginning
+    position: Floats  # Shape (moments,), rad
+    what: What  # Goals that it was sent, or states that were measured
     continued: bool = False
     """True: between two moments the joint goes from one to the other, however far apart they are."""
-    linear: bool = False
-    """Its positions are m."""
+    linear: bool = False  # Its positions are m
 
     def ordered(self) -> Series:
         """Return the finite ones in order of time; of several at one time the last."""
@@ -57,20 +52,13 @@ class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
 
     path: Path
     joints: tuple[str, ...]
-    what: tuple[What, ...]
-    """Of each joint."""
-    time_s: Floats
-    """Shape (moments,), growing, from 0."""
-    position: Floats
-    """Shape (moments, joints), rad."""
-    begin_s: float
-    """Of the recording, where the motion begins."""
-    linear: tuple[bool, ...]
-    """Which of the joints are in m, by the plan of the run."""
-    remarks: tuple[str, ...] = ()
-    """A sentence for each thing that could not be read."""
-    plan: bytes | None = None
-    """The plan of the run, as JSON; None: a foreign recording."""
+    what: tuple[What, ...]  # Of each joint
+    time_s: Floats  # Shape (moments,), growing, from 0
+    position: Floats  # Shape (moments, joints), rad
+    begin_s: float  # Of the recording, where the motion begins
+    linear: tuple[bool, ...]  # Which of the joints are in m, by the plan of the run
+    remarks: tuple[str, ...] = ()  # A sentence for each thing that could not be read
+    plan: bytes | None = None  # The plan of the run, as JSON; None: a foreign recording
 
     @property
     def duration_s(self) -> float:

@@ -14,14 +14,10 @@ from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import SplinePath, fit, tolerances
 
-LEAST_SPEED, MOST_SPEED = 0.01, 10.0
-"""Factors on a motion's speed, as of `dxlrun play`."""
-MOST_NUMBERS = 500_000
-"""Of all rows: what a sample_player keeps of one table."""
-LONGEST_PERIOD_S = 0.02
-"""Between two rows, where there would be too many with one in each cycle."""
-WINDOW_S = 0.05
-"""Over which speeds and accelerations are measured."""
+LEAST_SPEED, MOST_SPEED = 0.01, 10.0  # Factors on a motion's speed, as of `dxlrun play`
+MOST_NUMBERS = 500_000  # Of all rows: what a sample_player keeps of one table
+LONGEST_PERIOD_S = 0.02  # Between two rows, where there would be too many with one in each cycle
+WINDOW_S = 0.05  # Over which speeds and accelerations are measured
 RAMP_S = 0.3
 """For which the motion becomes faster at its beginning and slower at its end, wherever it was cut."""
 
@@ -32,12 +28,9 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
     motion: RecordedMotion
     speed: float
     period_s: float
-    at_s: Floats
-    """Shape (rows,)"""
-    recorded_s: Floats
-    """The time of the motion in each row."""
-    positions: Floats
-    """Shape (rows, joints), rad."""
+    at_s: Floats  # Shape (rows,)
+    recorded_s: Floats  # The time of the motion in each row
+    positions: Floats  # Shape (rows, joints), rad
 
     @property
     def joints(self) -> tuple[str, ...]:

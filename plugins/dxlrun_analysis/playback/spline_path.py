@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 
 GOAL_TOLERANCE = math.radians(0.1)
-PINION_M = 0.01
-"""Radius: 1 rad is 10 mm. [i]"""
+PINION_M = 0.01  # Radius: 1 rad is 10 mm. [i]
 STATE_TOLERANCE = math.radians(0.5)
 """More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
 _OVERSHOOT = 27 / 8
@@ -30,12 +29,9 @@ this slope, times the tolerance, by half of that."""
 class SplinePath(msgspec.Struct, frozen=True, eq=False):
     """A motion by knots; between them it is cubic."""
 
-    time_s: Floats
-    """Shape (knots,), growing, from 0."""
-    position: Floats
-    """Shape (knots, joints), rad."""
-    velocity: Floats
-    """Shape (knots, joints), rad/s."""
+    time_s: Floats  # Shape (knots,), growing, from 0
+    position: Floats  # Shape (knots, joints), rad
+    velocity: Floats  # Shape (knots, joints), rad/s
 
     @property
     def duration_s(self) -> float:

@@ -48,10 +48,8 @@ class Comparison:
         self, plan: LoopPlan, inputs: RecordedInputs, manager: Manager, hardware: RecordedHardware
     ) -> None:
         self.first: ReplayDifference | None = None
-        self.compared = 0
-        """Cycles."""
-        self.different = 0
-        """Cycles in which anything differs."""
+        self.compared = 0  # Cycles
+        self.different = 0  # Cycles in which anything differs
         self._plan = plan
         self._inputs = inputs
         self._manager, self._hardware = manager, hardware

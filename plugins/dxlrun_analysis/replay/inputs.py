@@ -30,8 +30,7 @@ class RecordedClock:
 
     def __init__(self, now_ns: int) -> None:
         self._now_ns = now_ns
-        self.wake_ns = now_ns
-        """When the next wait ends."""
+        self.wake_ns = now_ns  # When the next wait ends
 
     def now_ns(self) -> int:
         """Return recorded time, ns."""
@@ -69,11 +68,9 @@ class RecordedHardware:
         self._record = record
         self._clock = clock
         self._stop = stop
-        self._outside = len(inputs.plan.loop.sources)
-        """Sources that are no controllers: they come first."""
+        self._outside = len(inputs.plan.loop.sources)  # Sources that are no controllers: they come first
         self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
-        self.index = 0
-        """Of the cycle that is replayed."""
+        self.index = 0  # Of the cycle that is replayed
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Fill states and goals with those of the activation."""

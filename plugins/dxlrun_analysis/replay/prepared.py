@@ -43,8 +43,7 @@ class PreparedComparison:
         self.first: ReplayDifference | None = None
         self.compared = 0
         self.different = 0
-        self.without_request = 0
-        """Commands whose request is not in the log."""
+        self.without_request = 0  # Commands whose request is not in the log
         self._parameters: dict[str, list[ParametersModel]] = {}
         """All that a controller had until now: one of a client may have been prepared shortly before others
         became valid."""

@@ -24,8 +24,7 @@ from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
 from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"
-_LIBRARIES = ("dxlrun", "numpy")
-"""A different version of these may change a command."""
+_LIBRARIES = ("dxlrun", "numpy")  # A different version of these may change a command
 
 
 class _Begun(msgspec.Struct):
@@ -49,42 +48,31 @@ class ReplayDifference(msgspec.Struct, frozen=True):
     """One value that is not the same."""
 
     cycle: int
-    time_s: float
-    """Of the cycle's wake-up, since the loop's first deadline."""
+    time_s: float  # Of the cycle's wake-up, since the loop's first deadline
     what: str
     """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
     """None: a controller was active in one of the two and not in the other, or a message differs."""
-    controller: str | None
-    """The one that claims the joint, or commands the reference; None when none does."""
-    recorded: str
-    """The shortest number with these bits, and the bits where they are not a finite number's."""
+    controller: str | None  # The one that claims the joint, or commands the reference; None when none does
+    recorded: str  # The shortest number with these bits, and the bits where they are not a finite number's
     replayed: str
 
 
 class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
     """The inputs of one run."""
 
-    log: Log
-    """All that the log has, but packets and topics; of its cycles the scalars."""
+    log: Log  # All that the log has, but packets and topics; of its cycles the scalars
     plan: RecordedPlan
     loop: LoopPlan
     """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
     policy where the run did, not by itself."""
-    activation: np.void
-    """States and goals when the controllers were activated."""
-    start_ns: int
-    """Deadline of cycle 0."""
-    steered: tuple[ClientCommand, ...]
-    """The commands from outside."""
-    end: int
-    """How many cycles can be compared, from the first on; one at least."""
-    ends: int
-    """Index of the first cycle that is a policy's; in those the controllers are not active."""
-    kept: KeptStates
-    """What controllers began with that they had kept in earlier runs."""
-    stopped: str
-    """Why some cycles cannot be compared; empty when all can."""
+    activation: np.void  # States and goals when the controllers were activated
+    start_ns: int  # Deadline of cycle 0
+    steered: tuple[ClientCommand, ...]  # The commands from outside
+    end: int  # How many cycles can be compared, from the first on; one at least
+    ends: int  # Index of the first cycle that is a policy's; in those the controllers are not active
+    kept: KeptStates  # What controllers began with that they had kept in earlier runs
+    stopped: str  # Why some cycles cannot be compared; empty when all can
 
     def difference(  # noqa: PLR0917  what a difference is made of
         self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str

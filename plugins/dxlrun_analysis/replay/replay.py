@@ -38,28 +38,18 @@ class ReplayReport(msgspec.Struct, frozen=True):
 
     log: str
     robot: str
-    cycles: int
-    """That the log has."""
-    compared: int
-    """The first so many."""
-    last: int
-    """Number of the last of these."""
-    different: int
-    """Cycles in which anything differs."""
+    cycles: int  # That the log has
+    compared: int  # The first so many
+    last: int  # Number of the last of these
+    different: int  # Cycles in which anything differs
     first: ReplayDifference | None
-    joints: tuple[JointDifferences, ...]
-    """Those of which anything differs."""
-    fault: str
-    """Why the replay ended before the run did; empty when it did not."""
-    stopped: str
-    """Why not all cycles were compared; empty when they were, or when `fault` is the reason."""
-    remarks: tuple[str, ...]
-    """Other versions, damage of the log."""
-    messages: int = 0
-    """Messages of topics that were compared, or are in one of the two only."""
+    joints: tuple[JointDifferences, ...]  # Those of which anything differs
+    fault: str  # Why the replay ended before the run did; empty when it did not
+    stopped: str  # Why not all cycles were compared; empty when they were, or when `fault` is the reason
+    remarks: tuple[str, ...]  # Other versions, damage of the log
+    messages: int = 0  # Messages of topics that were compared, or are in one of the two only
     different_messages: int = 0
-    prepared: int = 0
-    """Commands that were prepared again."""
+    prepared: int = 0  # Commands that were prepared again
     different_prepared: int = 0
     unprepared: int = 0
     """Commands whose request the log does not have: it was too long, or its dxlrun is an older one."""

@@ -30,8 +30,7 @@ from dxlrun_analysis.season.pools import processes
 
 Row = dict[str, object]
 Progress = Callable[[str, float], None]
-_MEASUREMENT = "latency"
-"""The metadata record of a log that `dxlrun latency` wrote."""
+_MEASUREMENT = "latency"  # The metadata record of a log that `dxlrun latency` wrote
 _LOG, _LEDGER = ".mcap", ".ledger.jsonl"
 _ENDED = "the process that read it ended: it crashed, or had too little memory"
 _SETTLED_NS = 2_000_000_000
@@ -120,10 +119,8 @@ _KEPT = SCHEMA.append(pa.field("stamp", _TEXT))
 class FoundLog(NamedTuple):
     """One log below the directory."""
 
-    name: str
-    """Its path from there."""
-    path: Path
-    """A file, or the directory of a log in parts."""
+    name: str  # Its path from there
+    path: Path  # A file, or the directory of a log in parts
     files: tuple[Path, ...]
 
     @property
@@ -143,8 +140,7 @@ class Folder(NamedTuple):
 
     directory: Path
     logs: tuple[FoundLog, ...]
-    others: tuple[str, ...]
-    """Files that are no logs, and do not belong to one."""
+    others: tuple[str, ...]  # Files that are no logs, and do not belong to one
 
 
 def find_logs(directory: Path) -> Folder:

@@ -14,10 +14,8 @@ from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
 
 _FEWEST = 5
-_BESIDE = 12
-"""Bytes of a status packet beside its data, at most; others that came belong to another sender."""
-_ALONE = 0.7
-"""Share of the exchanges of a bus with such bytes from which they are one ID's."""
+_BESIDE = 12  # Bytes of a status packet beside its data, at most; others that came belong to another sender
+_ALONE = 0.7  # Share of the exchanges of a bus with such bytes from which they are one ID's
 
 
 class BrokenReplies:
@@ -27,8 +25,7 @@ class BrokenReplies:
         self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
         """Of each servo; of these as the first of several, none of them intact; and at the end of a shared
         status packet."""
-        self._noisy = np.zeros(buses, np.int64)
-        """Exchanges of each bus."""
+        self._noisy = np.zeros(buses, np.int64)  # Exchanges of each bus
 
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""

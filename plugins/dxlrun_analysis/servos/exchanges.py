@@ -20,21 +20,16 @@ from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
 
-IDS = 256
-"""A servo is one number: that of its bus times this, plus its ID."""
-_ROWS = 40
-"""Bits of an exchange's index in a key; above them the servo."""
-_BYTE_NS = 10_000_000_000
-"""Ten bits a byte, over the rate in bit/s."""
+IDS = 256  # A servo is one number: that of its bus times this, plus its ID
+_ROWS = 40  # Bits of an exchange's index in a key; above them the servo
+_BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
 _PING, _READ = 0x01, 0x02
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
-_HEAD_2 = 8
-"""Bytes before error, ID and data of the blocks of a fast status packet."""
-_LATEST_NS = 100_000_000
-"""A block of a fast status packet that comes later is taken for noise."""
+_HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
+_LATEST_NS = 100_000_000  # A block of a fast status packet that comes later is taken for noise
 _MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
 """Odd weights of a multilinear hash (Dietzfelbinger 1996): two instructions hardly ever have the same."""
 
@@ -46,18 +41,15 @@ class LoggedRequest(NamedTuple):
     """The replies that one instruction requests: from which servos, with how many bytes of data each."""
 
     servo_ids: tuple[int, ...] = ()
-    sizes: tuple[int, ...] = ()
-    """Bytes of data a servo; only for reads of several servos."""
-    fast: bool = False
-    """All answer in one status packet."""
+    sizes: tuple[int, ...] = ()  # Bytes of data a servo; only for reads of several servos
+    fast: bool = False  # All answer in one status packet
 
 
 class Requests(NamedTuple):
     """All different requests: none, of each servo by itself, then as found; columns of shape (requests,)."""
 
     kinds: tuple[LoggedRequest, ...] = ()
-    servos: Numbers = np.zeros(0, np.int64)
-    """How many each asks."""
+    servos: Numbers = np.zeros(0, np.int64)  # How many each asks
     fast: Flags = np.zeros(0, np.bool_)
     places: Numbers = np.zeros((0, IDS), np.int64)
     """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
@@ -88,91 +80,62 @@ class Exchanges(NamedTuple):
     """
 
     buses: tuple[LoggedBus, ...]
-    requests: Requests
-    """By `request`."""
+    requests: Requests  # By `request`
     bus: Numbers
-    cycle: Numbers
-    """Number of the cycle of the instruction; of the first of each bus -1."""
-    request: Numbers
-    """Index in `requests`."""
-    asked_ns: Numbers
-    """Before the write() of the instruction."""
-    blocked_ns: Numbers
-    """How long the write() took beyond the wire's time, where the rate is known."""
-    sent_ns: Numbers
-    """When the line had carried it, by its rate."""
-    last_ns: Numbers
-    """After the last reply; where there is none, `sent_ns`."""
+    cycle: Numbers  # Number of the cycle of the instruction; of the first of each bus -1
+    request: Numbers  # Index in `requests`
+    asked_ns: Numbers  # Before the write() of the instruction
+    blocked_ns: Numbers  # How long the write() took beyond the wire's time, where the rate is known
+    sent_ns: Numbers  # When the line had carried it, by its rate
+    last_ns: Numbers  # After the last reply; where there is none, `sent_ns`
     ended: Flags
     """False: the log ends before the next instruction, so a missing reply may have come a moment later."""
-    noise: Numbers
-    """Bytes that belong to no intact packet."""
+    noise: Numbers  # Bytes that belong to no intact packet
     replies: Replies
     due: Due
     late: Late
-    others: PacketColumns
-    """Instructions of other hosts on the line."""
-    echoes: Numbers
-    """The bus of each own instruction that came back."""
-    unasked: Numbers
-    """The servo of each intact reply that no instruction of this host asks for."""
-    stray: PacketColumns
-    """Bytes that belong to no intact packet."""
+    others: PacketColumns  # Instructions of other hosts on the line
+    echoes: Numbers  # The bus of each own instruction that came back
+    unasked: Numbers  # The servo of each intact reply that no instruction of this host asks for
+    stray: PacketColumns  # Bytes that belong to no intact packet
 
 
 class Replies(NamedTuple):
     """What came of single servos, of a fast status packet several; shape (replies,), in order of time."""
 
-    exchange: Numbers
-    """Index in the exchanges."""
+    exchange: Numbers  # Index in the exchanges
     servo: Numbers
-    place: Numbers
-    """In the replies that the instruction requests; -1: it does not."""
-    error: Numbers
-    """The error byte."""
+    place: Numbers  # In the replies that the instruction requests; -1: it does not
+    error: Numbers  # The error byte
     protocol: Numbers
-    wire_ns: Numbers
-    """How long the line needs for the status packet."""
-    last_ns: Numbers
-    """After the read() of the status packet's last byte."""
+    wire_ns: Numbers  # How long the line needs for the status packet
+    last_ns: Numbers  # After the read() of the status packet's last byte
     before_ns: Numbers
     """That of the status packet before it in its exchange; when the instruction was sent, for the first."""
-    due_ns: Numbers
-    """When it would have been there by wire and return delay, with all replies before it."""
-    answers: Flags
-    """True: requested, in time, and the servo's first in the exchange."""
-    strange: Flags
-    """True: a whole status packet of one servo that its exchange does not request."""
+    due_ns: Numbers  # When it would have been there by wire and return delay, with all replies before it
+    answers: Flags  # True: requested, in time, and the servo's first in the exchange
+    strange: Flags  # True: a whole status packet of one servo that its exchange does not request
 
 
 @unique
 class Loss(IntEnum):
     """Whose loss a missing reply is, as far as its exchange shows it."""
 
-    NONE = -1
-    """It is not missing."""
-    OWN = 0
-    """The servo's: it was asked alone, or is the first of several without an intact reply."""
-    BEHIND = 1
-    """That of a servo before it in the chain, or in the fast status packet."""
-    LINE = 2
-    """Nothing of several replies is intact: the instruction may be lost, or the first of them."""
-    LATE = 3
-    """None: the reply came, after it was given up."""
+    NONE = -1  # It is not missing
+    OWN = 0  # The servo's: it was asked alone, or is the first of several without an intact reply
+    BEHIND = 1  # That of a servo before it in the chain, or in the fast status packet
+    LINE = 2  # Nothing of several replies is intact: the instruction may be lost, or the first of them
+    LATE = 3  # None: the reply came, after it was given up
 
 
 class Due(NamedTuple):
     """Each reply that was requested, exchange by exchange and in order of places; shape (due replies,)."""
 
-    exchange: Numbers
-    """Index in the exchanges."""
+    exchange: Numbers  # Index in the exchanges
     servo: Numbers
-    place: Numbers
-    """In the replies that the instruction requests."""
-    reply: Numbers
-    """The answer, an index in the replies; -1: it is missing."""
-    loss: Numbers
-    """A Loss each."""
+    place: Numbers  # In the replies that the instruction requests
+    reply: Numbers  # The answer, an index in the replies; -1: it is missing
+    loss: Numbers  # A Loss each
     broken: Flags
     """Bytes that belong to no intact packet came in its place; always False where the loss is not its own."""
 
@@ -180,14 +143,10 @@ class Due(NamedTuple):
 class Late(NamedTuple):
     """Intact replies that came after they were given up; shape (late replies,)."""
 
-    servo: Numbers
-    """ID 254: those of several in one fast status."""
-    exchange: Numbers
-    """The newest one that lacks it; -1: that is not among these."""
-    at_ns: Numbers
-    """After the read() of its last byte."""
-    late_ns: Numbers
-    """How long after its instruction had been sent; 0: not known."""
+    servo: Numbers  # ID 254: those of several in one fast status
+    exchange: Numbers  # The newest one that lacks it; -1: that is not among these
+    at_ns: Numbers  # After the read() of its last byte
+    late_ns: Numbers  # How long after its instruction had been sent; 0: not known
 
 
 class Pairing:
@@ -195,8 +154,7 @@ class Pairing:
 
     def __init__(self, buses: tuple[LoggedBus, ...] = ()) -> None:
         """`buses`: of the log; without them those of the first slice."""
-        self.buses = buses
-        """The buses of the log, with what its plan says about them."""
+        self.buses = buses  # The buses of the log, with what its plan says about them
         self._waiting: list[PacketColumns] = []
         self._requests = _ALONE
         self._known: dict[bytes, int] = {}

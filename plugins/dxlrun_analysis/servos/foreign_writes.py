@@ -18,8 +18,7 @@ from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.finding import HURTS
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 
-_AFTER_NS = 2_000_000_000
-"""A servo that fails so soon after it was written to fails by that."""
+_AFTER_NS = 2_000_000_000  # A servo that fails so soon after it was written to fails by that
 _MOST_KEPT = 1000
 _MOST_NAMED = 3
 _HEADER_2 = b"\xff\xff\xfd\x00"
@@ -36,10 +35,8 @@ class _Write(NamedTuple):
     t_ns: int
     bus: int
     servo_id: int
-    name: str
-    """As the joint is called."""
-    what: str
-    """`baud_rate`, or `a reboot`."""
+    name: str  # As the joint is called
+    what: str  # `baud_rate`, or `a reboot`
     value: int | None
 
 

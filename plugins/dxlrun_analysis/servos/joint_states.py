@@ -20,15 +20,11 @@ Numbers = NDArray[np.int64]
 
 _IDS = 256
 BIN_DEG = 5
-ANGLES = 720 // BIN_DEG
-"""From -360 to 360 deg; what is beyond is in the outer ones."""
+ANGLES = 720 // BIN_DEG  # From -360 to 360 deg; what is beyond is in the outer ones
 STEP_RAD_S = 0.1
-SPEEDS = 200
-"""From 0 to 20 rad/s; what is faster is in the last one."""
-PLACES = ANGLES + 112
-"""Then 0 to 111 deg C, with what is beyond in the outer ones, too."""
-_MOST_HELD = 200_000
-"""Cycles that wait for their exchanges; in a whole log they are those of 20 s."""
+SPEEDS = 200  # From 0 to 20 rad/s; what is faster is in the last one
+PLACES = ANGLES + 112  # Then 0 to 111 deg C, with what is beyond in the outer ones, too
+_MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a whole log they are those of 20 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +35,7 @@ class Places:
     """Their numbers, ascending; shape (cycles,)."""
     angle: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     temperature: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
-    speed: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
-    """In bins of 0.1 rad/s"""
+    speed: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))  # In bins of 0.1 rad/s
 
 
 class JointStates:
@@ -55,8 +50,7 @@ class JointStates:
         """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
         self.time_ns, self.crossed = (np.zeros((len(joints), PLACES), np.int64) for _ in range(2))
         """How long each joint was at each place, and how often it came to it from below or left it so."""
-        self.speed_ns = np.zeros((len(joints), SPEEDS), np.int64)
-        """How long each joint was how fast."""
+        self.speed_ns = np.zeros((len(joints), SPEEDS), np.int64)  # How long each joint was how fast
         self._held: list[tuple[Numbers, Numbers, Floats, NDArray[np.bool_], Floats]] = []
         indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}

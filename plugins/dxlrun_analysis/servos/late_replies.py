@@ -15,15 +15,11 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
 from dxlrun_analysis.servos.reply_times import slow_servo
 
-_FEWEST = 5
-"""Late replies from which they are no chance."""
-_ALONE = 0.8
-"""Share of a bus' late replies from which they are one servo's."""
-_MOMENT_NS = 50_000_000
-"""Late replies with less between them are of one moment."""
+_FEWEST = 5  # Late replies from which they are no chance
+_ALONE = 0.8  # Share of a bus' late replies from which they are one servo's
+_MOMENT_NS = 50_000_000  # Late replies with less between them are of one moment
 _FEWEST_MOMENTS = 3
-_TOGETHER = 0.6
-"""Share of the moments of a bus from which it is late together with others."""
+_TOGETHER = 0.6  # Share of the moments of a bus from which it is late together with others
 
 
 class LateReplies:
@@ -32,8 +28,7 @@ class LateReplies:
     def __init__(self, buses: int) -> None:
         self._given_up = np.zeros(buses * IDS, np.int64)
         self._longest_ns, self._exchanges = np.zeros((2, buses), np.int64)
-        self._often = np.zeros(buses, np.int64)
-        """In how many twentieths of a second each bus was late."""
+        self._often = np.zeros(buses, np.int64)  # In how many twentieths of a second each bus was late
         self._moments: Counter[int] = Counter()
         """How many there were, by the buses that were late in them, a bit each."""
 

@@ -47,32 +47,24 @@ from dxlrun_analysis.servos.joint_states import (
 
 _ROWS = 40
 _EPISODE_NS = 200_000_000
-_WIDEST = 90 // BIN_DEG
-"""Bins of the widest range that is tried."""
+_WIDEST = 90 // BIN_DEG  # Bins of the widest range that is tried
 
-_FEWEST = 5
-"""Episodes from which a cause is named."""
-_MANY, _NARROW = 6, 0.1
-"""Fewer episodes are named only in so small a part of the time."""
+_FEWEST = 5  # Episodes from which a cause is named
+_MANY, _NARROW = 6, 0.1  # Fewer episodes are named only in so small a part of the time
 _TIMES_MORE = 4.0
 """So much more often than by the time spent there a reply is missing in a range that is named."""
-_INSIDE = 0.9
-"""Share of the episodes in it."""
-_SLOWEST = 3
-"""Bins of speeds below which a joint hardly moves."""
+_INSIDE = 0.9  # Share of the episodes in it
+_SLOWEST = 3  # Bins of speeds below which a joint hardly moves
 _FEWEST_FAST, _FEWEST_TIMES, _MOST_TIME, _FAST_MORE = 12, 4, 0.6, 5.0
 """Of losses at high speed: replies, episodes, share of the time, and how much more often than else."""
-_EVEN = 0.6
-"""A servo that has more of all episodes of its bus loses them alone."""
+_EVEN = 0.6  # A servo that has more of all episodes of its bus loses them alone
 _ALONE = 0.8
 """A servo that has so many of the lost replies of its bus is named for losing them when it is fast."""
 _SHORTER = 0.4
-_LOSSY_LINE = 10
-"""Episodes of a whole bus from which its line is named."""
+_LOSSY_LINE = 10  # Episodes of a whole bus from which its line is named
 _TOGETHER = 0.7
 """Share of the episodes of a bus that are of several servos at once, or of these at once that are of each."""
-_MOST_EPISODES = 100_000
-"""Kept for each run."""
+_MOST_EPISODES = 100_000  # Kept for each run
 _NOISY_SHARE = 0.005
 _FEWEST_NOISY = 10
 
@@ -83,36 +75,28 @@ class AngleRange:
 
     low: float
     high: float
-    episodes: int
-    """That began in it."""
-    time_share: float
-    """Of the run that the joint was there."""
+    episodes: int  # That began in it
+    time_share: float  # Of the run that the joint was there
 
 
 class Fast(NamedTuple):
     """The speed above which a joint's replies go missing."""
 
     rad_s: float
-    lost_share: float
-    """Of its lost replies."""
-    time_share: float
-    """Of the run that the joint was so fast."""
+    lost_share: float  # Of its lost replies
+    time_share: float  # Of the run that the joint was so fast
 
 
 @dataclass(frozen=True, slots=True)
 class ServoLosses:
     """One servo's own missing replies."""
 
-    asked: int
-    """Those that it could have answered: none before them in a chain was missing."""
+    asked: int  # Those that it could have answered: none before them in a chain was missing
     lost: int
     episodes: int
-    broken_off: int = 0
-    """Reads of several in which it answers first, of which nothing came."""
-    angles: AngleRange | None = None
-    """The range of angles in which they are, where chance is excluded."""
-    fast: Fast | None = None
-    """The speed above which they are."""
+    broken_off: int = 0  # Reads of several in which it answers first, of which nothing came
+    angles: AngleRange | None = None  # The range of angles in which they are, where chance is excluded
+    fast: Fast | None = None  # The speed above which they are
 
 
 class Losses:
@@ -128,13 +112,11 @@ class Losses:
         self._chains, self._broken_off, self._alone, self._lost_alone = np.zeros((4, servos), np.int64)
         """Reads of several servos, by the first; those of which nothing came; reads of one; lost ones."""
         self._answered = np.zeros(servos, np.int64)
-        self._answered_before = np.full(servos, -1, np.int64)
-        """The same before the last loss."""
+        self._answered_before = np.full(servos, -1, np.int64)  # The same before the last loss
         self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
         self._fast, self._begun_fast = np.zeros((2, len(states.share), SPEEDS), np.int64)
         """Lost replies, and episodes, by the joint's speed."""
-        self._episodes_at: list[tuple[int, int, int]] = []
-        """Bus, time in ns and ID of each servo's own."""
+        self._episodes_at: list[tuple[int, int, int]] = []  # Bus, time in ns and ID of each servo's own
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
         """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""

@@ -27,11 +27,9 @@ Of those that write items of a servo one is enough."""
 _FEWEST_UNASKED = 10
 """Replies that nothing asked for: a servo that is late once or a spoilt ID makes no more of them."""
 _MOST_NAMED = 3
-_ALL = 0.9
-"""Of the instructions from which an adapter always echoes, which it may."""
+_ALL = 0.9  # Of the instructions from which an adapter always echoes, which it may
 _LONGEST = 48
-_PIECES = 0.1
-"""Part of the bytes without a packet from which those that end as an instruction are no chance."""
+_PIECES = 0.1  # Part of the bytes without a packet from which those that end as an instruction are no chance
 _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 
 

@@ -40,49 +40,33 @@ after a rest of the line, or right behind an exchange."""
 _REST_NS = 1_000_000
 EDGES_US = (0, 50, 100, 200, 300, 400, 500, 600, 800, 1000, 1500, 2000, 4000, 8000, 16_000, 32_000)
 """Lower edges of the bins of a histogram; what is less than nothing is in the first."""
-_FEWEST = 20
-"""Replies from which a servo is judged."""
-_ODD_US = 100
-"""A servo differs from the others by more: clocks of servos and hosts do by some 10 us [i]."""
+_FEWEST = 20  # Replies from which a servo is judged
+_ODD_US = 100  # A servo differs from the others by more: clocks of servos and hosts do by some 10 us [i]
 _MOST = 0.75
-_LATE_US = 300
-"""A reply that comes so much later than usual on its bus is a late one."""
-_LONGEST_DELAY_US = 508
-"""Return Delay Time (5, 9) is at most 254 times 2 us."""
-_STEADY_US = 60
-"""A return delay is always the same; a servo that is busy is not [i]."""
-_GRAIN_US, _LONGEST_US = 20, 32_000
-"""Times by place are kept in such steps, up to this one."""
-_FEW = 5
-"""Replies from which a place may be the end of such a range."""
-_SPREADS = 3
-"""So many times the spread of its replies elsewhere those of a place are later."""
-_STAYS = 0.25
-"""Part of that by which the others may be later with it."""
-_LEAST_NS = 500_000_000
-"""So long a joint has to be there, and elsewhere."""
-_CROSSINGS = 4
-"""So often it has to come there or leave: once may be a moment, and not an angle."""
-_HOT = ANGLES + 45
-"""From 45 deg C on a servo may be late because it is hot: at rest most have 30 to 40 [i]."""
+_LATE_US = 300  # A reply that comes so much later than usual on its bus is a late one
+_LONGEST_DELAY_US = 508  # Return Delay Time (5, 9) is at most 254 times 2 us
+_STEADY_US = 60  # A return delay is always the same; a servo that is busy is not [i]
+_GRAIN_US, _LONGEST_US = 20, 32_000  # Times by place are kept in such steps, up to this one
+_FEW = 5  # Replies from which a place may be the end of such a range
+_SPREADS = 3  # So many times the spread of its replies elsewhere those of a place are later
+_STAYS = 0.25  # Part of that by which the others may be later with it
+_LEAST_NS = 500_000_000  # So long a joint has to be there, and elsewhere
+_CROSSINGS = 4  # So often it has to come there or leave: once may be a moment, and not an angle
+_HOT = ANGLES + 45  # From 45 deg C on a servo may be late because it is hot: at rest most have 30 to 40 [i]
 
 
 @dataclass(frozen=True, slots=True)
 class ReplyTime:
     """One servo's own part of its reply times."""
 
-    replies: int
-    """Those of which it is known."""
+    replies: int  # Those of which it is known
     median_us: float
     p99_us: float
-    planned_us: float
-    """The return delay that the plan assumes."""
-    histogram: tuple[int, ...]
-    """Replies by bins that begin at EDGES_US."""
+    planned_us: float  # The return delay that the plan assumes
+    histogram: tuple[int, ...]  # Replies by bins that begin at EDGES_US
     by_angle: tuple[tuple[float, float], ...] = ()
     """Lower edge of each bin of the servo's angles, deg, and the median there, us."""
-    by_temperature: tuple[tuple[float, float], ...] = ()
-    """The same by deg C."""
+    by_temperature: tuple[tuple[float, float], ...] = ()  # The same by deg C
 
 
 _Values = tuple[Numbers, Numbers]

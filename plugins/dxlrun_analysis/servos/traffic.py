@@ -25,18 +25,14 @@ from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested, slow_servo
 
 _BYTES = 256
-LATE_US = 2000
-"""An adapter that adds so much more than the plan expects is late."""
-_LATE_SHARE = 0.1
-"""Of the complete exchanges, from which a bus is late."""
+LATE_US = 2000  # An adapter that adds so much more than the plan expects is late
+_LATE_SHARE = 0.1  # Of the complete exchanges, from which a bus is late
 _NOW_AND_THEN = 0.01
 _FEWEST_MOMENTS = 10
-_FEWEST_SERVOS = 4
-"""Of so many it is no chance that only one was late."""
+_FEWEST_SERVOS = 4  # Of so many it is no chance that only one was late
 _FEWEST = 20
 _FEWEST_ALONE = 10
-_OFTEN = 3
-"""Late replies of a servo from which they are no chance."""
+_OFTEN = 3  # Late replies of a servo from which they are no chance
 _KINDS = max(PacketKind) + 1
 
 
@@ -46,32 +42,26 @@ class ServoTraffic:
 
     bus: str
     servo_id: int
-    joint: str
-    """Or the device; empty where the log's plan names none."""
-    instructions: int
-    """Addressed to it alone."""
+    joint: str  # Or the device; empty where the log's plan names none
+    instructions: int  # Addressed to it alone
     asked: int
     """Pings and reads, also those of several servos at once: what it has to answer at every status return
     level."""
     lost: int
     """Of `asked`, without a status packet of this servo before the bus' next instruction. What is still open
     where the log ends is in neither: its reply may have come a moment later."""
-    replies: int
-    """Status packets, acknowledged writes included."""
-    errors: int
-    """Replies with any error bit."""
+    replies: int  # Status packets, acknowledged writes included
+    errors: int  # Replies with any error bit
     error_names: tuple[str, ...]
     reply_median_us: float
     """From before the write() of a ping or read to after the read() of the reply's last byte; in a read of
     several servos at once, those that answer later have the replies before theirs in it."""
     reply_max_us: float
     reply_p99_us: float = 0.0
-    own: ReplyTime | None = None
-    """What of that is its own; None where its replies never came one by one."""
+    own: ReplyTime | None = None  # What of that is its own; None where its replies never came one by one
     losses: ServoLosses | None = None
     """Of `lost`, what is its own and not that of a servo before it in a chain."""
-    device: bool = False
-    """It is a device of the plan, and no servo."""
+    device: bool = False  # It is a device of the plan, and no servo
 
     @property
     def subject(self) -> str:
@@ -87,15 +77,13 @@ class BusTraffic:
     instructions: int
     broadcasts: int
     replies: int
-    noise_bytes: int
-    """Bytes that belong to no intact packet."""
+    noise_bytes: int  # Bytes that belong to no intact packet
     bytes_out: int
     bytes_in: int
     extra_us: float | None = None
     """Median of how much longer than wire and return delay a complete exchange took: what the adapter adds;
     None where the log's plan does not have it, and where replies wait for the next cycle."""
-    planned_latency_us: float | None = None
-    """What the plan expects of that."""
+    planned_latency_us: float | None = None  # What the plan expects of that
     port: str = ""
     late_share: float = 0.0
     """Of the exchanges, those that took 2 ms longer than the plan expects, or that were given up too soon:
@@ -112,8 +100,7 @@ class Traffic:
         """`watch` is called with all exchanges, too: they are paired once."""
         self._pairing, self._watch = Pairing(), watch
         self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
-        self.findings: tuple[Finding, ...] = ()
-        """By the rules of this room; known when all is finished."""
+        self.findings: tuple[Finding, ...] = ()  # By the rules of this room; known when all is finished
         self._size(0, JointStates())
 
     def _size(self, buses: int, states: JointStates) -> None:
@@ -129,8 +116,7 @@ class Traffic:
         )
         self._protocol = np.ones(servos, np.int64)
         self._seen = np.zeros(servos, np.bool_)
-        self._errors = np.zeros((servos, _BYTES), np.int64)
-        """By error byte."""
+        self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte
 
     def take(self, log: Log) -> None:
         """Count the packets of the next slice. Raises LogError when one cannot be read."""

@@ -14,17 +14,13 @@ from dxlrun_analysis.causes.account import Account
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Pairing
 
-PERIOD = 10_000
-"""us, as all times here."""
+PERIOD = 10_000  # us, as all times here
 IDS = (1, 2, 3)
 SIZE = 4
-ASK = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])
-"""A sync read of Protocol 2.0."""
-REPLY = 11 + SIZE
-"""Bytes of its replies."""
+ASK = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])  # A sync read of Protocol 2.0
+REPLY = 11 + SIZE  # Bytes of its replies
 DELAY = 100
-STEP = DELAY + REPLY * 10
-"""From one reply to the next at 1 Mbit/s."""
+STEP = DELAY + REPLY * 10  # From one reply to the next at 1 Mbit/s
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=0)
 
 
@@ -70,8 +66,7 @@ def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict
 
 
 FIRST = len(ASK) * 10 + STEP
-ALONE = 14 * 10 + STEP
-"""The read of one servo, from its instruction to its reply."""
+ALONE = 14 * 10 + STEP  # The read of one servo, from its instruction to its reply
 PLANNED = [FIRST, FIRST + STEP, FIRST + 2 * STEP]
 
 

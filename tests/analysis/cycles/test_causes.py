@@ -17,16 +17,13 @@ from dxlrun_analysis.causes.causes import Causes, CycleCauses
 from dxlrun_analysis.counts import has_them_alone
 
 Make = Callable[..., Any]
-PERIOD = 20_000
-"""us, as all times here."""
+PERIOD = 20_000  # us, as all times here
 COUNT = 30
-BAD = 17
-"""The cycle that is late or long."""
+BAD = 17  # The cycle that is late or long
 SERVOS = (5, 21)
 ASK = {5: bytes.fromhex("ffff0504022406ca"), 21: bytes.fromhex("ffff1504022406ba")}
 ANSWER = {servo: bytes([255, 255, servo, 8, 0, 0, 2, 0, 0, 0, 0, 0xF0]) for servo in SERVOS}
-PLANNED = 8 * 10 + 500 + 12 * 10
-"""Of one exchange: instruction, return delay and reply at 1 Mbit/s."""
+PLANNED = 8 * 10 + 500 + 12 * 10  # Of one exchange: instruction, return delay and reply at 1 Mbit/s
 PLAN = {
     "buses": [
         {

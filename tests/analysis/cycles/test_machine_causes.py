@@ -20,8 +20,7 @@ from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL, MachineLoa
 Make = Callable[..., Any]
 SECOND = 10**9
 LATE_US = 8_000
-BAD = (60, 70)
-"""Cycles that wake late, both in the second second of the run, which begins at 1 s."""
+BAD = (60, 70)  # Cycles that wake late, both in the second second of the run, which begins at 1 s
 
 
 def sample(end_s: float, *, core: int = 0, hot: bool = False, **values: float) -> bytes:

@@ -23,8 +23,7 @@ from dxlrun_analysis.playback.sources import read_motion
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 Dxlrun = Callable[..., Any]
 BEGAN_NS = 1_700_000_000_000_000_000
-Row = tuple[str, int, int, str, float]
-"""Topic, time of recording, stamp, joint, position."""
+Row = tuple[str, int, int, str, float]  # Topic, time of recording, stamp, joint, position
 
 
 def sine() -> tuple[np.ndarray, np.ndarray]:

@@ -25,8 +25,7 @@ from dxlrun_lab.commands import on_robot
 from dxlrun_lab.guided import virtual_rig
 
 Dxlrun = Callable[..., Any]
-REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))
-"""How many motions are interrupted in real time."""
+REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))  # How many motions are interrupted in real time
 
 
 def played(words: Mapping[str, Any]) -> Log:

@@ -30,8 +30,7 @@ from dxlrun_analysis.season.pools import processes
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
-Here = list[str]
-"""Names of the logs that were read."""
+Here = list[str]  # Names of the logs that were read
 
 
 def rows(said: Said) -> dict[str, dict[str, Any]]:
@@ -85,8 +84,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     return read
 
 
-ROWS: dict[str, runs.Row] = {}
-"""Of the logs in `made`."""
+ROWS: dict[str, runs.Row] = {}  # Of the logs in `made`
 
 
 @pytest.fixture

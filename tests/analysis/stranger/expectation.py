@@ -81,18 +81,15 @@ class Case:
     `bus:JOINT` is the bus of a joint, which needs no name where it is the only one."""
     cause: str = ""
     """Regular expression that matches the sentence, whatever its case; empty: nothing is wrong."""
-    good: bool | None = None
-    """Whether the run may, or must, be called good; None: either way."""
-    word: str = ""
-    """Regular expression that matches the verdict's word."""
+    good: bool | None = None  # Whether the run may, or must, be called good; None: either way
+    word: str = ""  # Regular expression that matches the verdict's word
     innocents: tuple[str, ...] | None = None
     """What no finding with blame may accuse; None: all joints but the subject."""
     first: int = 1
     """Among so many first findings with blame the cause is to be, or among the first two of all; 0: it is the
     very first sentence."""
     seed: int = 1
-    live: bool = False
-    """True: it runs in real time, some seconds, by the command line."""
+    live: bool = False  # True: it runs in real time, some seconds, by the command line
 
 
 def collector(cases: list[Case]) -> Callable[..., Callable[[Callable[[Story], None]], None]]:

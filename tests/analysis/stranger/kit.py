@@ -48,8 +48,7 @@ JOINTS = (*HEAD, *LEFT, *RIGHT)
 ARMS = tuple(name for name in JOINTS if name.endswith(("shoulder", "elbow")))
 KNEES = ("left_knee", "right_knee")
 Spec = dict[str, Any]
-Broken = Any
-"""A controller that is made to fail."""
+Broken = Any  # A controller that is made to fail
 
 TORSO = """<robot name="torso"><link name="stand"/><link name="torso"><inertial><mass value="1"/>
 <inertia ixx="0.004" iyy="0.004" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -65,8 +64,7 @@ class Robot:
     name: str
     protocol: float
     rate: int
-    models: tuple[str, str]
-    """Of most joints, and of the knees."""
+    models: tuple[str, str]  # Of most joints, and of the knees
     buses: dict[str, tuple[str, ...]]
     first_id: int = 1
     return_delay: str = "0 us"
@@ -175,8 +173,7 @@ class Story:
         self.duration_s = 6.0
         self.asks: list[tuple[float, str, str, Spec]] = []
         """When (s of the run), controller or "" for the loop, kind, and the command."""
-        self.clients: tuple[str, ...] = ("a client",)
-        """Which ask it: of several each in its turn."""
+        self.clients: tuple[str, ...] = ("a client",)  # Which ask it: of several each in its turn
         self.evidence: Counter[str] = Counter()
         """What really happened, by kind; a case that left nothing here is worthless."""
         self.checks: list[Callable[[Log], None]] = []

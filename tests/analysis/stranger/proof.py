@@ -11,8 +11,7 @@ from tests.analysis.stranger.kit import S, Story, instead
 from dxlrun.errors import StartUpError
 from dxlrun.log.reader import Log
 
-Column = np.ndarray[Any, Any]
-"""What the log has of one joint, by cycle."""
+Column = np.ndarray[Any, Any]  # What the log has of one joint, by cycle
 
 
 def column(log: Log, field: str, joint: str, since_s: float = 0.0) -> Column:

@@ -16,8 +16,7 @@ from tests.analysis.stranger.campaign import CASES, PAIRS
 from tests.analysis.stranger.expectation import Case, judged
 from tests.conftest import SEED as COMMIT
 
-UNNAMED: dict[tuple[str, str], str] = {}
-"""Pairs that are known not to be named, and why."""
+UNNAMED: dict[tuple[str, str], str] = {}  # Pairs that are known not to be named, and why
 COUNT = int(os.environ.get("DXLRUN_STRANGERS", "4"))
 SEED = os.environ.get("DXLRUN_STRANGERS_SEED", COMMIT)
 DRAWN = [(case, robot) for case, robot in PAIRS if not case.live and (case.name, robot) not in UNNAMED]
