@@ -9,7 +9,8 @@ import numpy as np
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges
+from dxlrun_analysis.servos.exchanges import Exchanges
+from dxlrun_analysis.servos.requests import IDS
 
 BYTES_OF_REPLIES = 1_000_000  # In a page, before they are text: 4 bytes a number, two numbers a row and curve
 _FEWEST_ROWS, _MOST_ROWS = 50, 1500

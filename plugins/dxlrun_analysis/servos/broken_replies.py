@@ -10,8 +10,9 @@ from dxlrun.errors import counted
 from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss
+from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
+from dxlrun_analysis.servos.requests import IDS
 
 _FEWEST = 5
 _BESIDE = 12  # Bytes of a status packet beside its data, at most; others that came belong to another sender

@@ -19,58 +19,13 @@ from dxlrun.log.reader import Log
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.servos import requests
+from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
 
-IDS = 256  # A servo is one number: that of its bus times this, plus its ID
 _ROWS = 40  # Bits of an exchange's index in a key; above them the servo
 _BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s
-_HEADER_2 = b"\xff\xff\xfd\x00"
-_STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-_PING, _READ = 0x01, 0x02
-_SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
-_FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
 _HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
 _LATEST_NS = 100_000_000  # A block of a fast status packet that comes later is taken for noise
-_MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
-"""Odd weights of a multilinear hash (Dietzfelbinger 1996): two instructions hardly ever have the same."""
-
-Numbers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-
-
-class LoggedRequest(NamedTuple):
-    """The replies that one instruction requests: from which servos, with how many bytes of data each."""
-
-    servo_ids: tuple[int, ...] = ()
-    sizes: tuple[int, ...] = ()  # Bytes of data a servo; only for reads of several servos
-    fast: bool = False  # All answer in one status packet
-
-
-class Requests(NamedTuple):
-    """All different requests: none, of each servo by itself, then as found; columns of shape (requests,)."""
-
-    kinds: tuple[LoggedRequest, ...] = ()
-    servos: Numbers = np.zeros(0, np.int64)  # How many each asks
-    fast: Flags = np.zeros(0, np.bool_)
-    places: Numbers = np.zeros((0, IDS), np.int64)
-    """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
-    ids: Numbers = np.zeros((0, IDS), np.int64)
-    """IDs in the order of places, those that are asked at the end; shape (requests, 256)."""
-
-    def and_more(self, kinds: tuple[LoggedRequest, ...]) -> Requests:
-        """Return these and more requests."""
-        places = np.full((len(kinds), IDS), -1, np.int64)
-        for row, one in zip(places, kinds, strict=True):
-            row[list(one.servo_ids)] = np.arange(len(one.servo_ids))
-        return Requests(
-            (*self.kinds, *kinds),
-            np.append(self.servos, [len(one.servo_ids) for one in kinds]),
-            np.append(self.fast, [one.fast for one in kinds]),
-            np.concatenate([self.places, places]),
-            np.concatenate([self.ids, np.argsort(places, axis=1, kind="stable")]),
-        )
-
-
-_ALONE = Requests().and_more((LoggedRequest(), *(LoggedRequest((servo_id,)) for servo_id in range(IDS))))
 
 
 class Exchanges(NamedTuple):
@@ -156,8 +111,7 @@ class Pairing:
         """`buses`: of the log; without them those of the first slice."""
         self.buses = buses  # The buses of the log, with what its plan says about them
         self._waiting: list[PacketColumns] = []
-        self._requests = _ALONE
-        self._known: dict[bytes, int] = {}
+        self._requests = RequestTable()
         self._free_ns = np.zeros(len(buses), np.int64)
         """When the line of each bus has carried all that was sent."""
 
@@ -212,7 +166,7 @@ class Pairing:
         delays = np.array([one.return_delay_ns for one in self.buses], np.int64)[bus]
         wire_ns = np.where(rates > 0, packets.length * _BYTE_NS // np.maximum(rates, 1), 0)
         request, asked_ns, blocked_ns, sent_ns, cycle = (np.zeros(size, np.int64) for _ in range(5))
-        request[at] = self._requested(packets.take(rows))
+        request[at] = self._requests.of(packets.take(rows))
         asked_ns[at] = packets.first_ns[rows]
         took_ns = packets.last_ns[rows] - packets.first_ns[rows]
         blocked_ns[at] = np.where(rates[rows] > 0, np.maximum(took_ns - wire_ns[rows], 0), 0)
@@ -235,12 +189,12 @@ class Pairing:
         ids = np.append(packets.servo_id[late[: len(late) - len(blocks)]], block_ids)
         to = np.full(size, -1, np.int64)
         to[at] = packets.servo_id[rows]
-        to[at[(to[at] == BROADCAST_ID) & (instruction_of(packets.take(rows)) == _PING)]] = -1
+        to[at[(to[at] == BROADCAST_ID) & (requests.instruction_of(packets.take(rows)) == requests.PING)]] = -1
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
         return Exchanges(
             self.buses,
-            self._requests,
+            self._requests.all,
             of_bus,
             cycle,
             request,
@@ -258,29 +212,6 @@ class Pairing:
             _unasked(replies, due, to),
             packets.take(noise),
         )
-
-    def _requested(self, packets: PacketColumns) -> Numbers:
-        """Return which request each instruction is."""
-        second, code = _second(packets), instruction_of(packets)
-        servo_id = np.where(second, packets.byte(4), packets.byte(2)).astype(np.int64)
-        found = np.zeros(len(packets), np.int64)
-        single = np.isin(code, (_PING, _READ)) & (servo_id != BROADCAST_ID)
-        found[single] = servo_id[single] + 1
-        many = np.where(second, np.isin(code, (_SYNC_READ, _BULK_READ, *_FAST)), code == _BULK_READ)
-        for length in np.unique(packets.length[many]).tolist():
-            rows = np.flatnonzero(many & (packets.length == length))
-            text = packets.data[packets.start[rows][:, None] + np.arange(length)]
-            mixed = text.astype(np.uint64) @ _MIXED[:length]
-            _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-            index = [
-                self._known.setdefault(text[row].tobytes(), len(_ALONE.kinds) + len(self._known))
-                for row in first.tolist()
-            ]
-            found[rows] = np.array(index)[inverse]
-        new = tuple(self._known)[len(self._requests.kinds) - len(_ALONE.kinds) :]
-        if new:
-            self._requests = self._requests.and_more(tuple(map(request_of, new)))
-        return found
 
     def _replies(  # noqa: PLR0917  columns of one table
         self,
@@ -303,7 +234,7 @@ class Pairing:
         before_ns = np.empty(len(of), np.int64)
         before_ns[1:] = last_ns[:-1]
         before_ns[begins] = sent_ns[of[begins]]
-        second = _second(status)
+        second = requests.second_of(status)
         joint = second & (status.servo_id == BROADCAST_ID)
         row = np.flatnonzero(~joint)
         servo_id, error = status.servo_id[row], np.where(second, status.byte(8), status.byte(4))[row]
@@ -313,7 +244,7 @@ class Pairing:
             row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
             order = np.lexsort((number, row))
             row, servo_id, error = row[order], servo_id[order], error[order]
-        place = self._requests.places[request[of[row]], servo_id]
+        place = self._requests.all.places[request[of[row]], servo_id]
         return Replies(
             of[row],
             status.bus[row].astype(np.int64) * IDS + servo_id,
@@ -337,7 +268,8 @@ class Pairing:
             mine = rows[request[rows] == index]
             packets = status.take(mine)
             at = _HEAD_2
-            for number, size in enumerate(self._requests.kinds[index].sizes):  # a block: error, ID, data, CRC
+            # a block: error, ID, data, CRC
+            for number, size in enumerate(self._requests.all.kinds[index].sizes):
                 there = at + size + 4 <= packets.length  # one that was cut has its intact blocks
                 numbers = np.full(int(there.sum()), number, np.int64)
                 pieces.append((mine[there], numbers, packets.byte(at + 1)[there], packets.byte(at)[there]))
@@ -345,10 +277,10 @@ class Pairing:
         return pieces
 
     def _due(self, bus: Numbers, request: Numbers, replies: Replies, noise: Numbers) -> Due:
-        count = self._requests.servos[request]
+        count = self._requests.all.servos[request]
         exchange, begin = np.repeat(np.arange(len(request)), count), np.cumsum(count) - count
         place = np.arange(len(exchange)) - begin[exchange]
-        servo_id = self._requests.ids[request[exchange], place - count[exchange]]
+        servo_id = self._requests.all.ids[request[exchange], place - count[exchange]]
         reply = np.full(len(exchange), -1, np.int64)
         rows = np.flatnonzero(replies.answers)[::-1]  # of several replies of a servo the first counts
         reply[begin[replies.exchange[rows]] + replies.place[rows]] = rows
@@ -365,11 +297,11 @@ class Pairing:
         self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: Due
     ) -> tuple[Numbers, NDArray[np.uint8]]:
         """Return bytes that are the block that a fast status packet lacks, come later; and its ID."""
-        lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.fast[request[due.exchange]])
+        lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.all.fast[request[due.exchange]])
         at = np.searchsorted(due.exchange[lacks], exchange) - 1
         rows = np.flatnonzero(at >= 0)
         lacks, noise = lacks[at[rows]], noise.take(rows)
-        of, kinds = due.exchange[lacks], self._requests.kinds
+        of, kinds = due.exchange[lacks], self._requests.all.kinds
         size = [
             kinds[index].sizes[place]
             for index, place in zip(request[of].tolist(), due.place[lacks].tolist(), strict=True)
@@ -446,19 +378,6 @@ def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: np.int64) -> Numbers:
     return begin + sent
 
 
-def instruction_of(packets: PacketColumns) -> Numbers:
-    """Return the code of each instruction packet."""
-    return np.where(_second(packets), packets.byte(7), packets.byte(4)).astype(np.int64)
-
-
-def _second(packets: PacketColumns) -> Flags:
-    """Return the protocol by the header; a Protocol 1.0 packet of ID 253 has no length 0."""
-    second = packets.length >= len(_HEADER_2)
-    for index, byte in enumerate(_HEADER_2):
-        second &= packets.byte(index) == byte
-    return second
-
-
 def ordered(packets: PacketColumns) -> PacketColumns:
     """Return packets bus by bus in order of time; those of one time keep theirs."""
     order = np.argsort(packets.bus, kind="stable")
@@ -466,30 +385,3 @@ def ordered(packets: PacketColumns) -> PacketColumns:
     if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():
         order = np.lexsort((packets.first_ns, packets.bus))
     return packets.take(order)
-
-
-def request_of(data: bytes) -> LoggedRequest:
-    """Return the servos that answer an instruction at every status return level: pings and reads."""
-    second = data.startswith(_HEADER_2)
-    servo_id, code = (_byte(data, 4), _byte(data, 7)) if second else (_byte(data, 2), _byte(data, 4))
-    if code in (_PING, _READ):
-        return LoggedRequest() if servo_id == BROADCAST_ID else LoggedRequest((servo_id,))
-    if not second:
-        return _entries(data[6:-1], 3, 1, fast=False) if code == _BULK_READ else LoggedRequest()
-    body = data[8:-2].replace(_STUFFED, _PLAIN)
-    fast = code in _FAST
-    if code in (_SYNC_READ, _FAST_SYNC_READ):
-        sizes = (int.from_bytes(body[2:4], "little"),) * len(body[4:])
-        return LoggedRequest(tuple(dict.fromkeys(body[4:])), sizes, fast)
-    return _entries(body, 5, 0, fast=fast) if code in (_BULK_READ, _FAST_BULK_READ) else LoggedRequest()
-
-
-def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
-    """Return the servos of a bulk read: entries of `width` bytes, the ID at `at`, the size first or last."""
-    entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
-    sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
-    return LoggedRequest(tuple(dict.fromkeys(entry[at] for entry in entries)), tuple(sizes), fast)
-
-
-def _byte(data: bytes, index: int) -> int:
-    return data[index] if index < len(data) else 0

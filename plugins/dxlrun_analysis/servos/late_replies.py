@@ -12,8 +12,9 @@ import numpy as np
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.reply_times import slow_servo
+from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
 
 _FEWEST = 5  # Late replies from which they are no chance
 _ALONE = 0.8  # Share of a bus' late replies from which they are one servo's

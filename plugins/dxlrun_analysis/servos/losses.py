@@ -34,7 +34,7 @@ from dxlrun.errors import counted
 from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Loss, Numbers
+from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.joint_states import (
     ANGLES,
     BIN_DEG,
@@ -44,6 +44,7 @@ from dxlrun_analysis.servos.joint_states import (
     Places,
     edge_rad,
 )
+from dxlrun_analysis.servos.requests import IDS, Numbers
 
 _ROWS = 40
 _EPISODE_NS = 200_000_000

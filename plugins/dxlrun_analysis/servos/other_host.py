@@ -18,8 +18,9 @@ from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Loss, Numbers, instruction_of
+from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
+from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, instruction_of
 
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits.

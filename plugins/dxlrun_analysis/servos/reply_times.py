@@ -31,8 +31,9 @@ from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, has_them_alone, median, quantile
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
+from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
 """Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone

@@ -17,12 +17,13 @@ from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
-from dxlrun_analysis.servos.exchanges import IDS, Exchanges, Numbers, Pairing
+from dxlrun_analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested, slow_servo
+from dxlrun_analysis.servos.requests import IDS, Numbers
 
 _BYTES = 256
 LATE_US = 2000  # An adapter that adds so much more than the plan expects is late
