@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
@@ -57,6 +58,13 @@ class Finding:
     def line(self) -> str:
         """The sentence, and the remedy behind it."""
         return f"{self.sentence} {self.remedy}".rstrip()
+
+
+def listed(names: Iterable[str], most: int = 3) -> str:
+    """Return the first of some names, each once, and how many more there are."""
+    shown = list(dict.fromkeys(names))
+    more = len(shown) - most
+    return ", ".join(shown[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def cause(code: str, subject: str, sentence: str, remedy: str = "", share: float = 1.0) -> Finding:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.errors import counted
-from dxlrun_analysis.finding import ROBOT, Finding, Rank
+from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
 from dxlrun_analysis.tally import RunTotals
 
 _MOST_NAMED = 3
@@ -103,7 +103,7 @@ def _failures(totals: RunTotals) -> Iterator[str]:
         same.sort(key=lambda groups: groups[0].t_ns)
     for same in sorted(told.values(), key=lambda same: same[0][0].t_ns):
         happened = [f"{_what(groups)}{_when(groups, conduct.begin_ns)}" for groups in same]
-        yield f"{_named([group.source for group in same[0]])} {', '.join(happened)}"
+        yield f"{listed(group.source for group in same[0])} {', '.join(happened)}"
 
 
 def _what(groups: Sequence[EventGroup]) -> str:
@@ -121,12 +121,6 @@ def _when(groups: Sequence[EventGroup], begin_ns: int) -> str:
 def _at(t_ns: int, begin_ns: int) -> str:
     """Return when it was since the first deadline; empty: there was none."""
     return f" at {max((t_ns - begin_ns) / 1e9, 0.0):.1f} s" if begin_ns else ""
-
-
-def _named(names: Sequence[str]) -> str:
-    shown = list(dict.fromkeys(names))
-    more = len(shown) - _MOST_NAMED
-    return ", ".join(shown[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
@@ -161,7 +155,7 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
             yield f"at {one.time_s:.1f} s {one.text}"
     released = [act for act in totals.acts if act.what.startswith(_RELEASED) and not act.refusal]
     if released:
-        names = _named([joint for act in released for joint in act.what.removeprefix(_RELEASED).split(", ")])
+        names = listed(joint for act in released for joint in act.what.removeprefix(_RELEASED).split(", "))
         yield f"torque of {names} off by request at {released[0].time_s:.1f} s"
 
 
@@ -174,7 +168,7 @@ def _played(totals: RunTotals) -> str:
     files = [motion for motion in dict.fromkeys(_motion(one.origin) for one in begun) if motion]
     within = _within(totals)
     if files:
-        return f"played {_named(files)} ({counted(len(motions), 'motion', 'motions')}){within}"
+        return f"played {listed(files)} ({counted(len(motions), 'motion', 'motions')}){within}"
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
     if totals.conduct.origins or any(act.set_points for act in sent):
         return f"moved by commands from outside{within}"

@@ -52,7 +52,7 @@ _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
 _OFTEN = 0.01  # Of the cycles: a goal beyond a limit now and then is what limits are for
-_OF_LOOP = (
+_OF_LOOP = [
     "switch",
     "rate",
     "halt",
@@ -64,7 +64,7 @@ _OF_LOOP = (
     "torque",
     "reboot",
     "stop",
-)
+]
 """Kinds of commands that the loop does itself."""
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.log.reader import Log
-from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.finding import Finding, Rank, listed
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _HANGS_S = 1.0
@@ -188,7 +188,8 @@ class Sensors:
             elif still and len(still) == lively and _at_once(still.values()):
                 if 2 * inside >= lively and any(each.moved or each.rested for each in still.values()):
                     stay = max(still.values(), key=lambda stay: stay.from_s)
-                    yield self._stands(name, _listed(list(still)), stay, Rank.SERVO_CAUSE)
+                    what = f"{listed(list(still), _MOST_NAMED)} {'was' if len(still) == 1 else 'were'}"
+                    yield self._stands(name, what, stay, Rank.SERVO_CAUSE)
             else:
                 for state, stay in still.items():
                     if stay.values >= _FEWEST_ALONE and stay.inside and lively > len(still):
@@ -223,12 +224,3 @@ def _at_once(stays: Collection[_Stay]) -> bool:
     """Return whether values stood still from the same moment on, as far as their changes before tell it."""
     begins = [stay.from_s for stay in stays]
     return max(begins) - min(begins) <= max(stay.usual_s for stay in stays) + 0.1
-
-
-def _listed(names: list[str]) -> str:
-    more = len(names) - _MOST_NAMED
-    return (
-        ", ".join(names[:_MOST_NAMED])
-        + (f" and {more} more" if more > 0 else "")
-        + (" was" if len(names) == 1 else " were")
-    )

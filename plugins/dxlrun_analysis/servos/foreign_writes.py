@@ -15,7 +15,7 @@ from dxlrun.channels.packets import LoggedPacket
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.plan.transaction import BROADCAST_ID
-from dxlrun_analysis.finding import HURTS
+from dxlrun_analysis.finding import HURTS, listed
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 
 _AFTER_NS = 2_000_000_000  # A servo that fails so soon after it was written to fails by that
@@ -84,8 +84,7 @@ class ForeignWrites:
         for names, each in by_items.items():
             ids = [str(servo_id) for servo_id, _ in each]
             items = each[0][1] if len({items for _, items in each}) == 1 else names
-            more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""
-            parts.append(f"{items} to {'IDs' if len(ids) > 1 else 'ID'} {', '.join(ids[:_MOST_NAMED])}{more}")
+            parts.append(f"{items} to {'IDs' if len(ids) > 1 else 'ID'} {listed(ids)}")
         more = f"; and to {len(parts) - _MOST_NAMED} more" if len(parts) > _MOST_NAMED else ""
         return "; ".join(parts[:_MOST_NAMED]) + more, bool(ends)
 
