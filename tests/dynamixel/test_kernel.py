@@ -3,6 +3,7 @@
 import ctypes
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import time
@@ -18,16 +19,35 @@ import fuzz_kernel as fuzz
 from dxlrun.channels import fence
 from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.packets import PacketKind
+from dxlrun.channels.packets import RECORD_HEADER, PacketKind
 from dxlrun.clock import MonotonicClock
+from dxlrun.dynamixel.exchange import bus, kernel
 from dxlrun.dynamixel.exchange.bus import FREE_NS
 from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
 from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.port import ports
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
 
 ROOT = Path(__file__).parents[2]
+
+
+def test_numbers_that_both_sides_share_are_the_same():
+    """The structs are read from `kernel.c`; these have a type in Python."""
+    text = fence.SOURCE.read_text()
+    found = {name: int(value) for name, value in re.findall(r"#define (\w+) (\d+)", text)}
+    for names in re.findall(r"^enum \{(.*?)\}", text, re.MULTILINE):
+        place = -1
+        for name, _, value in (one.partition(" = ") for one in names.split(", ")):
+            found[name.strip()] = place = int(value or place + 1)
+    shared = {one.name: int(one) for one in kernel.Answer}
+    shared |= {name: getattr(bus, name) for name in ("FREE_NS", "LATE_NS", "LOST", "ASKED_NS", "SILENCE_NS")}
+    shared |= {name.upper(): value for name, value in kernel._ENCODINGS.items()}
+    shared |= {"MOST_LATE_NS": bus.MOST_LATE_NS, "AWAITING": kernel.AWAITING}
+    shared |= {"WRITE_TIMEOUT_NS": ports._WRITE_TIMEOUT_NS, "RECORD_HEADER": RECORD_HEADER}
+    shared |= {one.name: int(one) for one in (PacketKind.INSTRUCTION, PacketKind.STATUS)}
+    assert {name: found[name] for name in shared} == shared
 
 
 by_both = pytest.mark.parametrize("by_parser", [False, True], ids=["kernel", "parser"])

@@ -19,6 +19,7 @@ from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlrun.dynamixel.exchange.samples import Samples
+from dxlrun.dynamixel.plan.retry import pause
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -26,7 +27,7 @@ from dxlrun.dynamixel.servo.life import Done
 from dxlrun.dynamixel.servo.offline import ignore
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
-from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits
+from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits, restore_torque_limits
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan
@@ -131,7 +132,7 @@ class DynamixelHardware:
             engaging()
             self._start_up.engage(self._goals)
             if self._restore_torque:
-                self._full_torque = self._start_up.restore_limits()
+                self._full_torque = self._start_up.stage(restore_torque_limits)
             self._first_states()
             self._start_up.watch()
             for bus in self._buses:
@@ -437,7 +438,7 @@ class DynamixelHardware:
         """Read until the states of all servos are fresh; raises StartUpError when some stay silent."""
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
-                self._start_up.pause(pause_ns)
+                self._lines.run([pause(pause_ns) for _ in self._plans])
             self.read()
             self._start_up.raise_failures()
             if not any(servos.silent for servos in self._servos):

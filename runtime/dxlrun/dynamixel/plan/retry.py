@@ -41,6 +41,11 @@ def retry(transaction: Transaction) -> Program[Reply]:
     return reply
 
 
+def pause(duration_ns: int) -> Program[None]:
+    """Let a moment pass, and take what still comes."""
+    yield listen(duration_ns)
+
+
 def drained(program: Program[Result]) -> Program[Result]:
     """Run a tool's program so that no reply is taken for the next: a status does not carry what it answers.
 

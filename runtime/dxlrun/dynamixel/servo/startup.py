@@ -30,7 +30,6 @@ from dxlrun.dynamixel.servo.access import Access, first_reach, reach
 from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
-from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Program, Result
@@ -98,13 +97,6 @@ class StartUp:
                 text = f"limp, as the robot file says: {limp}"
                 self._events.emit(EventCode.TORQUE_OFF, Severity.INFO, plan.name, text)
 
-    def restore_limits(self) -> list[list[int]]:
-        """Give the servos the torque again that a policy of an earlier run may have left them without.
-
-        Returns each servo's own limit in ticks, by bus.
-        """
-        return self.stage(restore_torque_limits)
-
     def confirm(self) -> None:
         """Read torque enable of every servo again, and let them get goals.
 
@@ -119,10 +111,6 @@ class StartUp:
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
         self.stage(lambda plan, found: mine[plan.name].watch(found), longer_ns)
-
-    def pause(self, duration_ns: int) -> None:
-        """Let a moment pass, and take what still comes."""
-        self.stage(lambda *_: _pause(duration_ns))
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no start without it."""
@@ -282,10 +270,6 @@ def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
         members = [plan.members[index] for index in plan.groups[number]]
         extra_ns += state_read(line, members).due_ns - state_read(line, members, fast=True).due_ns
     return extra_ns
-
-
-def _pause(duration_ns: int) -> Program[None]:
-    yield listen(duration_ns)
 
 
 def _refuse(problems: Iterable[str]) -> None:

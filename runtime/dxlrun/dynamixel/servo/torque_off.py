@@ -14,11 +14,10 @@ from msgspec.structs import replace
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.servo.access import reach
+from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
+from dxlrun.plan.transaction import Outcome, Program, Reply
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
 """A write and its read-back are tried so often, and the read-back is awaited so much longer each time.
@@ -81,15 +80,14 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
     for broadcast in plan.limp:
         if not broadcast.awaited:
             yield broadcast
-    writes = _torque_off_writes(plan)
+    every = [reach(plan, servo) for servo in plan.servos]
     details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
     late = False
     for longer_ns in LONGER_NS:
         for index in [index for index, detail in details.items() if detail]:
             if longer_ns and now_ns() >= deadline_ns:
                 break
-            acknowledged = yield writes[index]
-            back = yield _torque_read(plan, index, longer_ns)
+            acknowledged, back = yield from _off(every[index], longer_ns)
             details[index] = _detail(acknowledged, back)
             late = late or not (acknowledged.answered and back.answered)
     if late:
@@ -100,35 +98,34 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
 def _stand(plan: BusPlan) -> Program[list[str]]:
     yield listen(SETTLE_NS)
     sentences: list[str] = []
-    left: dict[int, str] = {}
-    for index, servo in enumerate(plan.servos):
-        problem = yield from _stop(plan, index)
+    left: list[tuple[Access, str]] = []
+    for servo in plan.servos:
+        one = reach(plan, servo)
+        problem = yield from _stop(one)
         if problem is None:
             continue
         if not problem:
-            sentences.append(f"{plan.label(servo)} stands: its goal is 0")
-        elif (yield from _off(plan, index, LONGER_NS[0])):
-            sentences.append(f"{plan.label(servo)} has no torque, as {problem}")
+            sentences.append(f"{one} stands: its goal is 0")
+        elif (yield from _is_off(one, LONGER_NS[0])):
+            sentences.append(f"{one} has no torque, as {problem}")
         else:
-            left[index] = problem
+            left.append((one, problem))
     for longer_ns in LONGER_NS[1:]:  # only now: a servo that still moves does not wait for a silent one
-        for index, problem in list(left.items()):
-            if (yield from _off(plan, index, longer_ns)):
-                del left[index]
-                sentences.append(f"{plan.label(plan.servos[index])} has no torque, as {problem}")
-    for index, problem in left.items():
-        name = plan.label(plan.servos[index])
-        sentences.append(f"{name} may keep moving: {problem}, and torque off was not confirmed")
+        for one, problem in tuple(left):
+            if (yield from _is_off(one, longer_ns)):
+                left.remove((one, problem))
+                sentences.append(f"{one} has no torque, as {problem}")
+    for one, problem in left:
+        sentences.append(f"{one} may keep moving: {problem}, and torque off was not confirmed")
     return sentences
 
 
-def _stop(plan: BusPlan, index: int) -> Program[str | None]:
+def _stop(one: Access) -> Program[str | None]:
     """Stop a servo; return why it does not stand, empty when it does, None where nothing was to be done."""
-    one = reach(plan, plan.servos[index])
     mode = yield from modes.mode_now(one)
     if mode in _HOLD:
         return None
-    torque = yield from retry(plan.torque_reads[index])
+    torque = yield from one.read_bytes(one.servo.torque_address, 1)
     if torque.answered and torque.parameters[0] == 0:
         return None
     if mode is Mode.UNKNOWN:
@@ -136,19 +133,17 @@ def _stop(plan: BusPlan, index: int) -> Program[str | None]:
     return (yield from modes.hold(one, mode)).problem
 
 
-def _off(plan: BusPlan, index: int, longer_ns: int) -> Program[bool]:
-    yield _torque_off_writes(plan)[index]
-    back = yield _torque_read(plan, index, longer_ns)
+def _off(one: Access, longer_ns: int) -> Program[tuple[Reply, Reply]]:
+    """Write torque off once and read it back; return both replies."""
+    acknowledged = yield one.writing(one.servo.torque_address, b"\0")
+    read = one.reading(one.servo.torque_address, 1)
+    back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
+    return acknowledged, back
+
+
+def _is_off(one: Access, longer_ns: int) -> Program[bool]:
+    _, back = yield from _off(one, longer_ns)
     return back.answered and back.parameters[0] == 0
-
-
-def _torque_off_writes(plan: BusPlan) -> list[Transaction]:
-    return [write for write in plan.limp if write.awaited]
-
-
-def _torque_read(plan: BusPlan, index: int, longer_ns: int) -> Transaction:
-    read = plan.torque_reads[index]
-    return replace(read, timeout_ns=read.timeout_ns + longer_ns)
 
 
 def _detail(acknowledged: Reply, back: Reply) -> str:

@@ -185,7 +185,7 @@ class OneServo:
         try:
             for state in (bright, dark) * times:
                 self.write(state)
-                self.tool.run(_pause(BLINK_NS))
+                self.tool.wait(BLINK_NS)
         finally:
             self.write([self.register(name, value) for name, value in before.items()])
         return f"blinked {times} times"
@@ -432,8 +432,3 @@ def _await(one: OneServo) -> None:
             port = one.tool.port.name
             raise one.fail(f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}")
         one.tool.wait(_PINGED_EVERY_NS)
-
-
-def _pause(duration_ns: int) -> Program[bool]:
-    yield listen(duration_ns)
-    return True
