@@ -151,6 +151,15 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
     assert rig.writes() == []  # it holds what it held
 
 
+def test_a_servo_that_is_not_in_order_is_not_written_to():
+    plan = declared(make_x((11, 12)), position_p_gain=900)
+    rig, execute = bench(plan)
+    rig.servo(11).poke("homing_offset", 5)
+    torqued, found = rejoined(execute, plan, torque=True)
+    assert (len(found.problems), torqued) == (1, False)
+    assert rig.writes() == []
+
+
 def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
     plan = declared(make_x((11, 12)), 1, return_delay_time=0, position_p_gain=850)
     rig = make_rig(plan)

@@ -111,6 +111,7 @@ def test_a_file_takes_over_what_it_does_not_say() -> None:
     entries = {
         "a": {
             "model": "A",
+            "aliases": ["A-T"],
             "speed": 1,
             "items": {"x": {"address": 4, "size": 1}, "y": {"address": 6, "size": 1}},
         },
@@ -122,7 +123,7 @@ def test_a_file_takes_over_what_it_does_not_say() -> None:
         },
     }
     merged = resolve("b", entries)
-    assert (merged["model"], merged["speed"]) == ("B", 1)
+    assert (merged["model"], merged["aliases"], merged["speed"]) == ("B", [], 1)
     assert merged["items"] == {"z": {"address": 0}, "x": {"address": 4, "size": 2}}
     assert list(merged["items"]) == ["z", "x"], "in the order of addresses"
     assert entries["a"]["items"] == {"x": {"address": 4, "size": 1}, "y": {"address": 6, "size": 1}}

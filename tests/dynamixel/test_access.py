@@ -1,0 +1,84 @@
+"""Access to a servo's items: what is read and written, and what is said where that fails."""
+
+import pytest
+from tests.kit.rigs import make_x
+
+from dxlrun.dynamixel.control_table import control_table, decoded
+from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.servo.access import reach
+from dxlrun.dynamixel.servo.registers import settle, write_register
+from dxlrun.plan.bus_plan import RegisterValue
+from dxlrun.plan.transaction import Outcome, Reply
+
+PLAN = make_x((11,))
+ONE = reach(PLAN, PLAN.servos[0])
+READ, WRITE = 2, 3
+GAIN = RegisterValue(84, 2, 900, "position_p_gain")
+
+
+def played(program, *answers):
+    """Run a program on answers, the last one again and again: data, or an outcome without; return its result,
+    and of each packet its instruction and address."""
+    sent, left = [], list(answers)
+    try:
+        request = next(program)
+        while True:
+            sent.append((request.packet[7], int.from_bytes(request.packet[8:10], "little")))
+            answer = left.pop(0) if len(left) > 1 else left[0]
+            failed = isinstance(answer, Outcome)
+            reply = Reply(answer if failed else Outcome.OK, 7, b"" if failed else answer, 0, 0, False)
+            request = program.send(reply)
+    except StopIteration as end:
+        return end.value, sent
+
+
+@pytest.mark.parametrize(
+    ("answers", "problem"),
+    [
+        ((b"", b"\x10"), ""),
+        ((b"", b"\x03"), "was given Operating Mode (11) = 16, but has 3"),
+        ((b"", b"\x7f"), "was given Operating Mode (11) = 16, but has 127"),
+        ((b"", Outcome.TIMEOUT), "did not answer when Operating Mode (11) was read back"),
+    ],
+)
+def test_an_item_counts_as_written_when_it_is_read_back(answers, problem):
+    found, sent = played(ONE.write("operating_mode", 16), *answers)
+    assert found == problem
+    assert sent[:2] == [(WRITE, 11), (READ, 11)]
+
+
+def test_a_refused_write_is_not_read_back():
+    problem, sent = played(ONE.write("operating_mode", 16), Outcome.REFUSED)
+    assert problem.startswith("refuses Operating Mode (11) = 16: access error")
+    assert {instruction for instruction, _ in sent} == {WRITE}
+
+
+def test_items_are_read_side_by_side_and_none_counts_where_one_does_not_come():
+    names = ("position_d_gain", "position_i_gain", "torque_enable")
+    found, sent = played(ONE.read(names), b"\1\0", b"\1\0\2\0")
+    assert found == {"torque_enable": 1, "position_d_gain": 1, "position_i_gain": 2}
+    assert sent == [(READ, 64), (READ, 80)]
+    found, _ = played(ONE.read(names), b"\1\0", Outcome.TIMEOUT)
+    assert found is None
+
+
+def test_a_register_is_written_again_until_it_is_read_back():
+    right, wrong = (900).to_bytes(2, "little"), (800).to_bytes(2, "little")
+    assert played(write_register(ONE, GAIN), b"", wrong, b"", right)[0] == ""
+    problem, sent = played(write_register(ONE, GAIN), b"", wrong, b"", wrong, b"", wrong)
+    assert problem == "was given Position P Gain (84) = 900, but has 800"
+    assert sent == [(WRITE, 84), (READ, 84)] * 3
+
+
+def test_nothing_is_written_where_one_register_cannot_be_read():
+    found, other = Findings(), RegisterValue(80, 2, 5, "position_d_gain")
+    before, sent = played(settle(ONE, (GAIN, other), found), b"\0\0", Outcome.TIMEOUT)
+    assert found.problems == [f"{ONE} did not answer when Position D Gain (80) was read"]
+    assert before == {"position_p_gain": 0}
+    assert {instruction for instruction, _ in sent} == {READ}
+
+
+def test_only_items_that_lie_whole_in_the_bytes_are_decoded():
+    items = control_table("XM430-W350", 2.0).items
+    assert decoded(items.values(), 80, b"\1\0\2\0\3") == {"position_d_gain": 1, "position_i_gain": 2}
+    assert decoded([items["position_d_gain"]], 81, b"\0\0\0") == {}
