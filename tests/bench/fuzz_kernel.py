@@ -26,6 +26,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from operator import itemgetter
 from pathlib import Path
 from zlib import crc32
 
@@ -337,7 +338,7 @@ class Side:
             ],
             "torqued": [one.life.torqued.tolist() for one in hardware._servos],
             "failures": [str(bus.failure) for bus in hardware._buses],
-            "events": list(self.events.list),
+            "events": sorted(self.events.list, key=itemgetter(2)),  # in order for each source, as packets are
         }
 
 
