@@ -212,8 +212,8 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
 )
 def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(model, protocol):
     plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
-    program = modes.mode_now(reach(plan, plan.servos[0]))
-    assert next(program).awaited[0].length != plan.torque_reads[0].awaited[0].length
+    one = reach(plan, plan.servos[0])
+    assert next(modes.mode_now(one)).awaited[0].length != next(one.read_torque()).awaited[0].length
 
 
 def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():

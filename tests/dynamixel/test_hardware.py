@@ -7,10 +7,15 @@ import pytest
 from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick, start_rig
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
 from dxlrun.plan.simulation_plan import ServoConfig
+
+
+def torque_read(plan, index):
+    return next(reach(plan, plan.servos[index]).read_torque()).packet
 
 
 def torque_given(rig, since=0):
@@ -114,7 +119,7 @@ class OneBus:
         rig.cycles(2)
         servo.silence(False)
         rig.cycles(6)
-        sent, probe = rig.into_bus()[before:], self.plan.torque_reads[2].packet
+        sent, probe = rig.into_bus()[before:], torque_read(self.plan, 2)
         goals = [(at, named[1]) for at, p in enumerate(sent) if (named := goals_in(p, self.plan.protocol))]
         named = [at for at, ids in goals if self.ids[2] in ids]
         assert sent.count(probe) == 1
@@ -314,7 +319,7 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same():
     named = [2 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
     assert not any(named[:40])
     assert all(named[-5:])
-    assert sent.count(rig.plans[0].torque_reads[1].packet) == 1
+    assert sent.count(torque_read(rig.plans[0], 1)) == 1
     ((source, text),) = rig.events.of(EventCode.OVERRUN)
     assert source == "main_2_joint"
     assert "waits for idle time" in text

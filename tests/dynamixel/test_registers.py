@@ -109,7 +109,7 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read():
     rig, execute = bench(plan)
     servo, line = rig.servo(11), rig.ports.ports[0]
     servo.poke("return_delay_time", 0)
-    write, torque = line.write, plan.torque_reads[0].packet
+    write, torque = line.write, next(reach(plan, plan.servos[0]).read_torque()).packet
 
     def listen(data):
         servo.silence(bytes(data) == torque)

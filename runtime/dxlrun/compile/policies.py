@@ -10,6 +10,7 @@ from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.dynamixel.plan.planning import torque_off_ns
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.policy_plan import (
@@ -199,11 +200,7 @@ def _group_policies(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tup
 
 def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
     """Return the part of the exit timeout that is no step's: two periods, and torque off on every line."""
-    limp = [
-        sum(each.due_ns + bus.latency_ns * bool(each.awaited) for each in (*bus.limp, *bus.torque_reads))
-        for bus in buses
-    ]
-    return max(limp, default=0) + round(2e9 / rate) + MARGIN_NS
+    return max(map(torque_off_ns, buses), default=0) + round(2e9 / rate) + MARGIN_NS
 
 
 def _too_long(file: RobotFile, policy: Policy, name: PolicyName, limit_ns: int) -> None:

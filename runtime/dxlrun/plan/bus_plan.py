@@ -318,8 +318,7 @@ class BusPlan(msgspec.Struct, frozen=True):
     reads: tuple[Transaction, ...]
     """The state read of each group, when all its servos answer, in the form that every firmware knows."""
     limp: tuple[Transaction, ...]
-    """Torque off, to be sent at any moment: to all servos first, then servo by servo, acknowledged."""
-    torque_reads: tuple[Transaction, ...]  # Read torque enable, in the order of `servos`
+    """Torque off for all servos at once, without a reply, to be sent at any moment."""
     budget: Budget  # Of a cycle with the reads that were chosen: the fast forms where `fast` says so
     fast: tuple[bool, ...] = ()
     """Of each group: it is to be read by a fast form, if that is answered at the start."""

@@ -100,11 +100,7 @@ def bus_plan(
         servos=servos,
         groups=reads.groups,
         reads=reads.plain,
-        limp=(
-            *_torque_off(line, servos),
-            *(line.write(servo.servo_id, servo.torque_address, b"\0") for servo in servos),
-        ),
-        torque_reads=tuple(line.read(servo.servo_id, servo.torque_address, 1) for servo in servos),
+        limp=tuple(_torque_off(line, servos)),
         budget=read_budget(line, reads.chosen, goals),
         fast=reads.fast,
         read_by=read_by(protocol, members, reads),
@@ -121,6 +117,16 @@ def plan_line(plan: BusPlan) -> Line:
         dialect_of(plan.protocol),
         device_margin_ns=plan.device_margin_ns,
     )
+
+
+def torque_off_ns(plan: BusPlan) -> int:
+    """Return how long torque off takes on a bus: to all at once, then to each servo, with read-back."""
+    line, total_ns = plan_line(plan), sum(each.due_ns for each in plan.limp)
+    for servo in plan.servos:
+        write = line.write(servo.servo_id, servo.torque_address, b"\0")
+        read = line.read(servo.servo_id, servo.torque_address, 1)
+        total_ns += write.due_ns + read.due_ns + 2 * plan.latency_ns
+    return total_ns
 
 
 def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:

@@ -83,6 +83,10 @@ class Access(NamedTuple):
         found = item.decode(back.parameters)
         return "" if found == value else f"was given {item.title} = {value}, but has {found}"
 
+    def read_torque(self) -> Program[Reply]:
+        """Read torque enable."""
+        return self.read_bytes(self.servo.torque_address, 1)
+
     def torque_off(self) -> Program[Reply]:
         """Write torque enable = 0."""
         return self.write_bytes(self.servo.torque_address, b"\0")

@@ -18,7 +18,6 @@ from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import Urgency
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.reboots import Reboots
@@ -127,7 +126,7 @@ class DesiredState:
             mode = yield from modes.mode_now(one)
             life.on(index, ServoEvent.DOUBT)
         else:
-            torque = yield from retry(one.plan.torque_reads[index])
+            torque = yield from one.read_torque()
             if not (torque.answered and torque.parameters[0] == 1):
                 life.on(index, ServoEvent.DOUBT)  # lost unnoticed, and a goal may switch it on
         self._changing[index] = False

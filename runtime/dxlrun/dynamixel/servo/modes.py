@@ -71,7 +71,7 @@ def enter(
     what is returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
     """
     desired = one.servo.mode_plan(mode)
-    torque = yield from one.read_bytes(one.servo.torque_address, 1)
+    torque = yield from one.read_torque()
     found = yield from one.read(register.name for register in desired.operating)
     if not torque.answered or found is None:
         return "did not answer when its mode was read"

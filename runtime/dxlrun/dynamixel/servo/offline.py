@@ -124,7 +124,7 @@ class Offline:
         """Bring a servo that answered to its desired state; return whether it has torque, and its mode."""
         life, one, servo = self.life, self.life.reach(index), self.life.plan.servos[index]
         if self.reboots.judge(index, reply) is None:
-            enabled = yield from retry(life.plan.torque_reads[index])
+            enabled = yield from one.read_torque()
             loss = life.losses.get(index)
             if loss is not None and loss.had_torque and enabled.answered and not enabled.parameters[0]:
                 self.reboots.count(index)
@@ -205,7 +205,7 @@ def rejoin(
     yield from settle(one, registers, found)
     if not found.problems and (problem := (yield from modes.enter(one, mode, again=False))):
         found.problems.append(f"{one} {problem}")
-    enabled = yield from one.read_bytes(one.servo.torque_address, 1)
+    enabled = yield from one.read_torque()
     if not enabled.answered:
         found.problems.append(f"{one} did not answer when its torque was read")
     if found.problems or not torque:

@@ -127,7 +127,7 @@ def meaning(item: ControlItem, value: int) -> str:
 
 
 def _torqued(one: Access, stored: Sequence[RegisterValue]) -> Program[str]:
-    reply = yield from one.read_bytes(one.servo.torque_address, 1)
+    reply = yield from one.read_torque()
     names = _names(one, stored)
     if not reply.answered:
         return f"did not answer when its torque was read, so {names} was not written"

@@ -90,7 +90,7 @@ class Requests:
             return f"{name} was switched off again meanwhile"
         if life.states[index] not in IN_DOUBT:
             return ""
-        back = yield from retry(life.plan.torque_reads[index])
+        back = yield from life.reach(index).read_torque()
         if back.answered and back.parameters[0] == 1:
             return ""
         return f"{name} did not confirm its torque; ask again when it answers"

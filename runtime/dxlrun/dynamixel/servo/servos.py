@@ -315,7 +315,8 @@ class Servos:
 
     def _read_torque(self, index: int) -> Program[None]:
         """Give goals again to a servo with torque, and none to one without."""
-        reply = yield from self._read(self._plan.torque_reads[index])
+        read = self.life.reach(index).reading(self._plan.servos[index].torque_address, 1)
+        reply = yield from self._read(read)
         if not reply.answered or index in self._strained or self.life.states[index] not in IN_DOUBT:
             return  # shut down, lost or released meanwhile: its torque limit or its return decides
         enabled = reply.parameters[0]

@@ -209,19 +209,19 @@ def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
 
 
 def _let_go(one: Access) -> Program[str]:
-    back = yield from one.read_bytes(one.servo.torque_address, 1)
+    back = yield from one.read_torque()
     if back.answered and back.parameters[0]:
         yield from one.torque_off()
-        back = yield from one.read_bytes(one.servo.torque_address, 1)
+        back = yield from one.read_torque()
     return "" if back.answered and not back.parameters[0] else "did not confirm that its torque is off"
 
 
 def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
     """Read torque enable of every servo again, after the last one got torque."""
-    for servo, read in zip(plan.servos, plan.torque_reads, strict=True):
+    for servo in plan.servos:
         if not servo.torque_at_start:
             continue
-        reply = yield from retry(read)
+        reply = yield from reach(plan, servo).read_torque()
         if not reply.answered:
             found.problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
         elif reply.parameters[0] != 1:

@@ -78,8 +78,7 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
     """
     yield listen(SETTLE_NS)
     for broadcast in plan.limp:
-        if not broadcast.awaited:
-            yield broadcast
+        _ = yield broadcast  # `yield from` would send the reply to a tuple
     every = [reach(plan, servo) for servo in plan.servos]
     details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
     late = False
@@ -125,7 +124,7 @@ def _stop(one: Access) -> Program[str | None]:
     mode = yield from modes.mode_now(one)
     if mode in _HOLD:
         return None
-    torque = yield from one.read_bytes(one.servo.torque_address, 1)
+    torque = yield from one.read_torque()
     if torque.answered and torque.parameters[0] == 0:
         return None
     if mode is Mode.UNKNOWN:

@@ -132,7 +132,7 @@ class ToolLine:
         port, latency_ns = self.port, self.port.most_latency_ns
         delay_ns = LONGEST_RETURN_DELAY_NS
         plan = BusPlan(
-            port.name, port.name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), (), _NOTHING
+            port.name, port.name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), _NOTHING
         )
         self.protocol, self.baud_rate = protocol, baud_rate
         self.line = Line(baud_rate, latency_ns, delay_ns, dialect_of(protocol))
