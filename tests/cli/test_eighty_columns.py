@@ -15,7 +15,7 @@ from dxlrun.cli.steering import steer, watch
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.output import terminal
 from dxlrun.output.table import Column, Table
-from dxlrun.remote.joints import states_of
+from dxlrun.remote.named.joints import states_of
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import run_summary
 from dxlrun.testing import plan_of, simulated_robot

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from dxlrun.cli.steering import goals, parameters, steer
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.client import Executed, GoalState, RemoteGoal
-from dxlrun.remote.replies import Parameter
+from dxlrun.remote.requests.replies import Parameter
 
 Dxlrun = Callable[..., Any]
 RUNNING = GoalState(3, "arm", "trajectory", "anna", "running", 0.5, 0.01, "")

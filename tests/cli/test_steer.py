@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import shlex
 import shutil
 import signal
@@ -496,7 +497,7 @@ def test_stop_waits_for_the_end_by_default(
 
 
 def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Path) -> None:
-    (script,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    script = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0]
     assert len(script.splitlines()) <= 30
     printed = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
@@ -505,6 +506,20 @@ def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Pat
     (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
     assert printed.stdout == shown
     assert torso.info()["rate"] == 40
+
+
+def test_the_policy_of_the_page_leads_an_arm(torso: RemoteRobot, tmp_path: Path) -> None:
+    text = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
+    (tmp_path / "policy.py").write_text(f"import time\n{text}")
+    program = runpy.run_path(str(tmp_path / "policy.py"))
+    elbow = torso.states().joints.index("left_elbow_joint")
+    began = torso.states().position[elbow]
+
+    program["follow"](
+        torso, lambda states: [[0.0, 0.0, began + 0.1 * step] for step in range(4)], seconds=0.2
+    )
+
+    assert torso.states().goal_position[elbow] != began
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl, which the page uses")

@@ -18,8 +18,8 @@ from dxlrun.cli.steering import watch
 from dxlrun.cli.steering.steer import Chosen
 from dxlrun.description.modes import Mode
 from dxlrun.output.table import Sentence
-from dxlrun.remote.joints import states_of
 from dxlrun.remote.live.states import RobotStates
+from dxlrun.remote.named.joints import states_of
 
 
 class Robot:

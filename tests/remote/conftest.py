@@ -27,7 +27,7 @@ from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.replies import FRAME_LENGTH, Frame
+from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
 
 PERIOD_NS = 20_000_000
 

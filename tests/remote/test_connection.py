@@ -20,7 +20,7 @@ from dxlrun.channels.heartbeat import Phase
 from dxlrun.remote import gateway, server
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.remote.live.topics import framed
-from dxlrun.remote.replies import RunEnded
+from dxlrun.remote.requests.replies import RunEnded
 from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS, serve
 from dxlrun.remote.sockets import MOST_BYTES, SocketLink
 

@@ -21,9 +21,10 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.compile.joints.limits import BeyondLimit
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.remote import gateway, link, server
-from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
+from dxlrun.remote import asked, link, server
 from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
+from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests.table import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True, "cycle": 0}
@@ -261,7 +262,7 @@ def test_of_a_body_without_end_a_mebibyte_is_read_and_no_more(desk):
 
 
 def test_a_body_that_stops_in_the_middle_is_given_up(desk, monkeypatch):
-    monkeypatch.setattr(gateway, "BODY_S", 0.01)
+    monkeypatch.setattr(asked, "BODY_S", 0.01)
     status, content = desk.ask("POST", GO, chunks=[chunk(b'{"posi')])
     assert (status, content["refused"]) == (408, "the request did not arrive within 0.01 s")
     assert desk.taken == []
@@ -315,7 +316,7 @@ def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(des
             await desk.request("POST", SET_POINT, {"positions": [0]}, client=(f"process {process}", 0))
 
     asyncio.run(flood())
-    assert len(desk.gateway._allowances[gateway.MOST_SET_POINTS]._left) == gateway.MOST_PEERS
+    assert len(desk.gateway._allowances[requests.MOST_SET_POINTS]._left) == asked.MOST_PEERS
     assert len(desk.take()) == 1
 
 
@@ -472,8 +473,7 @@ def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it
         yield {"type": "http.request", "body": b"[0]}"}
 
     status, told = asyncio.run(desk.request("POST", SET_POINT, chunks=chunks()))
-    refused = {"refused": "left was unloaded meanwhile", "code": "unloaded", "fields": {"controller": "left"}}
-    assert (status, told) == (404, refused)
+    assert (status, told["code"]) == (404, "unknown_controller")
     assert list(desk.mailbox.take()) == []
 
 
@@ -603,9 +603,9 @@ def test_every_refusal_has_a_sentence_of_its_fields(code):
 
 def test_the_page_gives_the_limits_that_are_kept():
     page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
-    rates = f"{gateway.MOST_LOOKS:.0f} GETs, {gateway.MOST_SET_POINTS:.0f} set-points or"
-    assert f"{rates} {gateway.MOST_OPERATIONS:.0f} other requests a second" in page
-    assert f"{gateway.CHARGED_BYTES >> 10} KiB of a body count as one more" in page
+    rates = f"{requests.MOST_LOOKS:.0f} GETs, {requests.MOST_SET_POINTS:.0f} set-points or"
+    assert f"{rates} {requests.MOST_OPERATIONS:.0f} other requests a second" in page
+    assert f"{asked.CHARGED_BYTES >> 10} KiB of a body count as one more" in page
     assert f"within {link.ANSWER_S:g} s and two of its periods, {2 * link.ANSWER_S:g} s at most" in page
     assert f"of the last {link.KEPT_EVENTS} events (fewer when their texts have more than" in page
     assert f"more than {link.KEPT_TEXT >> 20} MiB together" in page

@@ -23,7 +23,7 @@ from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.remote.live.listening import Listening
 from dxlrun.remote.live.topics import framed
-from dxlrun.remote.replies import Opened, RunEnded, Sample
+from dxlrun.remote.requests.replies import Opened, RunEnded, Sample
 from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\

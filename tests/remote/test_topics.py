@@ -16,7 +16,7 @@ from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.live.topics import MOST_RECORDS
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.replies import Opened, Sample
+from dxlrun.remote.requests.replies import Opened, Sample
 
 
 @dataclass

@@ -63,7 +63,6 @@ class Code(StrEnum):
     NAME_TAKEN = "name_taken", "there is a controller {controller} already"
     TOO_MANY_CONTROLLERS = "too_many_controllers", "there are {most} controllers, which is the most"
     NOT_IN_PAUSE = "not_in_pause", "pause the loop first: it stands still meanwhile"
-    UNLOADED = "unloaded", "{controller} was unloaded meanwhile"
     # goals and parameters
     UNKNOWN_TOPIC = "unknown_topic", "there is no topic {topic}; there are {topics}"
     UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"

@@ -13,50 +13,11 @@ import msgspec
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
+from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
-
-
-class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `torque`."""
-
-    joints: tuple[str, ...]
-    on: bool
-    release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle; those of positions may stay when
-    torque is switched on."""
-
-
-class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `reboot`."""
-
-    joints: tuple[str, ...]
-    release: bool = False
-
-
-class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Data of `get`."""
-
-    joint: str
-    """Or one of its servos, where it has several"""
-    item: str
-    row: int | None = None
-    """Of that servo, behind those of the joints"""
-
-
-class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Data of `register`; whether the item may be written was checked before."""
-
-    joint: str
-    """Or one of its servos, where it has several"""
-    item: str
-    value: int
-    """The integer on the wire, signed where the item is."""
-    row: int | None = None
-    """Of that servo, behind those of the joints"""
-
 
 _LED = (Mode.POSITION, Mode.EFFORT_POSITION)
 

@@ -15,17 +15,22 @@ from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.loop_requests import (
+    Cancel,
+    Parameters,
+    Rate,
+    RebootRequest,
+    Register,
+    RegisterReading,
+    Switch,
+    TorqueRequest,
+    Unload,
+)
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
-from dxlrun.control.joint_requests import (
-    JointRequests,
-    RebootRequest,
-    Register,
-    RegisterReading,
-    TorqueRequest,
-)
+from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.schedule import Schedule
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.plan.policy_plan import PolicyName
@@ -43,45 +48,10 @@ LONGEST_SHOWN = 120
 """Characters of a command's data in the event that reports it."""
 
 
-class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
-
-    activate: tuple[str, ...] = ()
-    deactivate: tuple[str, ...] = ()
-
-
-class Rate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `rate`."""
-
-    rate: float
-    """Hz"""
-
-
-class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `unload`."""
-
-    controller: str
-
-
-class Cancel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `cancel`: a goal by its number, or the one that a controller has."""
-
-    goal: int = 0
-    controller: str = ""
-
-
 class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `play`: what controllers are given from this cycle on; the array has all commands in a row."""
 
     parts: tuple[PlayedPart, ...]
-
-
-class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `parameters`: live parameters of a controller, checked against its model before."""
-
-    controller: str
-    values: dict[str, bool | int | float]
-    """By dotted name, in SI units."""
 
 
 FORMS: Mapping[str, type[msgspec.Struct] | None] = {

@@ -18,26 +18,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
-from urllib.parse import quote
+from typing import TYPE_CHECKING, TypeAlias
+from urllib.parse import quote, urlencode
 
 import msgspec
 from msgspec.structs import asdict
 
+from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
-from dxlrun.remote import replies
 from dxlrun.remote.live.listening import Listening, TopicMessage
-from dxlrun.remote.replies import (
-    Changed,
-    Clamped,
-    Goals,
-    GoalState,
-    NotDone,
-    Parameter,
-    Parameters,
-    Topics,
-    TopicState,
-)
+from dxlrun.remote.requests import replies
+from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
+from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Request, Row, Value
 from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, running, sockets
 
 if TYPE_CHECKING:
@@ -65,9 +58,6 @@ _FEEDBACK_S = 0.1
 """How long one request waits for the end of a goal, without and with progress to report."""
 _WRONG_INPUT = (404, 413, 422)
 """Statuses of requests that would be refused at any time: no such thing, too long, not as they must be."""
-
-
-Reply = TypeVar("Reply")
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,13 +141,13 @@ class RemoteRobot:
 
     def info(self) -> dict[str, object]:
         """Return rate, cycles, log, and the controllers with the commands that they take."""
-        return self._ask("GET", "/robot", dict[str, object])
+        return self._decoded(self._asked(requests.ROBOT), Row)
 
     def states(self) -> RobotStates:
         """Return the newest cycle: arrays with a row for each joint, device state, controller; SI units."""
         from dxlrun.remote.live.states import RobotStates, array  # numpy: most commands ask for none
 
-        return self._ask("GET", "/states", RobotStates, hook=array)
+        return self._decoded(self._asked(requests.STATES), RobotStates, array)
 
     def frames(self) -> FrameTree:
         """Return the robot's frames after its URDF: `pose` computes where one lies at any positions.
@@ -168,19 +158,18 @@ class RemoteRobot:
             from dxlrun.description.frames.tree import FramesPlan, FrameTree  # most clients ask for none
             from dxlrun.description.frames.urdf import read_urdf
 
-            found = self._ask("GET", "/frames", dict[str, object])
-            if not isinstance(urdf := found.get("urdf"), str):
+            found = self._ask(requests.FRAMES)
+            if found.urdf is None:
                 raise DxlrunError(
                     f"{self.name} has no URDF; its robot file names one by `model: {{urdf: ...}}`"
                 )
-            plan = msgspec.convert(found.get("frames"), FramesPlan)
-            self._frames = FrameTree(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
+            plan = msgspec.convert(found.frames, FramesPlan)
+            self._frames = FrameTree(read_urdf(found.urdf), plan.moved, plan.imu, plan.imu_link)
         return self._frames
 
     def urdf(self) -> str:
         """Return the text of the robot's URDF; empty: it has none."""
-        found = self._ask("GET", "/frames", dict[str, object])
-        return str(found.get("urdf") or "")
+        return self._ask(requests.FRAMES).urdf or ""
 
     def pose(self, of: str, relative_to: str = "") -> Transform:
         """Return where a frame lies now in another one, by default in the root: m, and a unit quaternion.
@@ -196,13 +185,13 @@ class RemoteRobot:
 
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""
-        return self._ask("GET", f"/events?after={after}", dict[str, object])
+        return self._decoded(self._asked(requests.EVENTS, query={"after": after}), Row)
 
     # Topics
 
     def topics(self) -> list[TopicState]:
         """Return what there is to listen to."""
-        return list(self._ask("GET", "/topics", Topics).topics)
+        return list(self._ask(requests.TOPICS).topics)
 
     def newest(self, topic: str) -> TopicMessage | None:
         """Return the newest message of a topic; None when it had none yet."""
@@ -224,7 +213,10 @@ class RemoteRobot:
 
     def _listen(self, topics: Sequence[str], query: str) -> Listening:
         names = "&".join(f"topic={quote('/' + topic.lstrip('/'))}" for topic in topics)
-        status, first, end = self._reached(lambda: self.link.stream(f"/stream?{names}{query}"))
+        try:
+            status, first, end = self.link.stream(f"{requests.STREAM.path}?{names}{query}")
+        except (OSError, ValueError) as error:
+            raise self._gone(error) from error
         if status >= 400:
             end.close()
             raise self._refused(status, first)
@@ -234,13 +226,12 @@ class RemoteRobot:
 
     def goals(self) -> list[GoalState]:
         """Return the goals that run, and the last 100 that ended."""
-        found = self._ask("GET", "/goals", Goals)
+        found = self._ask(requests.GOALS)
         return sorted((*found.running, *found.ended), key=lambda goal: goal.number)
 
     def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
         """Return one goal; with `wait`, at most 5 s, when it has ended or after that time."""
-        query = f"?wait={wait:g}" if wait else ""
-        return self._ask("GET", f"/goals/{number}{query}", GoalState)
+        return self._ask(requests.GOAL, number, query={"wait": f"{wait:g}"} if wait else {})
 
     def wait(
         self,
@@ -271,9 +262,9 @@ class RemoteRobot:
         Raises Refused when it has ended already, and when it is being cancelled already.
         """
         if isinstance(goal, str):
-            return self._execute(f"/controllers/{_quoted(goal)}/cancel")
+            return self._execute(requests.CANCEL_OF, goal)
         number = goal.number if isinstance(goal, RemoteGoal) else goal
-        return self._execute(f"/goals/{number}/cancel")
+        return self._execute(requests.CANCEL, number)
 
     # Parameters
 
@@ -283,7 +274,7 @@ class RemoteRobot:
 
     def parameter_table(self, controller: str) -> tuple[Parameter, ...]:
         """Return name, value, live, range and description of each parameter of a controller."""
-        return self._ask("GET", f"/controllers/{_quoted(controller)}/parameters", Parameters).parameters
+        return self._ask(requests.PARAMETERS, controller).parameters
 
     def set_parameters(
         self, controller: str, values: Mapping[str, bool | float | str]
@@ -292,8 +283,7 @@ class RemoteRobot:
 
         Values are written as in the robot file: `{"gains.p": 4.0, "speed": "20 deg/s"}`.
         """
-        path = f"/controllers/{_quoted(controller)}/parameters"
-        found = self._ask("POST", path, Changed, {"values": dict(values)})
+        found = self._ask(requests.CHANGE, controller, body=NewValues(dict(values)))
         return {one.name: (one.old, one.new) for one in found.changed}
 
     # Steering
@@ -316,9 +306,8 @@ class RemoteRobot:
         others keep their newest goals. A trajectory controller leads them there in `seconds`. Commands of a
         device: `send("board", "device_commands", {"led": 1})`, which the controller gets that has them.
         """
-        path = f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}"
-        query = [*(["units=true"] if units else []), *([] if seconds is None else [f"in={seconds!r}"])]
-        return self._execute(f"{path}?{'&'.join(query)}" if query else path, command)
+        query = ({"units": "true"} if units else {}) | ({} if seconds is None else {"in": repr(seconds)})
+        return self._execute(requests.COMMAND, controller, kind, body=_json(command), query=query)
 
     def play(self, motion: Path | str, speed: float = 1.0) -> Executed:
         """Play a motion file, `speed` times as fast; returns when its controllers have begun, all in one
@@ -327,7 +316,7 @@ class RemoteRobot:
         Raises Refused with all that is wrong with the file, or with the robot for it.
         """
         text = Path(motion).read_text(encoding="utf-8")
-        return self._execute("/play", {"file": str(motion), "text": text, "speed": speed})
+        return self._execute(requests.PLAY, body=NewMotion(text, str(motion), speed))
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
@@ -338,7 +327,7 @@ class RemoteRobot:
 
         Where servos must change their mode first, that takes longer; raises Refused when one does not.
         """
-        return self._execute("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
+        return self._execute(requests.SWITCH, body=Switch(tuple(activate), tuple(deactivate)))
 
     def get(self, joint: str, item: str = "") -> dict[str, object]:
         """Return a joint's newest state, SI units, or an item of its servo's memory, read in idle time.
@@ -347,8 +336,7 @@ class RemoteRobot:
 
         Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
         """
-        path = f"/joints/{_quoted(joint)}"
-        return self._ask("GET", f"{path}/registers/{_quoted(item)}" if item else path, dict[str, object])
+        return self._ask(requests.READ_REGISTER, joint, item) if item else self._ask(requests.JOINT, joint)
 
     def torque(self, joints: str | Sequence[str], on: bool, *, release: bool = False) -> Executed:
         """Switch the torque of joints on or off; returns when it was read back.
@@ -357,14 +345,14 @@ class RemoteRobot:
         start, and holds where it stands. Off: it is limp until its torque is switched on, whatever policies
         say. Refused while a controller commands one of them, unless `release` deactivates that.
         """
-        return self._execute("/torque", {"joints": _listed(joints), "on": on, "release": release})
+        return self._execute(requests.TORQUE, body=TorqueRequest(_listed(joints), on, release))
 
     def reboot(self, joints: str | Sequence[str], *, release: bool = False) -> Executed:
         """Reboot the servos of joints (Protocol 2.0); returns when they are in order again.
 
         That clears a hardware error. They have torque afterwards if they had it before.
         """
-        return self._execute("/reboot", {"joints": _listed(joints), "release": release})
+        return self._execute(requests.REBOOT, body=RebootRequest(_listed(joints), release))
 
     def set_register(self, joint: str, item: str, value: int | str) -> Executed:
         """Write a RAM item of a joint's servo, such as a gain; returns when it was read back.
@@ -372,11 +360,11 @@ class RemoteRobot:
         `value` is the integer of the e-Manual, or a quantity with its unit: `10 rad/s^2`. A servo that is
         reset in the run gets it again.
         """
-        return self._execute(f"/joints/{_quoted(joint)}/registers/{_quoted(item)}", {"value": value})
+        return self._execute(requests.REGISTER, joint, item, body=Value(value))
 
     def rate(self, rate: float) -> Executed:
         """Let the loop run at another rate, Hz."""
-        return self._execute("/rate", {"rate": rate})
+        return self._execute(requests.RATE, body=Rate(rate))
 
     def halt(self) -> Executed:
         """Deactivate all controllers that command joints; returns when every joint stands still and holds.
@@ -384,23 +372,23 @@ class RemoteRobot:
         `halted` of the answer has how long that took, and the fastest joint. Raises Refused with the code
         `still_moving` when one does not after five seconds.
         """
-        return self._execute("/halt")
+        return self._execute(requests.HALT)
 
     def pause(self) -> Executed:
         """Hold the joints, and stop the controllers' time."""
-        return self._execute("/pause")
+        return self._execute(requests.PAUSE)
 
     def resume(self) -> Executed:
         """Let the controllers' time run again, from where it was."""
-        return self._execute("/resume")
+        return self._execute(requests.RESUME)
 
     def load(self, name: str, entry: Mapping[str, object]) -> Executed:
         """Load a controller into the paused loop; `entry` is written as in the robot file."""
-        return self._execute("/controllers", {**entry, "name": name})
+        return self._execute(requests.LOAD, body={**entry, "name": name})
 
     def unload(self, name: str) -> Executed:
         """Take a controller that is not active out of the paused loop."""
-        return self._execute(f"/controllers/{_quoted(name)}", method="DELETE")
+        return self._execute(requests.UNLOAD, name)
 
     def stop(self, wait: bool = True) -> None:
         """End the run in order; with `wait`, return when it has ended and its log is closed.
@@ -424,7 +412,7 @@ class RemoteRobot:
     def _stopping(self) -> bool:
         """Ask once to stop; False when the connection was closed by a gateway that is alive."""
         try:
-            self._execute("/stop")
+            self._execute(requests.STOP)
         except Refused:
             raise
         except DxlrunError as error:
@@ -435,27 +423,51 @@ class RemoteRobot:
         return True
 
     def _execute(
-        self, path: str, content: Mapping[str, object] | None = None, method: str = "POST"
+        self,
+        request: Request[Body, replies.Executed[int]],
+        *names: object,
+        body: Body | None = None,
+        query: Mapping[str, object] = {},
     ) -> Executed:
-        done = self._ask(method, path, replies.Executed[int], content)
-        goals = tuple(RemoteGoal(self, number) for number in done.goals)
+        done = self._ask(request, *names, body=body, query=query)
+        goals = tuple([RemoteGoal(self, number) for number in done.goals])
         return Executed(**asdict(done) | {"goals": goals})
 
     def _ask(
         self,
-        method: str,
-        path: str,
-        reply: type[Reply],
-        content: Mapping[str, object] | None = None,
-        hook: Callable[[type, object], object] | None = None,
-    ) -> Reply:
-        """Ask, and return the reply; raises Refused."""
-        body = None if content is None else _json(content)
-        status, answer = self._reached(lambda: self.link.exchange(method, path, body))
+        request: Request[Body, Answer],
+        *names: object,
+        body: Body | None = None,
+        query: Mapping[str, object] = {},
+    ) -> Answer:
+        """Ask, and return the answer; `names`: of its path. Raises Refused."""
+        return self._decoded(self._asked(request, *names, body=body, query=query), request.answer)
+
+    def _asked(
+        self,
+        request: Request[Body, Answer],
+        *names: object,
+        body: Body | None = None,
+        query: Mapping[str, object] = {},
+    ) -> bytes:
+        """Ask, and return the answer as it came; raises Refused."""
+        path = request.target(*names)
+        content = body if body is None or isinstance(body, bytes) else _json(body)
+        try:
+            target = f"{path}?{urlencode(query)}" if query else path
+            status, answer = self.link.exchange(request.method, target, content)
+        except (OSError, ValueError) as error:
+            raise self._gone(error) from error
         if status >= 400:
             raise self._refused(status, answer)
+        return answer
+
+    def _decoded(
+        self, answer: bytes, kind: type[Answer], hook: Callable[[type, object], object] | None = None
+    ) -> Answer:
+        """Return an answer as what it is."""
         try:
-            return msgspec.json.decode(answer, type=reply, dec_hook=hook)
+            return msgspec.json.decode(answer, type=kind, dec_hook=hook)
         except msgspec.MsgspecError as error:
             raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
 
@@ -468,26 +480,19 @@ class RemoteRobot:
         sentence, wrong = refused.refused or f"HTTP status {status}", status in _WRONG_INPUT
         return Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
-    def _reached(self, ask: Callable[[], Reply]) -> Reply:
-        """Return an answer of the link; raises DxlrunError when there is none."""
-        try:
-            return ask()
-        except (OSError, ValueError) as error:
-            why = str(error) or type(error).__name__
-            raise DxlrunError(f"{self.name} no longer answers: {why}") from error
+    def _gone(self, error: Exception) -> DxlrunError:
+        """Return the exception for a link without an answer."""
+        return DxlrunError(f"{self.name} no longer answers: {str(error) or type(error).__name__}")
 
 
-def _listed(names: str | Sequence[str]) -> list[str]:
-    return [names] if isinstance(names, str) else list(names)
+def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
-def _quoted(name: str) -> str:
-    return quote(name, safe="")
-
-
-def _json(content: Mapping[str, object]) -> bytes:
+def _json(content: object) -> bytes:
     """Return the body of a request; arrays of numpy are lists there. Raises Refused for what is none."""
     try:
+        content = asdict(content) if isinstance(content, msgspec.Struct) else content
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         where = None if isinstance(error, RecursionError) else _not_finite(content)
@@ -534,15 +539,15 @@ class Stream:
     """
 
     def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
-        self._robot = robot
-        self._path = f"/controllers/{_quoted(controller)}/set-points/{_quoted(kind)}?lease={lease:g}"
+        self._robot, self._names, self._query = robot, (controller, kind), {"lease": f"{lease:g}"}
         self.clamped = 0
         self.clamped_joints: tuple[str, ...] = ()
 
     def send(self, command: Mapping[str, object]) -> int:
         """Leave the newest set-point, before the loop has taken it; return how many of its values are
         beyond their joints' limits."""
-        found = self._robot._ask("POST", self._path, Clamped, command)
+        body = _json(command)
+        found = self._robot._ask(requests.SET_POINT, *self._names, body=body, query=self._query)
         self.clamped_joints = found.clamped_joints
         self.clamped += found.clamped
         return found.clamped

@@ -1,6 +1,6 @@
 """Gateway: what can be asked of a running robot, over HTTP on a Unix socket; JSON in, JSON out.
 
-REQUESTS has all of it, docs/steering.md what each means. The answer is
+`requests.py` has all of it, docs/steering.md what each means. The answer is
 `{"done": true, "cycle": N}`, of a goal with its number in `"goals"`, of a set-point instead `"clamped"`, the
 number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
 "fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the
@@ -10,21 +10,20 @@ reason with its data.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 import traceback
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, TypeAlias
 
 import msgspec
+import starlette.requests
 from msgspec.structs import replace
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
@@ -32,15 +31,19 @@ from dxlrun.channels.answers import Code, Done, Field, Refusal
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.heartbeat import Phase
+from dxlrun.channels.loop_requests import Cancel, Rate, RebootRequest, Switch, TorqueRequest, Unload
 from dxlrun.contract.controller import Outcome
-from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
-from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.remote.asked import Allowance, Asked, peer, received
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
-from dxlrun.remote.joints import (
+from dxlrun.remote.link import Link, Loaded
+from dxlrun.remote.live.states import RobotStates, encoded
+from dxlrun.remote.live.topics import TopicStream, framed
+from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
+from dxlrun.remote.named.joints import (
     effort_units,
     joint_row,
     named_joints,
@@ -51,12 +54,9 @@ from dxlrun.remote.joints import (
     require_reboots,
     states_of,
 )
-from dxlrun.remote.link import Link, Loaded
-from dxlrun.remote.live.states import RobotStates, encoded
-from dxlrun.remote.live.topics import TopicStream, framed
-from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
-from dxlrun.remote.named_commands import DEVICE_COMMANDS, device_command, joint_command
-from dxlrun.remote.parameters import Change, changed, parameters_of
+from dxlrun.remote.named.named_commands import DEVICE_COMMANDS, INTERFACES, device_command, joint_command
+from dxlrun.remote.named.parameters import Change, changed, parameters_of
+from dxlrun.remote.openapi import openapi
 from dxlrun.remote.preparation import (
     Preparation,
     RefusedRequest,
@@ -64,34 +64,28 @@ from dxlrun.remote.preparation import (
     refused,
     unknown_controllers,
 )
-from dxlrun.remote.replies import (
+from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests.replies import (
     FRAME_LENGTH,
     Changed,
     Clamped,
+    ControllerInfo,
+    EventRow,
+    Events,
     Executed,
+    Frames,
     Goals,
+    GoalState,
     NotDone,
     Parameters,
+    RobotInfo,
     RunEnded,
     Topics,
-    Written,
 )
-from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.remote.requests.table import REQUESTS, Answer, Body, NewMotion, NewValues, Request, Row, Value
 
-MOST_OPERATIONS = 200.0
-MOST_SET_POINTS = 4000.0
-MOST_LOOKS = 2000.0
-"""A second, of one process; a short burst may be as many at once as come in a tenth of it."""
-MOST_PEERS = 256
-"""Processes whose allowance is kept."""
-CHARGED_BYTES = 16_384
-"""So many bytes of a body count as one request more."""
-BODY_S = 10.0
-"""How long a body may take to arrive."""
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
-LONGEST_WAIT_S = 5.0
-"""For the end of a goal; a client that waits longer asks again."""
 _SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.0005, 0.02
 """Between two looks of a stream into the rings: half a period of the loop, within these."""
 BEAT_S = 2.0
@@ -105,7 +99,6 @@ MOTION_S = 8.0
 LONGEST_FILE = 200
 MOST_MISTAKES = 20
 """Of a motion, in an answer."""
-LONGEST_ORIGIN = 64
 LONGEST_SENTENCE = 2000
 _STATUS = {
     Code.UNKNOWN_CONTROLLER: 404,
@@ -113,7 +106,6 @@ _STATUS = {
     Code.UNKNOWN_JOINT: 404,
     Code.UNKNOWN_REGISTER: 404,
     Code.UNKNOWN_PAGE: 404,
-    Code.UNLOADED: 404,
     Code.UNKNOWN_GOAL: 404,
     Code.UNKNOWN_TOPIC: 404,
     Code.UNKNOWN_PARAMETER: 404,
@@ -139,29 +131,20 @@ _STATUS = {
 _CONFLICT = 409
 """Status of all other refusals: what the loop or a controller cannot do now."""
 
-T = TypeVar("T")
+_Handler: TypeAlias = Callable[["GatewayApp", Asked[Body]], Awaitable[Answer | Response]]
+_HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
 
 
-class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a register's request: the integer on the wire, or a quantity with its unit."""
+def _answers(
+    request: Request[Body, Answer],
+) -> Callable[[_Handler[Body, Answer]], _Handler[Body, Answer]]:
+    """Mark what answers a request."""
 
-    value: int | str
+    def note(handler: _Handler[Body, Answer]) -> _Handler[Body, Answer]:
+        _HANDLERS[request] = handler
+        return handler
 
-
-class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a change of live parameters: values as in the robot file, by dotted name."""
-
-    values: dict[str, Written]
-
-
-class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a motion that is to be played."""
-
-    text: str
-    """Of the motion file."""
-    file: str = "motion"
-    """Its name, for the places of mistakes and the log."""
-    speed: float = 1.0
+    return note
 
 
 class GatewayApp:
@@ -177,8 +160,7 @@ class GatewayApp:
         self._link = link
         self._preparation = preparation
         self._log = log
-        rates = (MOST_OPERATIONS, MOST_SET_POINTS, MOST_LOOKS)
-        self._allowances = {rate: Allowance(rate, now) for rate in rates}
+        self._allowances = {one.rate: Allowance(one.rate, now) for one in REQUESTS if one.rate}
         self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
@@ -192,17 +174,17 @@ class GatewayApp:
         app.router.redirect_slashes = False
         return app
 
-    def _answered(self, asked: Asked) -> Callable[[Request], Awaitable[Response]]:
+    def _answered(
+        self, request: Request[Body, Answer]
+    ) -> Callable[[starlette.requests.Request], Awaitable[Response]]:
         """Return what answers a request: its body is read, and what a client may ask a second is kept."""
-        allowance = self._allowances[asked.rate] if asked.rate else None
-        handler = partial(asked.handler, self)
+        allowance, handler = self._allowances.get(request.rate), _HANDLERS[request]
 
-        async def answer(request: Request) -> Response:
+        async def answer(http: starlette.requests.Request) -> Response:
             try:
                 if allowance is not None:
-                    allowance.spend(peer(request))
-                given = () if asked.body is None else (await typed(request, asked.body),)
-                return _response(await handler(request, *given))
+                    allowance.spend(peer(http))
+                return _response(await handler(self, await received(request, http, allowance)))
             except RefusedRequest as error:
                 return _refused(error.refusal)
             except ClientDisconnect:
@@ -212,54 +194,54 @@ class GatewayApp:
             except Exception as error:  # the last resort: one request fails, and the gateway serves the next
                 traceback.print_exc()
                 return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
-            finally:
-                if allowance is not None:
-                    allowance.charge(peer(request), getattr(request.state, "received", 0))
 
         return answer
 
     # Looking
 
-    async def robot(self, request: Request) -> object:
+    @_answers(requests.ROBOT)
+    async def robot(self, asked: Asked[None]) -> RobotInfo:
         """Return the run, its controllers and the commands that they take."""
-        link = self._link
-        return {
-            "robot": link.plan.robot,
-            "rate": link.rate,
-            "paused": link.paused,
-            "cycles": link.heartbeat.cycles,
-            "skipped": link.heartbeat.skipped,
-            "joints": [joint.name for joint in link.plan.loop.joints],
-            "groups": link.plan.groups,
-            "units": {joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints},
-            "effort_units": effort_units(link.plan),
-            "limits": {one.name: (one.lower, one.upper) for one in link.plan.loop.joints if one.bounded},
-            "speeds": {one.name: one.highest_speed for one in link.plan.loop.joints},  # null: without a limit
-            "controllers": [self._shown(one) for one in link.controllers.values()],
-            "sources": link.plan.loop.sources,
-            "file": str(Path(link.plan.source_file).absolute()),
-            "log": self._log,
-        }
+        link, plan = self._link, self._link.plan
+        joints = plan.loop.joints
+        return RobotInfo(
+            robot=plan.robot,
+            rate=link.rate,
+            paused=link.paused,
+            cycles=link.heartbeat.cycles,
+            skipped=link.heartbeat.skipped,
+            joints=tuple(joint.name for joint in joints),
+            groups=dict(plan.groups),
+            units={joint.name: position_unit(plan, joint.name) for joint in joints},
+            effort_units=effort_units(plan),
+            limits={one.name: (one.lower, one.upper) for one in joints if one.bounded},
+            speeds={one.name: one.highest_speed for one in joints},  # JSON has null for infinite ones
+            controllers=tuple(self._shown(one) for one in link.controllers.values()),
+            sources=plan.loop.sources,
+            file=str(Path(plan.source_file).absolute()),
+            log=self._log,
+        )
 
-    def _shown(self, loaded: Loaded) -> dict[str, object]:
+    def _shown(self, loaded: Loaded) -> ControllerInfo:
         plan = loaded.plan
-        return {
-            "name": plan.name,
-            "type": plan.type,
-            "active": self._link.active(loaded),
-            "held": loaded.held,
-            "rate": plan.rate or self._link.rate,
-            "joints": plan.joints,
-            "command": plan.command,
-            "into": plan.into,
-            "fallback": plan.fallback,
-            "reference": plan.reference,
-            "reads": plan.reads,
-            "takes": self._preparation.takes(plan),
-            "goals": self._preparation.goals(plan),
-        }
+        return ControllerInfo(
+            name=plan.name,
+            type=plan.type,
+            active=self._link.active(loaded),
+            held=loaded.held,
+            rate=plan.rate or self._link.rate,
+            joints=plan.joints,
+            command=plan.command,
+            into=plan.into,
+            fallback=plan.fallback,
+            reference=plan.reference,
+            reads=plan.reads,
+            takes=self._preparation.takes(plan),
+            goals=tuple(self._preparation.goals(plan)),
+        )
 
-    async def states(self, request: Request) -> object:
+    @_answers(requests.STATES)
+    async def states(self, asked: Asked[None]) -> Response:
         """Return the newest cycle; numbers that are not known are null."""
         return Response(encoded(self._states()), media_type="application/json")
 
@@ -274,45 +256,42 @@ class GatewayApp:
             raise refused(Code.NO_CYCLE, {})
         return record
 
-    async def frames(self, request: Request) -> object:
+    @_answers(requests.FRAMES)
+    async def frames(self, asked: Asked[None]) -> Frames:
         """Return the URDF and what moves it: a client computes where frames lie by itself."""
         plan = self._link.plan
-        return {"urdf": plan.urdf, "frames": plan.frames}
+        return Frames(plan.urdf, plan.frames)
 
-    async def events(self, request: Request) -> object:
+    @_answers(requests.EVENTS)
+    async def events(self, asked: Asked[None]) -> Events:
         """Return the events after number `after` that are kept; `last` is the newest's number."""
-        after = number(request, "after", 0.0)
-        newest = self._link.events[-1][0] if self._link.events else 0
-        rows = [
-            {
-                "number": n,
-                "time": event.t_ns * 1e-9,
-                "name": event.name,
-                "severity": event.severity,
-                "source": event.source,
-                "text": event.text,
-            }
-            for n, event in self._link.events
-            if n > after
-        ]
-        return {"events": rows, "last": newest}
+        after, kept = asked.number("after", 0.0), self._link.events
+        rows = (
+            EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text)
+            for number, one in kept
+            if number > after
+        )
+        return Events(tuple(rows), kept[-1][0] if kept else 0)
 
-    async def topics(self, request: Request) -> object:
+    @_answers(requests.TOPICS)
+    async def topics(self, asked: Asked[None]) -> Topics:
         """Return all topics, with their types and rates."""
         return Topics((*self._link.topic_states(),))
 
-    async def stream(self, request: Request) -> object:
+    @_answers(requests.STREAM)
+    async def stream(self, asked: Asked[None]) -> Response:
         """Stream the messages of topics as frames, see `Frame`, until the run ends."""
-        topics, rate = request.query_params.getlist("topic"), number(request, "rate", MOST_LOOKS)
+        query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
+        topics = query.getlist("topic")
         if not topics or rate <= 0:
             raise invalid(
                 "name a topic, and a rate above 0 Hz; write for example /stream?topic=/joint_states"
             )
-        stream = self._link.listen(topics, newest="newest" in request.query_params)
-        once = "once" in request.query_params
-        return StreamingResponse(self._frames(stream, rate, once), media_type="application/octet-stream")
+        stream = self._link.listen(topics, newest="newest" in query)
+        frames = self._frames(stream, rate, once="once" in query)
+        return StreamingResponse(frames, media_type="application/octet-stream")
 
-    async def _frames(self, stream: TopicStream, rate: float, once: bool) -> AsyncIterator[bytes]:
+    async def _frames(self, stream: TopicStream, rate: float, *, once: bool) -> AsyncIterator[bytes]:
         look_s = min(_LONGEST_LOOK_S, max(_SHORTEST_LOOK_S, 0.5 / self._link.rate))
         sent = due = time.monotonic()
         while True:
@@ -330,35 +309,39 @@ class GatewayApp:
             await asyncio.sleep(0 if stream.behind else look_s)
         yield framed(RunEnded())
 
-    async def goals(self, request: Request) -> object:
+    @_answers(requests.GOALS)
+    async def goals(self, asked: Asked[None]) -> Goals:
         """Return the goals that run, and the last that ended."""
         book = self._link.goals
         return Goals((*book.running.values(),), (*book.ended.values(),))
 
-    async def goal(self, request: Request) -> object:
+    @_answers(requests.GOAL)
+    async def goal(self, asked: Asked[None]) -> GoalState:
         """Return one goal; with `wait`, s, when it has ended or after that time."""
-        wanted, chosen, goals = waiting(request), _goal_number(request), self._link.goals
+        wait_s, chosen, goals = asked.wait_s, asked.goal, self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
         if goals.status(chosen).ended is None and not running:
             await goals.wait(chosen, _ENDING_S)
             if goals.status(chosen).ended is None:
                 raise refused(Code.RUN_ENDING, {})
-        await goals.wait(chosen, wanted)
+        await goals.wait(chosen, wait_s)
         return goals.status(chosen)
 
     # Steering
 
-    async def cancel(self, request: Request) -> object:
+    @_answers(requests.CANCEL)
+    @_answers(requests.CANCEL_OF)
+    async def cancel(self, asked: Asked[None]) -> Executed[int]:
         """Cancel a goal by its number, or the one that a controller has; answer with its number."""
-        if "number" in request.path_params:
-            wanted = Cancel(goal=_goal_number(request))
+        if "number" in asked.http.path_params:
+            wanted = Cancel(goal=asked.goal)
             goals = [wanted.goal]
         else:
-            name = self._known(request).plan.name
+            name = self._known(asked).plan.name
             wanted = Cancel(controller=name)
             goals = [goal.number for goal in self._link.goals.running.values() if goal.controller == name]
         try:
-            done = await self._link.for_loop("cancel", wanted, origin(request))
+            done = await self._link.for_loop("cancel", wanted, asked.origin)
         except RefusedRequest as error:
             self._note_ended(goals, error.refusal)
             raise
@@ -373,14 +356,16 @@ class GatewayApp:
             for goal in goals:
                 self._link.goals.end(goal, str(known), LOST, record.woken_ns * 1e-9)
 
-    async def play(self, request: Request, given: NewMotion) -> object:
+    @_answers(requests.PLAY)
+    async def play(self, asked: Asked[NewMotion]) -> Executed[int]:
         """Play a motion file: all its controllers begin in one cycle; answer with their goals."""
+        given = asked.body
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
             raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
         self._newest()
         file = given.file[:LONGEST_FILE]
         async with self._playing:  # one at a time: each may need a core and some 100 MB
-            if await request.is_disconnected():
+            if await asked.http.is_disconnected():
                 raise ClientDisconnect
             found = await computed(partial(self._played, given, file), MOTION_S)
         if found is None:
@@ -388,10 +373,10 @@ class GatewayApp:
         played = msgspec.msgpack.decode(found, type=Played | Refusal)
         if isinstance(played, Refusal):
             raise RefusedRequest(played)
-        if await request.is_disconnected():  # it could not be cancelled by its number
+        if await asked.http.is_disconnected():  # it could not be cancelled by its number
             raise ClientDisconnect
         done = await self._link.command(
-            LOOP, "play", played.data, f"{origin(request)}: {file}", request=played.request
+            LOOP, "play", played.data, f"{asked.origin}: {file}", request=played.request
         )
         return Executed(done.cycle, done.goals, seconds=played.seconds)
 
@@ -415,40 +400,43 @@ class GatewayApp:
             answer = Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"})
         return msgspec.msgpack.encode(answer)
 
-    async def parameters(self, request: Request) -> object:
+    @_answers(requests.PARAMETERS)
+    async def parameters(self, asked: Asked[None]) -> Parameters:
         """Return a controller's parameters."""
-        now = self._preparation.parameters(self._known(request).plan)
+        now = self._preparation.parameters(self._known(asked).plan)
         return Parameters((*parameters_of(now),))
 
-    async def change(self, request: Request, given: NewValues) -> object:
+    @_answers(requests.CHANGE)
+    async def change(self, asked: Asked[NewValues]) -> Changed:
         """Change live parameters of a controller, all of them in one cycle."""
         async with self._changing:  # what is checked against the values of now must meet them in the loop
-            loaded = self._known(request)
+            loaded = self._known(asked)
             now = self._preparation.parameters(loaded.plan)
-            change = changed(loaded.plan, now, given.values)
+            change = changed(loaded.plan, now, asked.body.values)
             noted = partial(self._note_parameters, loaded, change)
-            done = await self._link.for_loop("parameters", change.request, origin(request), noted)
+            done = await self._link.for_loop("parameters", change.request, asked.origin, noted)
         return Changed(done.cycle, change.shown)
 
     def _note_parameters(self, loaded: Loaded, change: Change, _: Done) -> None:
         loaded.plan = change.plan
 
-    async def command(self, request: Request) -> object:
+    @_answers(requests.COMMAND)
+    async def command(self, asked: Asked[bytes]) -> Executed[int]:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
-        kind, content = request.path_params["kind"], await body(request)
-        device = self._devices.get(request.path_params["name"])
+        kind, content = asked.part("kind"), asked.body
+        query, device = asked.http.query_params, self._devices.get(asked.part())
         if device is not None and kind == DEVICE_COMMANDS:
             name, content = device_command(
                 device, content, self._plans(), self._active, self._preparation.takes
             )
             loaded = self._link.controllers[name]
         else:
-            loaded = self._known(request)
-        units = request.query_params.get("units") == "true" and device is None
-        seconds = None if "in" not in request.query_params else number(request, "in", 0.0)
+            loaded = self._known(asked)
+        units = query.get("units") == "true" and device is None
+        seconds = asked.number("in", 0.0) if "in" in query else None
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
             raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
-        if loaded.plan.joints and (newest := self._link.newest()) is not None:
+        if kind in INTERFACES and loaded.plan.joints and (newest := self._link.newest()) is not None:
             known = self._preparation.known(loaded.plan)
             found = joint_command(
                 known, kind, content, newest, units=units, seconds=seconds, groups=self._link.plan.groups
@@ -460,42 +448,42 @@ class GatewayApp:
         prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
         done = await self._link.command(
-            loaded.plan.name, kind, prepared.data, origin(request), request=prepared.request
+            loaded.plan.name, kind, prepared.data, asked.origin, request=prepared.request
         )
         return Executed(done.cycle, done.goals)
 
-    async def set_point(self, request: Request) -> object:
+    @_answers(requests.SET_POINT)
+    async def set_point(self, asked: Asked[bytes]) -> Clamped:
         """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
 
         The last gate clamps values beyond their joints' limits; the answer counts them.
         """
         shortest, usual, longest = LEASE_S
-        lease = number(request, "lease", usual)
+        lease = asked.number("lease", usual)
         if not shortest <= lease <= longest:
             raise invalid(f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
-        loaded, kind = self._known(request), request.path_params["kind"]
+        loaded, kind = self._known(asked), asked.part("kind")
         name = loaded.plan.name
         if kind in self._preparation.goals(loaded.plan):
             raise refused(Code.GOAL_STREAMED, {"controller": name, "kind": kind})
-        prepared = self._preparation.command(loaded.plan, kind, await body(request))
-        if self._link.controllers.get(name) is not loaded:
-            raise refused(Code.UNLOADED, {"controller": name})
+        prepared = self._preparation.command(loaded.plan, kind, asked.body)
         if not self._link.active(loaded):
             raise refused(Code.NOT_ACTIVE, {"controller": name})
         lease_ns = round(lease * 1e9)
-        self._link.set_point(loaded, kind, prepared.data, origin(request), lease_ns, prepared.request)
+        self._link.set_point(loaded, kind, prepared.data, asked.origin, lease_ns, prepared.request)
         return Clamped(len(prepared.beyond), prepared.joints_beyond)
 
-    async def switch(self, request: Request, switch: Switch) -> object:
+    @_answers(requests.SWITCH)
+    async def switch(self, asked: Asked[Switch]) -> Executed[int]:
         """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
-        known = tuple(self._link.controllers)
+        switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
         for names in (switch.activate, switch.deactivate):  # here: the loop must not go through thousands
             if twice := tuple(name for name, count in Counter(names).items() if count > 1):
                 raise refused(Code.NAMED_TWICE, {"controller": twice})
         below = self._below(switch.activate)
-        done = await self._link.for_loop("switch", switch, origin(request))
+        done = await self._link.for_loop("switch", switch, asked.origin)
         await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
         return Executed(done.cycle, below=(*below,))
 
@@ -514,44 +502,49 @@ class GatewayApp:
                     found.append(lower)
         return found
 
-    async def register(self, request: Request, given: Value) -> object:
+    @_answers(requests.REGISTER)
+    async def register(self, asked: Asked[Value]) -> Executed[int]:
         """Have a RAM item of a joint's servo written, and answer when it was read back."""
-        joint, item = request.path_params["name"], request.path_params["item"]
-        register = prepared_register(self._link.plan, joint, item, given.value)
-        done = await self._link.for_loop("register", register, origin(request))
+        joint, item = asked.part(), asked.part("item")
+        register = prepared_register(self._link.plan, joint, item, asked.body.value)
+        done = await self._link.for_loop("register", register, asked.origin)
         return Executed(done.cycle, old=done.value, value=register.value)
 
-    async def read_register(self, request: Request) -> object:
+    @_answers(requests.READ_REGISTER)
+    async def read_register(self, asked: Asked[None]) -> Row:
         """Have an item of a joint's servo read, and return what it has."""
-        plan, joint, item = self._link.plan, request.path_params["name"], request.path_params["item"]
+        plan, joint, item = self._link.plan, asked.part(), asked.part("item")
         reading = prepared_reading(plan, joint, item)
-        done = await self._link.for_loop("get", reading, origin(request))
+        done = await self._link.for_loop("get", reading, asked.origin)
         return {"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)}
 
-    async def joint(self, request: Request) -> object:
+    @_answers(requests.JOINT)
+    async def joint(self, asked: Asked[None]) -> Row:
         """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
-        plan, joint, states = self._link.plan, request.path_params["name"], self._states()
+        plan, joint, states = self._link.plan, asked.part(), self._states()
         if (source := states.source(joint)) is not None:
             return {"source": joint, "cycle": states.cycle, **source}
         joint_row(plan, joint, (*states.sources, *states.source_states))
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
         return {"joint": joint, "cycle": states.cycle, **states.joint(joint), **units}
 
-    async def torque(self, request: Request, given: TorqueRequest) -> object:
+    @_answers(requests.TORQUE)
+    async def torque(self, asked: Asked[TorqueRequest]) -> Executed[int]:
         """Switch the torque of joints on or off, and answer when it was read back."""
-        joints = named_joints(self._link.plan, self._plans(), given.joints)
-        return await self._joints_done("torque", replace(given, joints=joints), request)
+        joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
+        return await self._joints_done("torque", replace(asked.body, joints=joints), asked.origin)
 
-    async def reboot(self, request: Request, given: RebootRequest) -> object:
+    @_answers(requests.REBOOT)
+    async def reboot(self, asked: Asked[RebootRequest]) -> Executed[int]:
         """Reboot the servos of joints, and answer when they are in order again."""
-        joints = named_joints(self._link.plan, self._plans(), given.joints)
+        joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
         require_reboots(self._link.plan, joints)
-        return await self._joints_done("reboot", replace(given, joints=joints), request)
+        return await self._joints_done("reboot", replace(asked.body, joints=joints), asked.origin)
 
     async def _joints_done(
-        self, kind: str, wanted: TorqueRequest | RebootRequest, request: Request
+        self, kind: str, wanted: TorqueRequest | RebootRequest, origin: str
     ) -> Executed[int]:
-        done = await self._link.for_loop(kind, wanted, origin(request))
+        done = await self._link.for_loop(kind, wanted, origin)
         await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
         self._released |= dict.fromkeys(done.deactivated)
         offered = self._offered() if isinstance(wanted, TorqueRequest) and wanted.on else ()
@@ -568,43 +561,57 @@ class GatewayApp:
         limp = {joint for joint, row in rows.items() if record.states.torque[row] in LIMP}
         return tuple(name for name in self._released if limp.isdisjoint(known[name].plan.joints))
 
-    async def rate(self, request: Request, given: Rate) -> object:
+    @_answers(requests.RATE)
+    async def rate(self, asked: Asked[Rate]) -> Executed[int]:
         """Run the loop at another rate."""
-        return await self._for_loop("rate", given, request, partial(self._link.note_rate, given.rate))
+        return await self._for_loop(
+            "rate", asked.body, asked.origin, partial(self._link.note_rate, asked.body.rate)
+        )
 
-    async def halt(self, request: Request) -> object:
+    @_answers(requests.HALT)
+    async def halt(self, asked: Asked[None]) -> Executed[int]:
         """Let every joint come to a stop and hold; answered when they stand still."""
-        return await self._for_loop("halt", None, request)
+        return await self._for_loop("halt", None, asked.origin)
 
-    async def pause(self, request: Request) -> object:
+    @_answers(requests.PAUSE)
+    async def pause(self, asked: Asked[None]) -> Executed[int]:
         """Hold the joints at their goals, and stop the controllers' time."""
-        return await self._for_loop("pause", None, request, partial(self._link.note_paused, True))
+        return await self._for_loop("pause", None, asked.origin, partial(self._link.note_paused, True))
 
-    async def resume(self, request: Request) -> object:
+    @_answers(requests.RESUME)
+    async def resume(self, asked: Asked[None]) -> Executed[int]:
         """Let the controllers' time run again."""
-        return await self._for_loop("resume", None, request, partial(self._link.note_paused, False))
+        return await self._for_loop("resume", None, asked.origin, partial(self._link.note_paused, False))
 
-    async def stop(self, request: Request) -> object:
+    @_answers(requests.STOP)
+    async def stop(self, asked: Asked[None]) -> Executed[int]:
         """End the run in order."""
-        return await self._for_loop("stop", None, request)
+        return await self._for_loop("stop", None, asked.origin)
 
     async def _for_loop(
-        self, kind: str, data: object, request: Request, noted: Callable[[Done], object] | None = None
+        self, kind: str, data: object, origin: str, noted: Callable[[Done], object] | None = None
     ) -> Executed[int]:
         """Have the loop do something; `noted` is called when it is done."""
-        done = await self._link.for_loop(kind, data, origin(request), noted)
+        done = await self._link.for_loop(kind, data, origin, noted)
         return Executed(done.cycle, halted=done.halted)
 
-    async def load(self, request: Request, entry: dict[str, object]) -> object:
+    @_answers(requests.LOAD)
+    async def load(self, asked: Asked[Row]) -> Executed[int]:
         """Load a controller into a paused loop."""
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
-        plan = self._preparation.controller(entry, others, self._link.rate)
-        return await self._for_loop("load", plan, request, partial(self._link.loaded, plan))
+        plan = self._preparation.controller(asked.body, others, self._link.rate)
+        return await self._for_loop("load", plan, asked.origin, partial(self._link.loaded, plan))
 
-    async def unload(self, request: Request) -> object:
+    @_answers(requests.UNLOAD)
+    async def unload(self, asked: Asked[None]) -> Executed[int]:
         """Take a controller out of a paused loop."""
-        name = self._known(request).plan.name
-        return await self._for_loop("unload", Unload(name), request, partial(self._link.unloaded, name))
+        name = self._known(asked).plan.name
+        return await self._for_loop("unload", Unload(name), asked.origin, partial(self._link.unloaded, name))
+
+    @_answers(requests.DESCRIPTION)
+    async def description(self, asked: Asked[None]) -> Row:
+        """Return what can be asked, as OpenAPI has it."""
+        return openapi({request: (handler.__doc__ or "").strip() for request, handler in _HANDLERS.items()})
 
     def _plans(self) -> list[ControllerPlan]:
         return [one.plan for one in self._link.controllers.values()]
@@ -612,83 +619,22 @@ class GatewayApp:
     def _active(self, plan: ControllerPlan) -> bool:
         return self._link.active(self._link.controllers[plan.name])
 
-    def _known(self, request: Request) -> Loaded:
-        name = request.path_params["name"]
+    def _known(self, asked: Asked[Body]) -> Loaded:
+        name = asked.part()
         loaded = self._link.controllers.get(name)
         if loaded is None:
             raise unknown_controllers([name], (*self._link.controllers, *self._devices))
         return loaded
 
 
-class Asked(NamedTuple):
-    """A request that clients may make."""
-
-    method: str
-    path: str
-    handler: Callable[..., Awaitable[object]]
-    """Gets the request, and its body where that has a type; returns the answer."""
-    rate: float
-    """How many a second of one process, together with all others of this number; 0: it is always taken."""
-    body: type | None = None
-
-
-REQUESTS = (
-    Asked("GET", "/robot", GatewayApp.robot, MOST_LOOKS),
-    Asked("GET", "/states", GatewayApp.states, MOST_LOOKS),
-    Asked("GET", "/frames", GatewayApp.frames, MOST_LOOKS),
-    Asked("GET", "/events", GatewayApp.events, MOST_LOOKS),
-    Asked("GET", "/topics", GatewayApp.topics, MOST_LOOKS),
-    Asked("GET", "/stream", GatewayApp.stream, MOST_LOOKS),
-    Asked("GET", "/goals", GatewayApp.goals, MOST_LOOKS),
-    Asked("GET", "/goals/{number}", GatewayApp.goal, MOST_LOOKS),
-    Asked("POST", "/goals/{number}/cancel", GatewayApp.cancel, MOST_OPERATIONS),
-    Asked("POST", "/controllers/{name}/cancel", GatewayApp.cancel, MOST_OPERATIONS),
-    Asked("GET", "/controllers/{name}/parameters", GatewayApp.parameters, MOST_OPERATIONS),
-    Asked("POST", "/controllers/{name}/parameters", GatewayApp.change, MOST_OPERATIONS, NewValues),
-    Asked("POST", "/controllers/{name}/commands/{kind}", GatewayApp.command, MOST_OPERATIONS),
-    Asked("POST", "/controllers/{name}/set-points/{kind}", GatewayApp.set_point, MOST_SET_POINTS),
-    Asked("POST", "/controllers", GatewayApp.load, MOST_OPERATIONS, dict[str, object]),
-    Asked("DELETE", "/controllers/{name}", GatewayApp.unload, MOST_OPERATIONS),
-    Asked("POST", "/play", GatewayApp.play, MOST_OPERATIONS, NewMotion),
-    Asked("POST", "/switch", GatewayApp.switch, MOST_OPERATIONS, Switch),
-    # a path, since servos that share joints have names such as hip/1
-    Asked("POST", "/joints/{name:path}/registers/{item}", GatewayApp.register, MOST_OPERATIONS, Value),
-    Asked("GET", "/joints/{name:path}/registers/{item}", GatewayApp.read_register, MOST_OPERATIONS),
-    Asked("GET", "/joints/{name:path}", GatewayApp.joint, MOST_LOOKS),
-    Asked("POST", "/torque", GatewayApp.torque, MOST_OPERATIONS, TorqueRequest),
-    Asked("POST", "/reboot", GatewayApp.reboot, MOST_OPERATIONS, RebootRequest),
-    Asked("POST", "/rate", GatewayApp.rate, MOST_OPERATIONS, Rate),
-    Asked("POST", "/halt", GatewayApp.halt, 0),
-    Asked("POST", "/pause", GatewayApp.pause, MOST_OPERATIONS),
-    Asked("POST", "/resume", GatewayApp.resume, MOST_OPERATIONS),
-    Asked("POST", "/stop", GatewayApp.stop, 0),
-)
-"""All of them. Halt and stop are always taken, as far as there is room."""
-_EXAMPLES: Mapping[type, str] = {
-    NewValues: '{"values": {"speed": "20 deg/s"}}',
-    dict[str, object]: '{"name": "arm", "type": "..."}',
-    NewMotion: '{"text": "name: wave ...", "speed": 0.5}',
-    Switch: '{"activate": ["head"], "deactivate": []}',
-    Value: '{"value": 800}',
-    TorqueRequest: '{"joints": ["elbow"], "on": false}',
-    RebootRequest: '{"joints": ["elbow"]}',
-    Rate: '{"rate": 100}',
-}
-"""Of each body, for what is refused."""
-
-
-def _response(reply: object) -> Response:
+def _response(reply: object, status: int = 200) -> Response:
     """Return the response for what a handler returned."""
     if isinstance(reply, Response):
         return reply
     if isinstance(reply, Executed | Changed | Clamped):
         status = 202 if isinstance(reply, Clamped) else 200
-        return _json({"done": True, **msgspec.to_builtins(reply)}, status)
-    return _json(reply)
-
-
-def _json(content: object, status: int = 200) -> Response:
-    return Response(msgspec.json.encode(content), status, media_type="application/json")
+        reply = {"done": True, **msgspec.to_builtins(reply)}
+    return Response(msgspec.json.encode(reply), status, media_type="application/json")
 
 
 def _mistaken(error: InputError) -> dict[str, Field]:
@@ -704,119 +650,16 @@ def _mistaken(error: InputError) -> dict[str, Field]:
     }
 
 
-def _goal_number(request: Request) -> int:
-    text = request.path_params["number"]
-    if not (text.isdecimal() and text.isascii() and len(text) < 16):
-        raise invalid(f"{text[:40]!r} is no number of a goal")
-    return int(text)
-
-
 def _refused(refusal: Refusal) -> Response:
     status = _STATUS.get(refusal.code, _CONFLICT)
     sentence = " ".join(refusal.text.split())[:LONGEST_SENTENCE]
-    response = _json(NotDone(sentence, refusal.code, refusal.fields), status)
+    response = _response(NotDone(sentence, refusal.code, refusal.fields), status)
     if status in (408, 413):
         response.headers["connection"] = "close"  # what still comes of the body is not read
     return response
 
 
-async def _unknown_page(request: Request, error: Exception) -> Response:
+async def _unknown_page(http: starlette.requests.Request, error: Exception) -> Response:
     method = isinstance(error, HTTPException) and error.status_code == 405
     code = Code.WRONG_METHOD if method else Code.UNKNOWN_PAGE
-    return _refused(Refusal(code, {"method": request.method, "path": request.url.path[:80]}))
-
-
-# Requests
-
-
-@dataclass(slots=True)
-class Allowance:
-    """So many requests a second of each process, and no more (token bucket of a tenth of a second).
-
-    Long bodies count as many short ones: what they cost to read and to check keeps other clients waiting.
-    """
-
-    rate: float
-    now: Callable[[], float]
-    """Returns the time, s."""
-    _left: dict[str, tuple[float, float]] = field(default_factory=dict, init=False)
-    """Peer -> what it has left, and since when."""
-
-    def spend(self, peer: str) -> None:
-        """Take one; raises RefusedRequest when there is none left."""
-        left = self._refilled(peer)
-        if left < 1:
-            raise refused(Code.TOO_OFTEN, {"rate": self.rate})
-        self._left[peer] = (left - 1, self.now())
-
-    def charge(self, peer: str, size: int) -> None:
-        """Take what a body of so many bytes costs, also when that is more than is left."""
-        self._left[peer] = (self._refilled(peer) - size // CHARGED_BYTES, self.now())
-
-    def _refilled(self, peer: str) -> float:
-        now, most = self.now(), self.rate / 10
-        left, since = self._left.pop(peer, (most, now))
-        left = min(most, left + (now - since) * self.rate)
-        self._left[peer] = (left, now)
-        if len(self._left) > MOST_PEERS:
-            del self._left[next(iter(self._left))]
-        return left
-
-
-async def body(request: Request) -> bytes:
-    """Return a body, as long as it may be; raises RefusedRequest before more than that is in memory."""
-    announced = request.headers.get("content-length", "0")
-    if not announced.isdecimal() or len(announced) > 18 or int(announced) > MOST_BYTES:
-        raise refused(Code.TOO_LONG, {"size": announced[:20], "most": MOST_BYTES})
-    content = bytearray()
-    try:
-        async with asyncio.timeout(BODY_S):
-            async for chunk in request.stream():
-                content += chunk
-                if len(content) > MOST_BYTES:
-                    raise refused(Code.TOO_LONG, {"size": len(content), "most": MOST_BYTES})
-    except TimeoutError:
-        raise refused(Code.BODY_TIMEOUT, {"seconds": BODY_S}) from None
-    finally:
-        request.state.received = len(content)
-    return bytes(content)
-
-
-async def typed(request: Request, kind: type[T]) -> T:
-    """Return a body that is JSON of a type; raises RefusedRequest."""
-    try:
-        return msgspec.json.decode(await body(request), type=kind)
-    except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{error}; write for example {_EXAMPLES[kind]}") from error
-
-
-def number(request: Request, name: str, default: float) -> float:
-    """Return a number of the query; raises RefusedRequest."""
-    text = request.query_params.get(name)
-    try:
-        value = default if text is None else float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise invalid(f"{name}={str(text)[:40]} is no number")
-    return value
-
-
-def waiting(request: Request) -> float:
-    """Return how long a client waits, s; raises RefusedRequest."""
-    wait = number(request, "wait", 0.0)
-    if not 0 <= wait <= LONGEST_WAIT_S:
-        raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wait:g}")
-    return wait
-
-
-def peer(request: Request) -> str:
-    """Return the process that sent a request, as the operating system reports it."""
-    return request.client.host if request.client else "a process"
-
-
-def origin(request: Request) -> str:
-    """Return a client's name for the log: printable, at most 64 characters; the process if it has none."""
-    given = request.headers.get("x-dxlrun-client", "").encode("latin-1", "replace").decode(errors="replace")
-    name = "".join(letter for letter in given if letter.isprintable())[:LONGEST_ORIGIN]
-    return name.strip() or peer(request)
+    return _refused(Refusal(code, {"method": http.method, "path": http.url.path[:80]}))

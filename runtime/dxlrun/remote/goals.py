@@ -14,7 +14,7 @@ from dxlrun.channels.answers import Code
 from dxlrun.channels.events import Event, EventCode
 from dxlrun.contract.controller import Outcome
 from dxlrun.remote.preparation import refused
-from dxlrun.remote.replies import GoalState
+from dxlrun.remote.requests.replies import GoalState
 
 KEPT_GOALS = 100
 """So many of those that ended are kept for clients."""

@@ -29,7 +29,7 @@ from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.live.topics import LiveTopics, TopicStream
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.replies import TopicState
+from dxlrun.remote.requests.replies import TopicState
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""

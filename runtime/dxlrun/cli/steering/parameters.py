@@ -10,7 +10,7 @@ from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import show, show_json_line
-from dxlrun.remote.replies import Parameter
+from dxlrun.remote.requests.replies import Parameter
 
 _DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from dxlrun.errors import DxlrunError
-from dxlrun.remote.replies import FRAME_LENGTH, Frame, Opened, Sample
+from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample
 from dxlrun.remote.sockets import TIMEOUT_S, RobotLink
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from dxlrun.channels.tagged import Tagged, decode
 from dxlrun.log.schemas import CYCLE, CYCLE_TOPIC, EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
-from dxlrun.remote.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
+from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
 
 MOST_RECORDS = 64
 """Of each ring that a stream takes at once, before the gateway looks after others."""

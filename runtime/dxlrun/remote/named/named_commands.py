@@ -29,7 +29,7 @@ POINT_SPEED = 0.5
 """rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
 _SHORTEST_S = 0.1
 _FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
-_INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
+INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
 """Singular and plural -> interface."""
 
 
@@ -59,7 +59,7 @@ def joint_command(
     named beside it. Raises RefusedRequest.
     """
     plan, commands = known.plan, known.controller.Commands
-    interface = _INTERFACES.get(kind)
+    interface = INTERFACES.get(kind)
     if interface is None:
         return None
     try:

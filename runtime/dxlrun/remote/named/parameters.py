@@ -11,13 +11,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from dxlrun.channels.answers import Code, Field
+from dxlrun.channels.loop_requests import Parameters
 from dxlrun.control.controllers.live_parameters import live_names, value_of
-from dxlrun.control.steering import Parameters
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.preparation import invalid, mistakes, plugin_code, refused
-from dxlrun.remote.replies import NewValue, Parameter, Written
+from dxlrun.remote.requests.replies import NewValue, Parameter, Written
 
 _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
 

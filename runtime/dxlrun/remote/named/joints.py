@@ -9,8 +9,8 @@ import numpy as np
 
 from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord, Torque
+from dxlrun.channels.loop_requests import Register, RegisterReading
 from dxlrun.compile.joints.registers import UnfitRegister, steered_value
-from dxlrun.control.joint_requests import Register, RegisterReading
 from dxlrun.description.joints.groups import ALL
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table

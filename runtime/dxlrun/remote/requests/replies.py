@@ -15,6 +15,83 @@ Written = bool | int | float | str
 """A value as in the robot file: `4.0`, `true`, `20 deg/s`."""
 
 
+class ControllerInfo(msgspec.Struct, frozen=True):
+    """A controller of a running robot."""
+
+    name: str
+    type: str
+    active: bool
+    held: bool
+    """Its joints are held because its stream ended."""
+    rate: float
+    """Hz"""
+    joints: tuple[str, ...]
+    command: tuple[str, ...]
+    """The interfaces that it commands of them."""
+    into: tuple[str, ...]
+    """Controllers that it commands."""
+    fallback: str
+    reference: tuple[str, ...]
+    """What those above it command of it."""
+    reads: tuple[str, ...]
+    takes: dict[str, object]
+    """JSON Schema of each command."""
+    goals: tuple[str, ...]
+    """Those of its commands that are goals."""
+
+
+class RobotInfo(msgspec.Struct, frozen=True):
+    """A run, its controllers and the commands that they take."""
+
+    robot: str
+    rate: float
+    """Hz"""
+    paused: bool
+    cycles: int
+    skipped: int
+    joints: tuple[str, ...]
+    groups: dict[str, tuple[str, ...]]
+    units: dict[str, str]
+    """Of each joint's positions."""
+    effort_units: dict[str, str]
+    limits: dict[str, tuple[float, float]]
+    """Lowest and highest position of the joints that have limits."""
+    speeds: dict[str, float | None]
+    """Highest one of each joint; null: without a limit."""
+    controllers: tuple[ControllerInfo, ...]
+    sources: tuple[object, ...]
+    """Devices and sensors, with their states and commands."""
+    file: str
+    """The robot file."""
+    log: str | None
+
+
+class Frames(msgspec.Struct, frozen=True):
+    """The URDF and what moves it: a client computes where frames lie by itself."""
+
+    urdf: str | None
+    frames: object
+
+
+class EventRow(msgspec.Struct, frozen=True):
+    """An event."""
+
+    number: int
+    time: float
+    """s of the run's clock"""
+    name: str
+    severity: int
+    source: str
+    text: str
+
+
+class Events(msgspec.Struct, frozen=True):
+    """Events that are kept, and the newest's number."""
+
+    events: tuple[EventRow, ...]
+    last: int
+
+
 class Executed(msgspec.Struct, Generic[AGoal], frozen=True, omit_defaults=True):
     """The reply to a command that the robot executed."""
 

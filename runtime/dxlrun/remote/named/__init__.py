@@ -1,0 +1,1 @@
+"""What clients name: joints, their registers, commands of joints and devices, a controller's parameters."""

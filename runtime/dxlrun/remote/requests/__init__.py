@@ -1,0 +1,1 @@
+"""What clients may ask of a running robot, and what it answers."""
