@@ -42,11 +42,6 @@ class Tracks:
         """True while a trajectory is followed."""
         return bool(self._playing)
 
-    @property
-    def moving(self) -> bool:
-        """True while a joint follows something."""
-        return not self.still.all()
-
     def free(self) -> Track:
         """Return a track that no joint follows, for the next trajectory."""
         return next(track for track in self._pool if track not in self._playing)

@@ -145,6 +145,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         joints, limits, parameters = context.joints, context.limits, self.parameters
         count = len(joints)
         self._tracks = Tracks(count)
+        self._still = self._tracks.still
         self._desired, self._path = self._tracks.desired, SplineSample(count)
         self._trajectory = self._tracks.free().trajectory
         """What was begun last."""
@@ -277,7 +278,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             held = self.context.goals if self._tracking is None else self.context.states
             self._desired.rest_at(finite_or(held.position, self._desired.position))
         if not self._tracks.playing:
-            self._rate = 1.0 if self._tracks.moving and self._speed <= _STILL else self._speed
+            self._rate = 1.0 if not self._still.all() and self._speed <= _STILL else self._speed
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
             self._base_ns, self._base_s = time_ns, 0.0
         self._know_where(time_ns)
@@ -286,7 +287,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """Set the desired state of now."""
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
-        if self._tracks.moving:
+        if not self._still.all():
             self._sample(time_ns)
 
     def _path_of(self, moved: NDArray[np.bool_]) -> SplineSample:
@@ -341,7 +342,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._now_ns = time_ns
         if self._spliced is not None:
             self._splice(self._spliced, time_ns)
-        elapsed = self._sample(time_ns) if self._tracks.moving else 0.0
+        elapsed = 0.0 if self._still.all() else self._sample(time_ns)
         if self._phase is _Phase.MOVING:
             self._move(time_ns, elapsed)
         elif self._phase is _Phase.STOPPING:
@@ -434,7 +435,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._phase, self._stop_ns = _Phase.STOPPING, time_ns
 
     def _come_to_rest(self, time_ns: int) -> None:
-        if not self._tracks.moving:
+        if self._still.all():
             self._phase = _Phase.RESTING
             self._end(Outcome.CANCELLED, time_ns)  # any other end came before the stop
 
@@ -452,7 +453,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             np.copyto(commands.velocity, desired.velocity)
         elif self._moves:
             np.abs(desired.velocity, out=commands.velocity)
-            np.copyto(commands.velocity, self._closing, where=self._tracks.still)
+            np.copyto(commands.velocity, self._closing, where=self._still)
         self._moves = False
 
     # How far off
