@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import signal
 import subprocess
 import zlib
 from collections.abc import Callable, Generator, Iterator
@@ -146,6 +147,9 @@ class Extras:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Extras())
+    # a shell ignores Ctrl-C for what it starts in the background, and what that starts inherits it
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_finish() -> None:

@@ -40,12 +40,9 @@ class Form(Enum):
     def __init__(self, fields: frozenset[str], integrates: bool) -> None:
         self.fields, self.integrates = fields, integrates
 
-    @classmethod
-    def of(cls, fields: Collection[str]) -> Form | None:
-        """Return the form of a command with these fields; None: it is not driven."""
-        if cls.TRAJECTORY.fields.issubset(fields):
-            return cls.TRAJECTORY
-        return next((form for form in cls if form.fields == set(fields)), None)
+    def fits(self, fields: Collection[str]) -> bool:
+        """Return whether a command with these fields has this form; a trajectory may have others."""
+        return self.fields <= set(fields) if self is Form.TRAJECTORY else self.fields == set(fields)
 
 
 class Slot(msgspec.Struct, frozen=True):
@@ -100,18 +97,13 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
     """
     info = cast("Row", robot.info())
     active = [one for one in info["controllers"] if one["active"]]
-    other = {
-        lower for one in active for lower in one["into"]
-    }  # is commanded by another one, or follows joints
-    other |= {
-        one["name"] for one in active if any(read.split("/")[0] in info["units"] for read in one["reads"])
-    }
-    able = [one for one in active if one["name"] not in other]
-    whole = [bank for one in able if (bank := _bank(robot, one, info)) is not None]
+    commanded = {lower for one in active for lower in one["into"]}
+    free = [one for one in active if one["name"] not in commanded and not _follows(one, info)]
+    whole = [bank for one in free if (bank := _bank(robot, one, info)) is not None]
     own = {bank.controller: [(bank, index) for index in bank.driven] for bank in whole}
     joints = {bank.slots[index].name: [(bank, index)] for places in own.values() for bank, index in places}
     groups = {
-        name: [*(joints[one][0] for one in each if one in joints)] for name, each in info["groups"].items()
+        name: [joints[one][0] for one in each if one in joints] for name, each in info["groups"].items()
     }
     words = {name: places for name, places in (joints | groups | own).items() if places}
     chosen: dict[str, dict[int, Bank]] = {}
@@ -129,10 +121,15 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
     ]
 
 
+def _follows(one: Row, info: Row) -> bool:
+    """Return whether a controller moves its joints by what it reads of other ones."""
+    return any(read.split("/")[0] in info["units"] for read in one["reads"])
+
+
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
     """Return a controller with all that it commands; None where that is not driven."""
     for kind, schema in one["takes"].items():
-        if (form := Form.of(schema.get("properties", ()))) is not None:
+        for form in (form for form in Form if form.fits(schema.get("properties", ()))):
             twist = form is Form.TWIST
             slots = _twist(robot, one) if twist else [_joint(joint, info, form) for joint in one["joints"]]
             places = tuple(range(len(slots)))

@@ -20,28 +20,20 @@ SHOULDERS = frozenset((0x136, 0x137))
 """BTN_TL and BTN_TR: the dead-man's switch of a gamepad."""
 BUTTONS: Mapping[int, Press] = {0x130: Press.NEXT, 0x13B: Press.QUIT}
 """BTN_SOUTH, BTN_START"""
-STICKS: Mapping[int, str] = {
-    1: "left stick up/down",
-    0: "left stick left/right",  # ABS_Y, ABS_X
-    4: "right stick up/down",
-    3: "right stick left/right",  # ABS_RY, ABS_RX
-    5: "right stick up/down",
-    2: "right stick left/right",  # ABS_RZ, ABS_Z: of some it is these
-    17: "pad up/down",
-    16: "pad left/right",  # ABS_HAT0Y, ABS_HAT0X
+_STICKS = "left stick", "right stick", "right stick", "pad"
+STICKS: Mapping[int, str] = {  # ABS_Y, _X, _RY, _RX, of some _RZ, _Z instead, _HAT0Y, _HAT0X
+    code: f"{_STICKS[at // 2]} {('up/down', 'left/right')[at % 2]}"
+    for at, code in enumerate((1, 0, 4, 3, 5, 2, 17, 16))
 }
 DEAD_ZONE = 0.1
 """A stick that is so near to its middle is released; what is left is the whole axis."""
 KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER, 1: Press.QUIT}
 """KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
 SIDES: Mapping[int, tuple[int, float]] = {
-    **{16 + axis: (axis, 1.0) for axis in range(8)},  # KEY_Q to KEY_I, as they lie on a US keyboard
-    **{30 + axis: (axis, -1.0) for axis in range(8)},  # KEY_A to KEY_K
-    103: (0, 1.0),
-    108: (0, -1.0),
-    105: (1, 1.0),
-    106: (1, -1.0),  # up, down, left, right
+    **{first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)},
+    **{103: (0, 1.0), 108: (0, -1.0), 105: (1, 1.0), 106: (1, -1.0)},
 }
+"""From KEY_Q and from KEY_A on, by their places whatever is printed on them; up, down, left, right"""
 
 
 class Device(Protocol):

@@ -15,23 +15,16 @@ from dxlrun_teleop.source import Given, Press
 HELD_S = 0.13
 """A key counts as held for so long after it was typed: above 92 ms, in which the Linux console repeats it
 (10.9 Hz, kbdrate(8)); desktops repeat faster."""
-POSITIVE, NEGATIVE = "qwertyui", "asdfghjk"
+AXES = ("Q/A Up/Down", "W/S Left/Right", "E/D", "R/F", "T/G", "Y/H", "U/J", "I/K")
 """A column of keys each axis: the upper one is its positive side."""
-_KEYS = {key: (axis, 1.0) for axis, key in enumerate(POSITIVE)} | {
-    key: (axis, -1.0) for axis, key in enumerate(NEGATIVE)
-}
+_ROWS = ("qwertyui", 1.0), ("asdfghjk", -1.0)
+_KEYS = {key: (axis, side) for row, side in _ROWS for axis, key in enumerate(row)}
 _ARROWS = {"A": (0, 1.0), "B": (0, -1.0), "D": (1, 1.0), "C": (1, -1.0)}
 """Last letters of ESC [ A and the like: up, down, left, right."""
 _PRESSES = {"\t": Press.NEXT, "+": Press.FASTER, "=": Press.FASTER, "-": Press.SLOWER, "\x04": Press.QUIT}
 _TYPED = re.compile(r"\x1b[\[O](?:[\d;]*)([A-Za-z~])|(.)", re.DOTALL)
 _PART = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")
 """The beginning of a sequence whose end comes later."""
-AXES = tuple(
-    f"{upper}/{lower}{also}"
-    for upper, lower, also in zip(
-        POSITIVE.upper(), NEGATIVE.upper(), (" Up/Down", " Left/Right", *[""] * 6), strict=True
-    )
-)
 
 
 class TerminalKeyboard:
