@@ -31,7 +31,10 @@ KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER,
 """KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
 SIDES: Mapping[int, tuple[int, float]] = {
     **{first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)},
-    **{103: (0, 1.0), 108: (0, -1.0), 105: (1, 1.0), 106: (1, -1.0)},
+    103: (0, 1.0),
+    108: (0, -1.0),
+    105: (1, 1.0),
+    106: (1, -1.0),
 }
 """From KEY_Q and from KEY_A on, by their places whatever is printed on them; up, down, left, right"""
 

@@ -15,7 +15,7 @@ from dxlrun_teleop.source import Given, Press
 HELD_S = 0.13
 """A key counts as held for so long after it was typed: above 92 ms, in which the Linux console repeats it
 (10.9 Hz, kbdrate(8)); desktops repeat faster."""
-AXES = ("Q/A Up/Down", "W/S Left/Right", "E/D", "R/F", "T/G", "Y/H", "U/J", "I/K")
+AXES: tuple[str, ...] = ("Q/A Up/Down", "W/S Left/Right", "E/D", "R/F", "T/G", "Y/H", "U/J", "I/K")
 """A column of keys each axis: the upper one is its positive side."""
 _ROWS = ("qwertyui", 1.0), ("asdfghjk", -1.0)
 _KEYS = {key: (axis, side) for row, side in _ROWS for axis, key in enumerate(row)}
