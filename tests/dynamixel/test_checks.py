@@ -1,5 +1,7 @@
 """The table of checks before torque: each row fails on what it is for, and on nothing that is in order."""
 
+from contextlib import suppress
+
 import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan
@@ -7,8 +9,9 @@ from tests.kit.rigs import make_plan
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.findings import Findings
+from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.access import reach
-from dxlrun.dynamixel.servo.checks import CHECKS, inspect
+from dxlrun.dynamixel.servo.checks import CHECKS, inspect, survey
 from dxlrun.plan.bus_plan import RegisterValue
 from dxlrun.plan.transaction import Outcome, Reply
 
@@ -122,6 +125,20 @@ def test_what_refuses_nothing_is_reported(protocol, change, sentence):
 
 def test_a_servo_with_torque_is_accepted_when_the_robot_is_taken_over():
     assert look(2.0, {"torque_enable": 1}, take_over=True).problems == []
+
+
+def test_a_servo_that_answers_twice_is_read_no_further():
+    plan, found = make_plan((1,), protocol=2.0, model="XM430-W350"), Findings()
+    program, sent = survey(plan, False, found), []
+    request = next(program)
+    with suppress(StopIteration):
+        while True:
+            sent.append(request.packet)
+            request = program.send(Reply(Outcome.OK, 0, b"\0\0\0", 0, 1, False))
+    (problem,) = found.problems
+    assert "answers 3 of 3 pings garbled or twice" in problem
+    reads = [packet for packet in sent if packet and packet[7] == 2]
+    assert reads == [plan_line(plan).read(1, 0, 3).packet], "the look for an echo alone"
 
 
 def test_every_row_of_the_table_has_a_case_here():
