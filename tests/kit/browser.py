@@ -5,19 +5,32 @@ https://chromedevtools.github.io/devtools-protocol
 
 from __future__ import annotations
 
-import base64
 import fcntl
 import json
 import os
 import shutil
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 from tests.kit.awaited import until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+_DIFFERING = """async (...pictures) => {
+  const [one, other] = await Promise.all(pictures.map(async (text) => {
+    const image = Object.assign(new Image(), { src: `data:image/png;base64,${text}` });
+    await image.decode();
+    const canvas = new OffscreenCanvas(image.width, image.height).getContext("2d");
+    canvas.drawImage(image, 0, 0);
+    return canvas.getImageData(0, 0, image.width, image.height).data;
+  }));
+  if (one.length !== other.length) return 1;
+  let differing = 0;
+  for (let at = 0; at < one.length; at += 4) {
+    differing += [0, 1, 2].some((colour) => Math.abs(one[at + colour] - other[at + colour]) > 32);
+  }
+  return differing / (one.length / 4);
+}"""
 
 
 class Browser:
@@ -69,8 +82,8 @@ class Browser:
         return message
 
     def value(self, expression: str) -> Any:
-        """Return the value of an expression in the page."""
-        answer = self("Runtime.evaluate", expression=expression, returnByValue=True)
+        """Return the value of an expression in the page, of a promise what it becomes."""
+        answer = self("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
@@ -92,6 +105,17 @@ class Browser:
                 "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=buttons, clickCount=1
             )
 
+    def place(self, selector: str) -> tuple[float, float, float, float]:
+        """Return left, top, width and height of an element in the window."""
+        box = self.value(f"document.querySelector({selector!r}).getBoundingClientRect().toJSON()")
+        return box["x"], box["y"], box["width"], box["height"]
+
+    def click(self, selector: str) -> None:
+        """Press and release the mouse in the middle of an element."""
+        left, top, width, height = self.place(selector)
+        middle = (left + width / 2, top + height / 2)
+        self.drag(middle, middle)
+
     def open(self, address: str, width: int = 1440, height: int = 900, *, dark: bool = False) -> None:
         """Open a page in a window of this size."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
@@ -100,31 +124,19 @@ class Browser:
         self("Emulation.setEmulatedMedia", features=features)
         self("Page.navigate", url=address)
 
-    def picture(self) -> bytes:
-        """Return what the window shows, as PNG."""
-        return base64.b64decode(self("Page.captureScreenshot", format="png")["data"])
+    def picture(self, selector: str = "html") -> str:
+        """Return what the window shows of an element, as PNG in base64."""
+        clip = dict(zip(("x", "y", "width", "height"), self.place(selector), strict=True)) | {"scale": 1}
+        return str(self("Page.captureScreenshot", format="png", clip=clip)["data"])
 
-    def pixels(self, x: float, y: float, width: float, height: float) -> bytes:
-        """Return the colours of a part of the window, one byte each, uncompressed."""
-        clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
-        png = base64.b64decode(self("Page.captureScreenshot", format="png", clip=clip)["data"])
-        return _uncompressed(png)
+    def differing(self, first: str, second: str) -> float:
+        """Return the share of pixels of two pictures that differ by more than what trembles at an edge."""
+        return float(self.value(f"({_DIFFERING})({first!r}, {second!r})"))
 
     def close(self) -> None:
         os.close(self._to)  # by that it ends
         os.waitpid(self._process, 0)
         os.close(self._from)
-
-
-def _uncompressed(png: bytes) -> bytes:
-    """Return the bytes of a PNG's lines, filtered as they are (PNG specification, 11.2.3)."""
-    place, data = 8, b""
-    while place < len(png):
-        size, kind = struct.unpack(">I4s", png[place : place + 8])
-        if kind == b"IDAT":
-            data += png[place + 8 : place + 8 + size]
-        place += size + 12
-    return zlib.decompress(data)
 
 
 def _above(descriptor: int) -> int:

@@ -1,4 +1,4 @@
-"""A log, and pages that are served."""
+"""A log, a running robot, and pages that are served."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 from tests.view.served import Served
+from tests.view.torso import Run
 
+from dxlrun_view.live import LiveRobot
 from dxlrun_view.recorded import RecordedRobot
 from dxlrun_view.shown import Source
 
@@ -39,6 +41,23 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def recorded(log: Path) -> RecordedRobot:
     return RecordedRobot(log)
+
+
+@pytest.fixture(scope="package")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    one = Run(tmp_path_factory.mktemp("live"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(one.place))
+        one.start()
+        yield one
+        one.end()
+
+
+@pytest.fixture
+def live(run: Run) -> Iterator[LiveRobot]:
+    robot = LiveRobot("bioloid_torso_imu")
+    yield robot
+    robot.close()
 
 
 @pytest.fixture

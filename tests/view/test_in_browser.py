@@ -1,15 +1,19 @@
-"""The page in Chromium: the robot moves with its joints, curves advance, a log plays and jumps."""
+"""The page in Chromium: what clicks do, to the servos too; the robot moves, curves advance, a log plays."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import until
 from tests.kit.browser import CHROMIUM, Browser
 from tests.view.served import Served
+from tests.view.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 
+from dxlrun_view.live import LiveRobot
 from dxlrun_view.recorded import RecordedRobot
 
 Serve = Callable[..., Served]
@@ -39,36 +43,71 @@ def errors(browser: Browser) -> list[object]:
     return [one for one in found if "ERR_CONNECTION_REFUSED" not in str(one)]
 
 
-def differing(first: bytes, second: bytes) -> float:
-    """Return the share of differing bytes of two uncompressed pictures."""
-    return sum(a != b for a, b in zip(first, second, strict=True)) / len(first)
-
-
-def scene(browser: Browser) -> bytes:
-    """Return the pixels of the 3-D view, as the window shows them."""
-    box = browser.value(
-        "(b => [b.x, b.y, b.width, b.height])(document.querySelector('#body').getBoundingClientRect())"
-    )
-    return browser.pixels(*box)
-
-
 def test_a_log_plays_and_jumps(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
     browser.open(serve(recorded).address)
     browser.until("window.looked > 3 && !!document.querySelector('.legend b')?.textContent")
     assert browser.value("document.querySelector('#robot').textContent") == "bioloid_torso_imu"
     assert browser.value("document.querySelectorAll('#joints tbody tr').length") == 8
     assert browser.value("document.querySelector('#stop').hidden")
-    before = scene(browser)
+    before = browser.picture("#scene")
     move = "(time => { const input = document.querySelector('#time'); input.value = time; input.oninput(); })"
     looked = browser.value(f"{move}(8), window.looked")
     browser.until(f"window.looked > {looked + 3}")
-    assert 0.003 < differing(before, scene(browser)) < 0.6
+    moved = browser.differing(before, browser.picture("#scene"))
+    assert 0.01 < moved < 0.6
     assert browser.value("document.querySelector('#now').textContent").startswith("8.00 of ")
     browser.value("document.querySelector('#speed').value = '4', document.querySelector('#play').click()")
     browser.until("parseFloat(document.querySelector('#now').textContent) > 9.5")
     browser.value("document.querySelector('[data-tab=events]').click()")
     browser.value("[...document.querySelectorAll('#events li')].at(-1).click()")
     browser.until("parseFloat(document.querySelector('#now').textContent) < 2")
+    assert errors(browser) == []
+
+
+def looks(browser: Browser, more: int) -> None:
+    """Wait until the page has drawn some times more."""
+    browser.until(f"window.looked > {browser.value('window.looked') + more}")
+
+
+def test_switch_slider_and_stop_reach_the_servos(
+    live: LiveRobot, run: Run, serve: Serve, browser: Browser
+) -> None:
+    browser.open(serve(live, control=True).address)
+    browser.until("document.querySelector('.legend b')?.textContent")
+    browser.click("[data-tab=controllers]")
+    browser.click("[aria-label='deactivate right_arm']")
+    browser.until("!!document.querySelector('[aria-label=\"activate right_arm\"]')")
+    assert not live.shown().info.controllers[3].active
+    browser.click("[aria-label='activate right_arm']")
+    browser.until("!!document.querySelector('[aria-label=\"deactivate right_arm\"]')")
+
+    browser.click("[data-tab=joints]")
+    browser.click(f"[title^={JOINT}]")  # its curves
+    browser.until("document.querySelectorAll('.legend b').length === 4")
+    looks(browser, 5)
+    still, curves = browser.picture("#scene"), browser.picture("#charts")
+    name = f"[aria-label='goal of {JOINT}']"
+    slider = f'document.querySelector("{name}")'
+    span = browser.value(f"{slider}.max - {slider}.min")
+    share = browser.value(f"({slider}.value - {slider}.min) / {span}")
+    left, top, width, height = browser.place(name)
+    track, middle = width - height, top + height / 2  # the thumb is as wide as it is high
+    thumb = left + height / 2 + track * share
+    browser.drag((thumb, middle), (thumb + 0.2 * track, middle))
+    ticks = 0.2 * span * 1023 / math.radians(300)
+    until(lambda: abs(abs(run.written(GOAL_POSITION)[SERVO] - 512) - ticks) < 0.1 * ticks)
+    looks(browser, 20)
+    moved, advanced = (
+        browser.differing(before, browser.picture(part))
+        for before, part in ((still, "#scene"), (curves, "#charts"))
+    )
+    assert 0.01 < moved < 0.6
+    assert advanced > 0.01
+
+    assert run.written(TORQUE_ENABLE)[SERVO] == 1
+    browser.click("#stop")
+    until(lambda: run.limp)
+    browser.until("document.querySelector('#message').textContent.includes('limp')")
     assert errors(browser) == []
 
 

@@ -27,6 +27,7 @@ export function drawControllers(element, shown, act) {
       if (shown.control) {
         const button = text("button", controller.active ? "deactivate" : "activate");
         button.type = "button";
+        button.setAttribute("aria-label", `${button.textContent} ${controller.name}`);
         button.onclick = () => act({ verb: "switch", names: [controller.name], on: !controller.active });
         row.append(button);
       }

@@ -168,7 +168,10 @@ function buildJoints() {
       slider = Object.assign(document.createElement("input"), { type: "range", min: joint.lower, max: joint.upper, step: "any" });
       slider.setAttribute("aria-label", `goal of ${joint.name}`);
       slider.oninput = () => { page.touching = joint.name; lead(joint.name, Number(slider.value)); };
-      slider.onchange = () => { lead(joint.name, Number(slider.value)); setTimeout(() => { if (page.touching === joint.name) page.touching = null; }, 600); };
+      slider.onchange = slider.onpointerup = async () => {
+        await lead(joint.name, Number(slider.value));
+        setTimeout(() => { if (page.touching === joint.name) page.touching = null; }, 600); // until the goal is there
+      };
       reach.append(slider);
     } else {
       const bar = reach.appendChild(document.createElement("span"));
@@ -186,17 +189,18 @@ function buildJoints() {
 
 // send the newest goal of a slider, one at a time
 const goals = new Map();
-let leading = false;
-async function lead(joint, goal) {
+let leading = null;
+function lead(joint, goal) {
   goals.set(joint, goal);
-  if (leading) return;
-  leading = true;
+  return leading ??= led().finally(() => { leading = null; });
+}
+
+async function led() {
   while (goals.size) {
     const [[name, to]] = goals;
     goals.delete(name);
     if (!(await act({ verb: "goal", names: [name], value: to }, true))) goals.clear();
   }
-  leading = false;
 }
 
 function drawJoints() {
@@ -211,7 +215,7 @@ function drawJoints() {
     const beyond = goal !== null && position !== null && Math.abs(goal - position) > (unit === "deg" ? 0.09 : 0.005);
     row.goal.classList.toggle("hot", beyond);
     if (row.is) { row.is.style.left = share(position ?? lower); row.to.style.left = share(goal ?? position ?? lower); row.to.hidden = goal === null; }
-    if (row.slider && page.touching !== name && (document.activeElement !== row.slider || !leading)) row.slider.value = goal ?? position ?? 0;
+    if (row.slider && page.touching !== name) row.slider.value = goal ?? position ?? 0;
     const [by, effortUnit] = scaleOf(`${name}/effort`);
     set(row.load, effort === null ? "–" : `${figure1(effort * by)} ${effortUnit}`);
     const heat = value(`${name}/temperature`), volts = value(`${name}/voltage`);

@@ -1,0 +1,79 @@
+"""A simulated torso with an IMU in a process of its own, and what its servos were sent."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.kit.awaited import DEADLINE_S, until
+
+from dxlrun import running
+from dxlrun.simulation.bus.ledger import read_ledger
+
+ROBOTS = Path(__file__).resolve().parents[2] / "robots"
+JOINT, SERVO = "right_elbow_joint", 4
+SERVOS = {1, 2, 3, 4, 5, 6, 20, 21}
+TORQUE_ENABLE, GOAL_POSITION = 24, 30
+
+
+class Run:
+    """A torso in a process of its own."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self.ledger = place / "ledger.jsonl"
+        self.process: subprocess.Popen[bytes] | None = None
+        shutil.copytree(ROBOTS, place / "robots")
+        torso = place / "robots/bioloid_torso.yaml"
+        torso.write_text(
+            torso.read_text().replace("latency: 1 ms", "latency: 20 ms")
+        )  # a busy machine is late
+
+    def start(self) -> None:
+        code = "from dxlrun.cli import main; main()"
+        words = [
+            "robots/bioloid_torso_imu.yaml",
+            "rate:=5",
+            "--no-record",
+            "--ledger",
+            str(self.ledger),
+            "--duration",
+            "300",
+        ]
+        with (self.place / "said").open("wb") as said:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", code, *words], cwd=self.place, stdout=said, stderr=said
+            )
+        until(lambda: bool(running()) or self.process is None or self.process.poll() is not None)
+        assert self.process.poll() is None, (self.place / "said").read_text()
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.terminate()
+            self.process.wait(DEADLINE_S)
+            self.process = None
+            self.ledger.unlink()
+
+    @property
+    def limp(self) -> bool:
+        """True when no servo has torque."""
+        written = self.written(TORQUE_ENABLE)
+        return all(written[servo] == 0 for servo in SERVOS)
+
+    def written(self, address: int) -> dict[int, int]:
+        """Return what was last written at an address of each servo (Protocol 1.0: WRITE and SYNC WRITE)."""
+        found: dict[int, int] = {}
+        for entry in read_ledger(self.ledger):
+            data = entry.data
+            if entry.direction != "in" or len(data) < 7:
+                continue
+            if data[4] == 0x03 and data[5] == address:
+                found[data[2]] = int.from_bytes(data[6:-1], "little")
+            elif data[4] == 0x83 and data[5] <= address < data[5] + data[6]:
+                size, offset = data[6] + 1, address - data[5] + 1
+                rows = [data[at : at + size] for at in range(7, len(data) - 1, size)]
+                width = 2 if address == GOAL_POSITION else 1
+                found |= {row[0]: int.from_bytes(row[offset : offset + width], "little") for row in rows}
+        return found
