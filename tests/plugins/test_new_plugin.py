@@ -149,7 +149,7 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     assert ["first_one", "(first_one", "1.5,", "contract", "1)"] in lines
     assert ["mine", "position"] in lines
     assert ["decisions", "about", "late", "cycles"] in lines
-    assert ["joint_trajectory_controller", "trajectory"] in [line[:2] for line in lines]
+    assert ["joint_trajectory_controller", "chunk", "trajectory"] in [line[:3] for line in lines]
     assert (
         "broken: plug-in broken_one of broken_one 1.5 was written for contract 5, "
         "this dxlrun has contract 4; install a version of it that fits"
