@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.cli.steering import goals, parameters, steer
+from dxlrun.cli.steering import goals, parameters, play, steer
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.client import Executed, GoalState, RemoteGoal
 from dxlrun.remote.requests.replies import Parameter
@@ -58,18 +58,15 @@ class Robot:
 
     def info(self) -> dict[str, Any]:
         joints = {"arm": ("shoulder", "elbow"), "leg": ("hip", "knee", "ankle", "toe"), "pages": ("hip",)}
-        takes = {"pages": {"play": {"properties": {"motion": {}}}}}
+        motions = {"pages": {"walk": 2.0, "bow": 1.25}}
         return {
             "file": str(self.file),
+            "groups": {},
             "controllers": [
-                {"name": name, "joints": moved, "takes": takes.get(name, {"trajectory": {}})}
+                {"name": name, "joints": moved, "motions": motions.get(name, {})}
                 for name, moved in joints.items()
             ],
         }
-
-    def parameters(self, controller: str) -> dict[str, object]:
-        assert controller == "pages"
-        return {"joints": ["hip"], "motions": {"walk": {}, "bow": {}}}
 
     def begin(self) -> None:
         if self.interrupted is not None:
@@ -119,7 +116,7 @@ class Robot:
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     one = Robot()
-    for room in (goals, parameters, steer):
+    for room in (goals, parameters, play, steer):
         monkeypatch.setattr(room, "robot_of", lambda chosen, verb: one)
     return one
 
@@ -357,3 +354,64 @@ def test_a_motion_is_played_by_its_name(dxlrun: Dxlrun, robot: Robot, wave: Path
     for folder in (wave.parent, wave.parent / "motions"):
         (folder / "wave.yaml").write_text("name: wave\nmotions: []\n")
     assert dxlrun("play", "dance").err.endswith("nor is it a file; known: bow, walk, wave\n")
+
+
+def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end(
+    dxlrun: Dxlrun, robot: Robot
+) -> None:
+    reached = replace(REACHED, controller="pages")
+    robot.script = {3: [reached, reached, reached, reached, MISSED]}
+    assert dxlrun("play", "walk", "bow", "--loop", "3").code == 1
+    assert [each[3]["motion"] for each in robot.requests] == ["walk", "bow", "walk", "bow", "walk"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "name a motion; `dxlrun play --list` shows those of the robot"),
+        (("walk", "--list"), "--list shows what there is to play; leave walk out"),
+        (("walk", "--loop", "0"), "--loop 0: give how often all is played, from 1 to 10000"),
+        (("walk", "bow", "--no-wait"), "--no-wait returns when one motion has begun; leave it out"),
+        (("walk", "--loop", "2", "--no-wait"), "--no-wait returns when one motion has begun; leave it out"),
+        (("walk", "nowhere/wave.yaml"), "there is no motion file nowhere/wave.yaml; check the path"),
+        (("walk", "wolk"), "knows no motion wolk, nor is it a file; did you mean walk?"),
+    ],
+)
+def test_nothing_is_played_of_what_cannot_be_played_whole(
+    dxlrun: Dxlrun, robot: Robot, words: tuple[str, ...], said: str
+) -> None:
+    refused = dxlrun("play", *words)
+    assert refused.code == 2
+    assert said in refused.err
+    assert robot.requests == []
+
+
+def test_a_later_motion_with_a_mistake_is_told_before_the_first_begins(
+    dxlrun: Dxlrun, robot: Robot, wave: Path
+) -> None:
+    wave.write_text("name: wave\nmotions: 3\n")
+    refused = dxlrun("play", "walk", wave)
+    assert (refused.code, f"{wave}:2:" in refused.err) == (2, True)
+    assert robot.requests == []
+
+
+def test_the_list_has_what_can_be_played_with_its_length(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    robot.file = wave.parent / "torso.yaml"
+    joints = "{shoulder: {position: 20 deg}}"
+    points = f"points: [{{time: 2 s, joints: {joints}}}]"
+    wave.write_text(f"name: wave\nmotions:\n- controller: arm\n  start: 1 s\n  {points}\n")
+    (wave.parent / "broken.yaml").write_text("name: broken\nmotions: 3\n")
+    other = wave.read_text().replace("controller: arm", "controller: wing")
+    (wave.parent / "flap.yaml").write_text(other)  # for another robot
+    found = json.loads(dxlrun("play", "--list", "--json").out)
+    assert [(each["motion"], each["joints"], each["seconds"]) for each in found] == [
+        ("bow", ["hip"], 1.25),
+        ("broken", [], None),
+        ("walk", ["hip"], 2.0),
+        ("wave", ["shoulder"], 3.0),
+    ]
+    lines = dxlrun("play", "--list").out.splitlines()
+    assert [line.split()[:4] for line in lines if "hip" in line] == [
+        ["bow", "pages", "hip", "1.25"],
+        ["walk", "pages", "hip", "2.00"],
+    ]

@@ -514,6 +514,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
     assert left.pop("takes")["go"]["properties"]["positions"]["type"] == "array"
     assert left == {
         "goals": [],
+        "motions": {},
         "name": "left",
         "type": "arm",
         "active": True,

@@ -8,7 +8,7 @@ cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -177,6 +177,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             asked_by={"effort": key} if key else {},
             partial=parameters.partial,
         )
+
+    @classmethod
+    def motions(cls, parameters: KeyframeParameters) -> Mapping[str, float]:
+        """Return the motions with their lengths at speed 1, those that follow them included, s."""
+        known = parameters.motions
+        lengths = {name: motion.duration_s(motion.repeat) for name, motion in known.items()}
+        return {name: sum(map(lengths.__getitem__, parameters.chain(name))) for name in known}
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:

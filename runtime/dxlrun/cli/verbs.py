@@ -38,7 +38,7 @@ PLACES_WHILE_IT_RUNS = {
         "reboot": "joints:reboot",
         "switch": "steer:switch",
         "send": "goals:send",
-        "play": "goals:play",
+        "play": "play:play",
         "cancel": "goals:cancel",
         "parameters": "parameters:parameters",
         "echo": "echo:echo",

@@ -312,6 +312,11 @@ class Controller(ABC, Generic[P]):
         return cls.Topics
 
     @classmethod
+    def motions(cls, parameters: P) -> Mapping[str, float]:
+        """Return the motions that its goal `play` plays, `{"motion": name}`, and how long each is, s."""
+        return {}
+
+    @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:
         """Turn a typed command into one flat array, outside the loop's process; a pure function.
 

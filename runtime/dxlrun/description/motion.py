@@ -106,6 +106,31 @@ class Motion(Form):
         "What each controller does.", "[{controller: head, ...}]", min_length=1
     )
 
+    @property
+    def controllers(self) -> tuple[str, ...]:
+        """The controllers that it is for, each once."""
+        return tuple(dict.fromkeys(part.controller for part in self.motions))
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints that it moves, each once."""
+        named = (
+            part.joints
+            if isinstance(part, FormulaPart)
+            else [joint for point in part.points for joint in point.joints]
+            for part in self.motions
+        )
+        return tuple(dict.fromkeys(joint for joints in named for joint in joints))
+
+    @property
+    def seconds(self) -> float:
+        """From its begin to the last target, s."""
+        ends = (
+            part.start + (part.duration if isinstance(part, FormulaPart) else part.points[-1].time)
+            for part in self.motions
+        )
+        return max(ends) * 1e-9
+
 
 class MotionDescription(msgspec.Struct, frozen=True):
     """A motion file whose form is right, with the place of everything in it."""

@@ -238,6 +238,7 @@ class GatewayApp:
             reads=plan.reads,
             takes=self._preparation.takes(plan),
             goals=tuple(self._preparation.goals(plan)),
+            motions=self._preparation.motions(plan),
         )
 
     @_answers(requests.STATES)

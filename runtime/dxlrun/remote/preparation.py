@@ -201,6 +201,15 @@ class Preparation:
         offer = self.plugins.controllers.get(plan.type)
         return sorted(offer.controller.Goals) if offer else []
 
+    def motions(self, plan: ControllerPlan) -> dict[str, float]:
+        """Return the motions that a controller plays by name, s; none where its code fails."""
+        try:
+            known = self.known(plan)
+            with bounded(plan.name):
+                return dict(known.controller.motions(known.parameters))
+        except (Exception, SystemExit):  # a plug-in's code; other controllers are shown all the same
+            return {}
+
     def parameters(self, plan: ControllerPlan) -> ParametersModel:
         """Return the parameters of a controller as they are now; raises RefusedRequest."""
         return self.known(plan).parameters

@@ -1,9 +1,9 @@
-"""What a running robot is given to do: `dxlrun send`, `play`, `cancel`, and goals until their end."""
+"""What a running robot is given to do: `dxlrun send`, `cancel`, and goals until their end."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,7 @@ from msgspec import to_builtins
 
 from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
-from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
+from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
 
 if TYPE_CHECKING:
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 REST_S = 10.0
 """How long a cancelled goal may take until its joints are at rest."""
-_PLAY = "play"
-"""The command of a keyframe_player."""
-_MOST_JOINTS = 3
-"""Named in a result."""
+MOST_JOINTS = 3
+"""Named in a result or a list."""
 _PROGRESS_S = 0.1
 _BEGIN_S = 0.5
 """How long a goal may take to begin that was sent and not answered."""
@@ -138,91 +136,6 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
     return 0
 
 
-def play(motion: str, /, *, speed: float = 1.0, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """Play a motion on a running robot, begun softly from where its joints are: `dxlrun play walk`.
-
-    All its controllers begin in one cycle. Ctrl-C cancels them, and returns when the joints are at rest.
-
-    Parameters
-    ----------
-    motion
-        A motion file, or the name of one beside the robot file or in motions beside it, or of a motion that a
-        keyframe_player has; its controllers must be active.
-    speed
-        How fast, as a factor: 0.5 takes twice as long.
-    no_wait
-        Return when the motion has begun.
-    """
-    path = Path(motion)
-    if not path.is_file() and (path.suffix or path.name != motion):
-        raise InputError(f"there is no motion file {motion}; check the path")
-    with robot_of(chosen, "play") as robot:
-        path, player = (path, "") if path.is_file() else _found(robot, motion)
-        try:
-            with begun_or_cancelled(robot, "play", waited=not no_wait):
-                if player:
-                    done = robot.send(player, _PLAY, {"motion": motion, "speed": speed})
-                else:
-                    done = robot.play(path, speed)
-        except Refused as refused:
-            raise _located(refused, path) from None
-        numbers = [goal.number for goal in done.goals]
-        if no_wait:
-            shown = ", ".join(map(str, numbers))
-            goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
-            return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")
-        return follow(robot, chosen, done, numbers, motion)
-
-
-def _found(robot: RemoteRobot, name: str) -> tuple[Path, str]:
-    """Return the motion file, or the controller, that has a motion of this name; raises InputError."""
-    info = robot.info()
-    players: dict[str, Sequence[str]] = {}
-    listed = info.get("controllers")
-    for one in listed if isinstance(listed, list) else []:
-        command = one["takes"].get(_PLAY)
-        if command is not None and "motion" in command.get("properties", {}):
-            motions = robot.parameters(one["name"]).get("motions")
-            players[one["name"]] = tuple(motions) if isinstance(motions, Mapping) else ()
-    folder = Path(str(info.get("file") or "")).parent
-    files = [file for place in (folder, folder / "motions") for file in sorted(place.glob("*.yaml"))]
-    fitting = [*(file for file in files if file.stem == name and file != Path(str(info.get("file"))))]
-    having = [player for player, motions in players.items() if name in motions]
-    if len(fitting) + len(having) > 1:
-        ways = [
-            *(f"`dxlrun play {file}`" for file in fitting),
-            *(f"`dxlrun send {player} {_PLAY} motion={name}`" for player in having),
-        ]
-        raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
-    if fitting or having:
-        return (fitting[0], "") if fitting else (Path(name), having[0])
-    written = (file.stem for file in files if _has_motions(file))
-    known = (*(one for motions in players.values() for one in motions), *written)
-    raise InputError(f"{robot.name} knows no motion {name}, nor is it a file; {suggestion(name, known)}")
-
-
-def _has_motions(file: Path) -> bool:
-    """Return whether a file has motions, as far as its lines tell; playing it tells what is wrong with it."""
-    from dxlrun.description.document import read_text
-
-    try:
-        return any(line.startswith("motions:") for line in read_text(file).splitlines())
-    except InputError:
-        return False
-
-
-def _located(refused: Refused, motion: Path) -> DxlrunError:
-    """Return a refusal with the places of the mistakes in the motion file."""
-    places, problems, fixes = (refused.fields.get(name) for name in ("places", "problems", "fixes"))
-    if not (isinstance(places, list) and isinstance(problems, list) and isinstance(fixes, list)):
-        return refused
-    found = []
-    for place, problem, fix in zip(places, problems, fixes, strict=True):
-        line, column = map(int, place.split(":"))
-        found.append(Problem(Mark(str(motion), line, column), problem, fix))
-    return InputError(found)
-
-
 @contextmanager
 def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterator[None]:
     """Where goals are waited for: on Ctrl-C before their numbers are known, cancel those that begin."""
@@ -272,7 +185,7 @@ def follow(
     joints = _joints(robot) if motion else {}
     for state in states:
         moved = joints.get(state.controller, ())
-        played = f"{motion} ({', '.join(moved[:_MOST_JOINTS])}{' ...' * (len(moved) > _MOST_JOINTS)}): "
+        played = f"{motion} ({', '.join(moved[:MOST_JOINTS])}{' ...' * (len(moved) > MOST_JOINTS)}): "
         text = f"{played if motion else ''}{sentence(state)}"
         if state.reached:
             show(f"{robot.name}: {text}")

@@ -39,6 +39,7 @@ _METHODS = (
     "__init__",
     "interfaces",
     "mismatches",
+    "motions",
     "prepare",
     "on_configure",
     "on_activate",

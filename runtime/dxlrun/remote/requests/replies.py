@@ -38,6 +38,8 @@ class ControllerInfo(msgspec.Struct, frozen=True):
     """JSON Schema of each command."""
     goals: tuple[str, ...]
     """Those of its commands that are goals."""
+    motions: dict[str, float]
+    """Those that it plays by name, with their lengths, s."""
 
 
 class RobotInfo(msgspec.Struct, frozen=True):

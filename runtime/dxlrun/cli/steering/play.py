@@ -1,0 +1,232 @@
+"""`dxlrun play`: motions of a running robot, one after the other, and a list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag
+from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, follow
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
+from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
+from dxlrun.output.terminal import show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.description.joints.groups import Groups
+    from dxlrun.remote.client import RemoteRobot
+
+PLAY = "play"
+"""The command of a controller that has motions of its own."""
+MOST_LOOPS = 10_000
+_FOLDER = "motions"
+"""Beside the robot file."""
+
+
+class Found(NamedTuple):
+    """Where a motion is that was asked for."""
+
+    motion: str
+    path: Path
+    player: str = ""
+    """The controller that has it; empty: it is in the file."""
+
+
+class Playable(NamedTuple):
+    """A motion that a robot has by name."""
+
+    motion: str
+    controllers: Sequence[str]
+    joints: Sequence[str]
+    seconds: float | None
+    """At speed 1, from its first pose on; None: its file cannot be read."""
+    file: str = ""
+    """Empty: the controller has it."""
+
+
+def play(
+    *motions: Annotated[str, Parameter(name="motion")],
+    speed: float = 1.0,
+    loop: int = 1,
+    listed: Annotated[Flag, Parameter(name="--list")] = False,
+    no_wait: Flag = False,
+    chosen: Chosen = ONLY_ONE,
+) -> int:
+    """Play motions on a running robot: `dxlrun play wave bow`.
+
+    All controllers of a motion begin in one cycle. Ctrl-C cancels them, and returns when the joints are at
+    rest; the first motion that does not reach its end is the last one.
+
+    Parameters
+    ----------
+    motions
+        A motion file, or the name of one beside the robot file or in motions beside it, or of a motion that a
+        keyframe_player has; its controllers must be active.
+    speed
+        How fast, as a factor: 0.5 takes twice as long.
+    loop
+        How often all of them are played.
+    listed
+        List the motions that the robot has by name, with their joints and lengths.
+    no_wait
+        Return when the motion has begun.
+    """
+    _check(motions, loop, listed=listed, no_wait=no_wait)
+    with robot_of(chosen, "play") as robot:
+        if listed:
+            _list(robot, chosen)
+            return 0
+        found = [_found(robot, motion) for motion in motions]
+        if len(found) > 1:
+            _check_forms(robot, [each.path for each in found if not each.player])
+        for _ in range(loop):
+            for each in found:
+                if code := _play(robot, each, speed, chosen, no_wait=no_wait):
+                    return code
+    return 0
+
+
+def _check(motions: Sequence[str], loop: int, *, listed: bool, no_wait: bool) -> None:
+    if listed and motions:
+        raise InputError(f"--list shows what there is to play; leave {' '.join(motions)} out")
+    if not (listed or motions):
+        raise InputError("name a motion; `dxlrun play --list` shows those of the robot")
+    if not 1 <= loop <= MOST_LOOPS:
+        raise InputError(f"--loop {loop}: give how often all is played, from 1 to {MOST_LOOPS}")
+    if no_wait and loop * len(motions) > 1:
+        raise InputError("--no-wait returns when one motion has begun; leave it out to play several")
+    for motion in motions:
+        path = Path(motion)
+        if not path.is_file() and (path.suffix or path.name != motion):
+            raise InputError(f"there is no motion file {motion}; check the path")
+
+
+def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, no_wait: bool) -> int:
+    """Play one motion until its end, and return the exit code."""
+    motion, path, player = found
+    try:
+        with begun_or_cancelled(robot, "play", waited=not no_wait):
+            if player:
+                done = robot.send(player, PLAY, {"motion": motion, "speed": speed})
+            else:
+                done = robot.play(path, speed)
+    except Refused as refused:
+        raise _located(refused, path) from None
+    numbers = [goal.number for goal in done.goals]
+    if no_wait:
+        shown = ", ".join(map(str, numbers))
+        goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
+        return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")
+    return follow(robot, chosen, done, numbers, motion)
+
+
+# Which there are
+
+
+def _found(robot: RemoteRobot, name: str) -> Found:
+    """Return the motion file, or the controller, that has a motion of this name; raises InputError."""
+    if (path := Path(name)).is_file():
+        return Found(name, path)
+    info = robot.info()
+    players = _players(info)
+    files = _files(info)
+    fitting = [file for file in files if file.stem == name]
+    having = [player for player, motions in players.items() if name in motions]
+    if len(fitting) + len(having) > 1:
+        ways = [
+            *(f"`dxlrun play {file}`" for file in fitting),
+            *(f"`dxlrun send {player} {PLAY} motion={name}`" for player in having),
+        ]
+        raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
+    if fitting or having:
+        return Found(name, fitting[0]) if fitting else Found(name, Path(name), having[0])
+    known = [each.motion for each in _playable(info)]
+    raise InputError(f"{robot.name} knows no motion {name}, nor is it a file; {suggestion(name, known)}")
+
+
+def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float]]:
+    """Return the motions that each controller has of its own, with their lengths."""
+    rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
+    return {str(row["name"]): cast("Mapping[str, float]", row["motions"]) for row in rows}
+
+
+def _files(info: Mapping[str, object]) -> list[Path]:
+    """Return the files beside the robot file, and those of its folder of motions."""
+    robot = Path(str(info["file"]))
+    folders = robot.parent, robot.parent / _FOLDER
+    return [file for folder in folders for file in sorted(folder.glob("*.yaml")) if file != robot]
+
+
+def _has_motions(file: Path) -> bool:
+    """Return whether a file has motions, as far as its lines tell; playing it tells what is wrong with it."""
+    from dxlrun.description.document import read_text
+
+    try:
+        return any(line.startswith("motions:") for line in read_text(file).splitlines())
+    except InputError:
+        return False
+
+
+def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
+    """Read all files before the first is played; raises InputError with the mistakes of one."""
+    from dxlrun.description.motion import read_motion
+
+    groups = cast("Groups", robot.info()["groups"])
+    for file in files:
+        read_motion(file, groups)
+
+
+def _list(robot: RemoteRobot, chosen: Chosen) -> None:
+    from dxlrun.output.table import Column, Table
+
+    rows = sorted(_playable(robot.info()))
+    if chosen.as_json:
+        show_json([row._asdict() for row in rows])
+        return
+    if not rows:
+        show(f"{robot.name} has no motions; `dxlrun teach` records some")
+        return
+    columns = [Column(name, "name") for name in ("motion", "controllers", "joints")]
+    columns += [Column("length", form="{:.2f} s"), Column("file", "name")]
+    cells = [
+        (row.motion, ", ".join(row.controllers), _few(row.joints), row.seconds, row.file) for row in rows
+    ]
+    show(Table.of("", columns, cells))
+
+
+def _few(joints: Sequence[str]) -> str:
+    return ", ".join(joints) if len(joints) <= MOST_JOINTS else f"{len(joints)} joints"
+
+
+def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
+    """Yield the motions that the robot has by name; files that are for other robots are left out."""
+    from dxlrun.description.motion import read_motion
+
+    rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
+    joints = {str(row["name"]): cast("Sequence[str]", row["joints"]) for row in rows}
+    known = {joint for each in joints.values() for joint in each}
+    for player, motions in _players(info).items():
+        for name, seconds in motions.items():
+            yield Playable(name, (player,), joints[player], seconds)
+    for file in filter(_has_motions, _files(info)):
+        try:
+            motion = read_motion(file, cast("Groups", info["groups"])).motion
+        except InputError:
+            yield Playable(file.stem, (), (), None, str(file))
+            continue
+        if set(motion.controllers) <= joints.keys() and known.issuperset(motion.joints):
+            yield Playable(file.stem, motion.controllers, motion.joints, motion.seconds, str(file))
+
+
+def _located(refused: Refused, motion: Path) -> DxlrunError:
+    """Return a refusal with the places of the mistakes in the motion file."""
+    places, problems, fixes = (refused.fields.get(name) for name in ("places", "problems", "fixes"))
+    if not (isinstance(places, list) and isinstance(problems, list) and isinstance(fixes, list)):
+        return refused
+    found = []
+    for place, problem, fix in zip(places, problems, fixes, strict=True):
+        line, column = map(int, place.split(":"))
+        found.append(Problem(Mark(str(motion), line, column), problem, fix))
+    return InputError(found)
