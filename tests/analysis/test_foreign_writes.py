@@ -104,7 +104,7 @@ def test_of_a_bulk_write_each_part_is_told() -> None:
         write(1.0, 4, "goal_position", 1, b"\1"),
         b"\xff\xff\x04",
     ],
-    ids=["a ping", "a read", "nobody", "no item begins there", "half an item", "a piece"],
+    ids=["a ping", "a read", "no servo", "no item begins there", "half an item", "a piece"],
 )
 def test_what_writes_no_item_of_a_servo_is_not_told(sent: bytes) -> None:
     assert told(1.0, sent) == ("", False)

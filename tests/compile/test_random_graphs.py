@@ -249,7 +249,7 @@ def clashes(graph: Graph, names: set[str]) -> set[frozenset[str]]:
 
 
 def steps(graph: Graph) -> set[tuple[str, str]]:
-    """Return who is updated before whom."""
+    """Return what is updated before what."""
     names = {one.name for one in graph}
     down = {(one.name, low) for one in graph for low in one.into if low in names}
     read = {

@@ -35,7 +35,7 @@ class Story(Robot):
 
     @property
     def what(self):
-        """What was asked of servos, without whom to answer."""
+        """What was asked of servos, without a client to answer."""
         return [words[:-1] for words in self.asked]
 
     def done(self, *answer, which=0):

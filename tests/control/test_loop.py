@@ -27,7 +27,7 @@ def test_the_phase_stays_and_every_period_is_accounted_for(robot):
     assert result.skipped > 5_000
     np.testing.assert_array_equal(scheduled, start_ns + cycle * PERIOD_NS)
     np.testing.assert_array_equal(skipped[1:], np.diff(cycle) - 1)
-    np.testing.assert_array_equal(woken, scheduled)  # virtual time wakes nobody late
+    np.testing.assert_array_equal(woken, scheduled)  # virtual time wakes nothing late
     assert np.diff(woken).min() >= PERIOD_NS  # never a burst
     np.testing.assert_array_equal(period[1:], np.minimum(np.diff(woken), 5 * PERIOD_NS))
 

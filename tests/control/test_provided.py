@@ -1,4 +1,4 @@
-"""States that a controller provides: who reads them, and how old and how valid they are."""
+"""States that a controller provides: what reads them, and how old and how valid they are."""
 
 from __future__ import annotations
 

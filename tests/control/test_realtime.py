@@ -332,7 +332,7 @@ def test_a_real_process_without_rights_gets_plain_sentences():
 
 
 def test_a_real_process_gets_what_its_rights_allow():
-    """Whoever runs the tests, root or not, in a container or not: what is told is what the kernel did."""
+    """Root or not, in a container or not: what is told is what the kernel did."""
     found = outcome(WISHES.format(before=""))
     granted = dict(found["granted"])
     lockable, prioritised = found["may"]

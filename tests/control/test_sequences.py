@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.kit.loops import PERIOD_NS, Robot
 
 SEQUENCES = int(os.environ.get("DXLRUN_SEQUENCES", "60"))
-NAMES = ("a", "b", "c", "d", "nobody")
+NAMES = ("a", "b", "c", "d", "none_such")
 JOINTS = {"a": ("j0",), "b": ("j1", "j2"), "c": ("j0", "j1", "j2"), "d": ("j2",), "x": ("j0",), "y": ("j1",)}
 
 names = st.one_of(
@@ -38,7 +38,7 @@ sequences = st.lists(
 
 
 class Run:
-    """One robot whose controllers write their own mark, so that a goal tells who commanded it."""
+    """One robot whose controllers write their own mark, so that a goal tells what commanded it."""
 
     def __init__(self, overrun):
         self.robot = robot = Robot(joints=3)
@@ -46,7 +46,7 @@ class Run:
         self.broken = False  # c did so in this cycle
         self.late_ns = 0
         self.times = {}
-        self.wrong = []  # who was told a time before the one that it had been told
+        self.wrong = []  # what was told a time before the one that it had been told
         for mark, name in enumerate("abcd", start=1):
             rate = 25.0 if name == "b" else None
             fallback = "d" if name == "c" else ""
@@ -132,13 +132,13 @@ class Run:
         assert self.updated <= set(active) | self.ended(), "an inactive controller was updated"
         marks = {round(value * 100) for value in record.commands.position if np.isfinite(value)}
         allowed = {{"a": 1, "b": 2, "c": 3, "d": 4, "x": 1, "y": 4}[name] for name in active}
-        assert marks <= allowed, "the robot was commanded by somebody who is not active"
+        assert marks <= allowed, "the robot was commanded by a controller that is not active"
         if self.robot.loop.steering.paused:
             assert not marks
             assert not self.updated
 
     def ended(self):
-        """Return who was ended by its fault in this very cycle."""
+        """Return what was ended by its fault in this very cycle."""
         return {"c"} if self.broken else set()
 
 

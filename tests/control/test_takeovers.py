@@ -1,4 +1,4 @@
-"""Requests of controllers: who takes over in the same cycle, what is refused, and how a run is ended."""
+"""Requests of controllers: which take over in the same cycle, what is refused, and how a run is ended."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Rig:
 
 
 def lose_the_write(rig):
-    """Lose the instruction behind a read of Torque Enable and three pings for somebody else: the write."""
+    """Lose the instruction behind a read of Torque Enable and three pings for another servo: the write."""
     rig.line.bus.after(4, lambda: rig.line.bus.alter_next_instruction("lost", lambda data: b""))
 
 

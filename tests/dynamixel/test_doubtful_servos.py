@@ -134,7 +134,7 @@ def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(mo
     said = stand(rig.lines)
     assert said == ("main_1_joint (ID 1 on bus main) stands: its goal is 0",)
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
-    assert rig.torque() == [True, False], "who had no torque was given some"
+    assert rig.torque() == [True, False], "a servo without torque was given some"
     standing = rig.servo(1).position
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
     rig.torque()

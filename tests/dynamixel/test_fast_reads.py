@@ -1,4 +1,4 @@
-"""Fast sync and bulk reads: all servos in one status, fewer bytes, and nobody's value is another's."""
+"""Fast sync and bulk reads: all servos in one status, fewer bytes, and no value is another servo's."""
 
 from functools import partial
 

@@ -402,7 +402,7 @@ def test_an_adapter_that_is_back_soon_after_the_end_finds_torque_off_sent(back_a
     bus.at(rig.clock.now_ns() + back_after_ns, bus.plug_in)
     before = rig.clock.now_ns()
     failures = rig.hardware.stop()
-    assert rig.torque(1) == [False, False]  # nobody waited for the line that was gone
+    assert rig.torque(1) == [False, False]  # nothing waited for the line that was gone
     assert rig.torque(0) == [not limp] * 2
     assert bool(failures) == (not limp)
     assert rig.clock.now_ns() - before < 500_000_000

@@ -70,7 +70,7 @@ def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answe
     assert "arm_13_joint" in lost
     assert len(lost) == (1 if others_answer else 6)
     started.restless = 0.002
-    started.cycles(10)  # whoever missed a turn is asked for its torque before it gets goals again
+    started.cycles(10)  # a servo that missed a turn is asked for its torque before it gets goals again
     goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
     assert list(goals[12:-2:9]) == list(X_IDS)
 
@@ -175,10 +175,10 @@ def test_late_replies_of_three_silent_servos_are_never_taken_as_current(late_ms)
     for servo in servos:
         servo.silence()
     sent = len(rig.out_of_bus())
-    for _ in range(2):  # nobody answers what is asked now: whatever arrives is old
+    for _ in range(2):  # no servo answers what is asked now: what arrives is old
         rig.cycle()
         assert not rig.states.valid.any()
-    assert len(rig.out_of_bus()) > sent or late_ms > 40  # by then they are lost, and nobody is asked
+    assert len(rig.out_of_bus()) > sent or late_ms > 40  # by then they are lost, and none is asked
     for servo in servos:
         servo.silence(False)
     rig.cycles(20)
@@ -206,5 +206,5 @@ def test_servos_of_several_layouts_share_a_bus():
     assert rig.events.of(EventCode.READ_LOST) == []
     assert rig.hardware.stop() == ()
     assert rig.torque() == [False] * 4
-    # nobody was told to write at the address where the other model has its torque enable
+    # no servo was told to write at the address where the other model has its torque enable
     assert [packet for packet in rig.into_bus() if packet[4] == 254 and packet[7] == 3] == []

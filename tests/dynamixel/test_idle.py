@@ -152,7 +152,7 @@ def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
     assert rounds.idle.begin(rounds.rig.clock.now_ns() + 5_000_000)
     rounds.bus.load(rounds.idle)
-    rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nobody waits for the reply
+    rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nothing waits for the reply
     rounds.rig.clock.wait_until(rounds.rig.clock.now_ns() + 5_000_000)
     assert rounds.gap(1_000_000) == [protocol2.read(11, 7, 1)]
     assert found == [[11]]

@@ -105,5 +105,5 @@ def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_
         if known is not Mode.UNKNOWN:
             assert in_mode(servo.mode_plan(known), found), (known, found)
         if servo.joint not in excused:
-            assert known is not Mode.UNKNOWN, f"nobody knows in which mode {servo.joint} is"
+            assert known is not Mode.UNKNOWN, f"it is not known in which mode {servo.joint} is"
             assert rig.torque()[servo.row], f"{servo.joint} lost its torque over a change"

@@ -271,7 +271,7 @@ def test_a_later_request_replaces_the_one_that_is_on_its_way(arm):
     change(arm, Mode.EFFORT)
     assert arm.servo(1).registers["operating_mode"] == 0
     written = [data[10] for data in arm.into_bus() if data[4:10] == bytes((1, 6, 0, 3, 11, 0))]
-    assert written == [0], "the EEPROM was written for modes that nobody wanted any more"
+    assert written == [0], "the EEPROM was written for modes that were not wanted any more"
 
 
 def test_a_servo_that_falls_silent_on_the_way_gets_no_goals(arm):

@@ -200,7 +200,7 @@ def test_a_difference_that_the_start_mends_does_not_forbid_it():
         "Return Delay Time (5) was 250 and is 0",
     ]
     eeprom = [address for _, address, _ in rig.writes() if address < 24]
-    assert eeprom == [16, 5]  # each once, though nobody acknowledged the first
+    assert eeprom == [16, 5]  # each once, though the first was not acknowledged
 
 
 def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says():

@@ -1,4 +1,4 @@
-"""Lines that go and come back: who keeps them, and who asks for them; on pseudo-terminals behind a link."""
+"""Lines that go and come back: what keeps them, and what asks for them; on pseudo-terminals behind a link."""
 
 import os
 import select
@@ -131,7 +131,7 @@ def test_whoever_asks_gets_the_line_in_the_place_of_the_old_one(adapters, kept):
     assert keeper.receive() == [LineLost(0)]  # it was lost anew
     adapters[0].plug_in()
     keeper.close()
-    assert not ports.reopen(0)  # nobody is there to ask
+    assert not ports.reopen(0)  # nothing is there to ask
     ours.close()
 
 

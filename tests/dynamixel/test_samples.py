@@ -62,7 +62,7 @@ class Robot:
         self.settle([True] * count, [age_ns] * count)
 
     def turn(self, *positions, after_ms=10, came=True):
-        """Let the servos stand at angles, rad; return who is valid, and where."""
+        """Let the servos stand at angles, rad; return which are valid, and where."""
         for index, (servo, angle) in enumerate(zip(self.servos, positions, strict=True)):
             raw = round((angle * servo.direction + servo.reference) / servo.rad_per_tick)
             self.put(index, raw, 0, 0)

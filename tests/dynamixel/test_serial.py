@@ -83,7 +83,7 @@ def test_a_line_that_is_back_has_the_place_and_the_number_of_the_one_that_is_gon
     os.close(master)
     ports.wait(time.monotonic_ns() + 5_000_000_000)
     assert not ports.reopen(0)
-    # nobody here has the device open any more, and nobody waits for it
+    # nothing here has the device open any more, and nothing waits for it
     assert os.readlink(f"/proc/self/fd/{port.descriptor}") == os.devnull
     assert ports.wait(time.monotonic_ns() + 1_000_000) == ()
     master, slave = pty.openpty()

@@ -1,4 +1,4 @@
-"""Slow registers, reboots that nobody missed, jumps, and shutdowns: judged by the simulated bus."""
+"""Slow registers, reboots that cost no reply, jumps, and shutdowns: judged by the simulated bus."""
 
 import math
 

@@ -13,7 +13,7 @@ from dxlrun.plan.simulation_plan import ServoConfig
 
 
 def refusal(rig):
-    """Return what start says when it refuses; nobody may have torque then, and no register was written."""
+    """Return what start says when it refuses; no servo may have torque then, and no register was written."""
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()
     at = 4 if rig.plans[0].protocol == 1.0 else 7
@@ -294,7 +294,7 @@ def test_answers_that_come_late_are_those_to_what_was_asked():
     assert rig.torque() == [True] * 8
     assert [code for code, severity, *_ in rig.events.list if severity >= Severity.WARNING] == []
     asked = [packet for packet in rig.into_bus() if packet[2] == 6]
-    assert asked.count(protocol1.ping(6)) == 3  # nobody was asked twice
+    assert asked.count(protocol1.ping(6)) == 3  # no servo was asked twice
 
 
 def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypatch):
@@ -302,7 +302,7 @@ def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypat
     read, reads = rig.hardware.read, []
 
     def late():
-        """Let nobody hear anything for 70 ms when the first states are read."""
+        """Let no servo hear anything for 70 ms when the first states are read."""
         if not reads:
             for servo in rig.buses[0].servos:
                 servo.silence()

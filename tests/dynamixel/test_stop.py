@@ -45,7 +45,7 @@ def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
     assert started.torque() == [servo.servo_id == 4 for servo in started.buses[0].servos]
     last = protocol1.write(21, 24, b"\0")
     off_ns = next(e.t_ns for e in started.ledger.entries if e.t_ns >= start and e.data == last)
-    assert off_ns - start < 50_000_000  # whoever comes behind it does not wait for it
+    assert off_ns - start < 50_000_000  # the servos behind it do not wait for it
     assert started.clock.now_ns() - start < 400_000_000
     assert len(started.events.of(EventCode.SHUTDOWN_FAILED)) == 1
 
@@ -59,7 +59,7 @@ def test_stop_in_noise_tries_again(started):
 
 
 def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(monkeypatch):
-    """A servo that falls silent once it has torque: nobody may claim that it is limp."""
+    """A servo that falls silent once it has torque: it is not called limp."""
     rig = make_rig()
     emit = rig.events.emit
 

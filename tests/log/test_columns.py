@@ -32,7 +32,7 @@ RULE = "=" * 80
 MIXED = MessageType(
     "a/msg/Mixed",
     f"""uint8 LEVEL=3
-string<=9 name "nobody # in particular"
+string<=9 name "arm # in particular"
 Inner[] inner
 int16[3] three
 uint8 flag 1

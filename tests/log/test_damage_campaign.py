@@ -160,7 +160,7 @@ def test_a_flipped_bit_costs_one_chunk_at_most(
 def test_a_chunk_that_is_another_record_by_one_bit_is_missed(
     written: Written, tmp_path: Path, opcode: int
 ) -> None:
-    """A footer, an index, or a kind that nobody knows: the file's statistics tell."""
+    """A footer, an index, or a kind that no version knows: the file's statistics tell."""
     begin = written.data.index(b"\4\0\0\0zstd", written.ends[1]) - 37
     assert written.data[begin] == 6
     data = bytearray(written.data)

@@ -19,7 +19,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 
 PLANNED = TakenCommand(5_000, 3, 7, "left_arm", "trajectory", "wave.yaml:7:5", b"")
-GIVEN = TakenCommand(6_000, 4, -1, "head", "positions", "somebody", np.array([0.5, -0.0, np.nan]).tobytes())
+GIVEN = TakenCommand(6_000, 4, -1, "head", "positions", "anna", np.array([0.5, -0.0, np.nan]).tobytes())
 STREAMED = TakenCommand(
     6_500, 4, -1, "head", "positions", "anna", np.array([0.25]).tobytes(), lease_ns=200_000_000
 )
@@ -60,7 +60,7 @@ def test_another_reader_decodes_them(written: Path) -> None:
     assert [message.cycle for message in found["/activation"]] == [-1]
     planned, given, streamed, steering, *_ = found["/commands"]
     assert (planned.cycle, planned.planned, planned.controller, list(planned.data)) == (3, 7, "left_arm", [])
-    assert (given.planned, given.kind, given.origin) == (-1, "positions", "somebody")
+    assert (given.planned, given.kind, given.origin) == (-1, "positions", "anna")
     assert np.array(given.data).tobytes() == GIVEN.data
     assert (streamed.lease_ns, list(streamed.data), streamed.text) == (200_000_000, [0.25], "")
     assert (steering.controller, steering.kind, list(steering.data)) == ("", "switch", [])

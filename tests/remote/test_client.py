@@ -38,7 +38,7 @@ class Peer:
                     said = self.answers.pop(0)
                     if said is None:
                         if not self.answers:
-                            self.listener.close()  # as a process that dies: nobody can come any more
+                            self.listener.close()  # as a process that dies: no client can come any more
                         break
                     end.sendall(said)
         self.listener.close()

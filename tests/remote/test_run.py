@@ -82,7 +82,7 @@ def place(tmp_path_factory) -> Iterator[Path]:
 
 
 def misbehave(path: Path) -> None:
-    """Be a client that nobody wants: hang in half a request, 70 times, and send what is never read."""
+    """Be a client that is not wanted: hang in half a request, 70 times, and send what is never read."""
     clients = [socket.socket(socket.AF_UNIX) for _ in range(70)]
     for client in clients:
         client.connect(str(path))

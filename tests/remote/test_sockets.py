@@ -1,4 +1,4 @@
-"""Where sockets are, who may use them, and which of them are alive."""
+"""Where sockets are, which users may use them, and which of them are alive."""
 
 import os
 import socket
@@ -39,7 +39,7 @@ def test_only_the_same_user_may_enter(place):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(place.stat().st_mode) == 0o700
         assert running() == ("pair",)
-        if os.getuid() == 0:  # only root can become somebody else
+        if os.getuid() == 0:  # only root can become another user
             for parent in (*list(place.parents)[:2], place):  # the socket's own mode is what forbids it
                 parent.chmod(0o755)
             command = [sys.executable, "-c", CONNECT, str(path)]

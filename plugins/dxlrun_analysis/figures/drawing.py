@@ -79,7 +79,7 @@ def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
 ) -> ET.Element:
     """Return the part of a page with what `fill` draws on an empty figure of `height` inches.
 
-    `name`: unique in the page, of letters, digits and dashes. `alt`: for readers who cannot see it, the axes
+    `name`: unique in the page, of letters, digits and dashes. `alt`: for readers that cannot see it, the axes
     with their units, and the finding. `text`: its caption.
     """
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]  # the stubs want one literal type for all keys

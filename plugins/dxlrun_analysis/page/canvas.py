@@ -101,7 +101,7 @@ class Plot:
     name: str
     title: str
     label: str
-    """What it shows, for readers who cannot see it, where it has no title: at first its vertical axis'."""
+    """What it shows, for readers that cannot see it, where it has no title: at first its vertical axis'."""
     text: str  # Its caption: what is drawn and what is found
     model: bokeh_figure
     _legend: list[Element] = field(default_factory=list)

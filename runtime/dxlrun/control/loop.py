@@ -77,7 +77,7 @@ class LoopResult(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True, kw_only=True)
 class Loop:
-    """One robot's control loop; hardware is started before and stopped after it by whoever built it.
+    """One robot's control loop; hardware is started before and stopped after it by what built it.
 
     Cycle n is due by the Schedule, which also has the controllers' time: that of the wake-up since the first
     deadline, pauses left out. Controllers get the true time since the cycle before too, at most PERIOD_CAP

@@ -65,7 +65,7 @@ def test_a_silent_servo_and_periods_that_were_skipped(
     robot.write_text(robot_file.read_text().replace("default: 50,", "default: 200,").replace("25}", "50}"))
     log = run(
         lambda one: silence(one, (3, 7, 8), 300, 600), robot, duration_s=4.0
-    )  # who is lost is asked once a second
+    )  # a lost one is asked once a second
     cycles = read_log(log).cycles
     assert cycles["skipped"].sum() > 0
     assert not cycles["valid"].all()

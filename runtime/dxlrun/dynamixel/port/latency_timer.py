@@ -1,7 +1,7 @@
 """Latency timer: how long an FTDI adapter keeps the last bytes of a reply back, and how to shorten that.
 
 Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c, which has the timer in sysfs and shortens it to
-1 ms for whoever sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such timer.
+1 ms for a program that sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such timer.
 """
 
 from __future__ import annotations

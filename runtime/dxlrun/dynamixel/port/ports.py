@@ -21,7 +21,7 @@ _WRITE_TIMEOUT_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
 
 Reopened = Callable[[int], int | None]
-"""Asks whoever opens lines for one of them again; returns its descriptor once there is one; never waits."""
+"""Asks the process that opens lines for one again; returns its descriptor once there is one; never waits."""
 
 
 AUTO_SHARE = 0.1

@@ -1,4 +1,4 @@
-"""Reopening: a lost line is opened again by whoever keeps the lines, and handed to whoever speaks on them."""
+"""Reopening: a lost line is opened again by the process that keeps the lines, and handed to the loop."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class KeptLines:
     """The lines of a robot, kept open; one that is gone is opened again, however long that takes.
 
     A descriptor keeps its number while the line behind it goes and comes. Opening happens in a thread, one a
-    lost line: a driver may take seconds over it, and whoever keeps the lines has a loop to watch.
+    lost line: a driver may take seconds over it, and the process that keeps the lines has a loop to watch.
     """
 
     def __init__(self, lines: Sequence[Wanted], system: Path = SYSTEM) -> None:
@@ -99,7 +99,7 @@ class KeptLines:
         if not self._names[index]:
             return False
         try:
-            # not before it is needed: a thread has the priority of whoever starts it
+            # not before it is needed: a thread has the priority of the one that starts it
             threading.Thread(target=self._keep_trying, args=(index,), daemon=True).start()
         except RuntimeError:  # the system has no thread left
             return False
