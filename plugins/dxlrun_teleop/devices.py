@@ -30,12 +30,8 @@ DEAD_ZONE = 0.1
 KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER, 1: Press.QUIT}
 """KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
 SIDES: Mapping[int, tuple[int, float]] = {
-    **{first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)},
-    103: (0, 1.0),
-    108: (0, -1.0),
-    105: (1, 1.0),
-    106: (1, -1.0),
-}
+    first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)
+} | {103: (0, 1.0), 108: (0, -1.0), 105: (1, 1.0), 106: (1, -1.0)}
 """From KEY_Q and from KEY_A on, by their places whatever is printed on them; up, down, left, right"""
 
 
@@ -157,8 +153,7 @@ def chosen(path: str | None) -> Gamepad:
         return source
     what = f"{path} is no gamepad or keyboard that can be read" if path else "no gamepad can be read"
     what = "several gamepads are there, choose one by --device" if pads and not path else what
-    hint = (
-        "" if len(devices) == len(paths) else "; `sudo usermod -aG input $USER` and a new log-in show others"
-    )
+    more = "; `sudo usermod -aG input $USER` and a new log-in show others"
+    hint = more if len(devices) < len(paths) else ""
     listed = "".join(f"\n  {device.path}  {device.name}" for device in devices if device.path in able)
     raise InputError(f"{what}; gamepads and keyboards{hint}:{listed or ' none'}")
