@@ -30,11 +30,17 @@ gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are coll
 
 SAMPLED = (
     "run/test_new_log.py",
+    "bench/test_exchange.py",
+    "bench/test_exchange_command.py",
     "cli/test_sim.py",
+    "lab/characterize/test_command.py",
     "lab/characterize/test_known_servos.py",
     "lab/guided/test_live.py",
+    "lab/identify/test_command.py",
+    "lab/identify/test_published.py",
     "lab/identify/test_recovery.py",
     "lab/sweep/test_sweep.py",
+    "lab/tracking/test_command.py",
 )
 """Runs through all processes, and experiments: some seconds each, of which CI runs a sample.
 

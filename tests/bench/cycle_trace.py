@@ -113,7 +113,13 @@ def command_cycle() -> Calls:
 
 
 def _most_frequent(cycles: Sequence[Calls]) -> Calls:
-    kinds = Counter(frozenset(calls.items()) for calls in cycles)
+    """Return the most frequent of those in which the kernel came back once: late replies make it more."""
+    waited = [any(code.co_name == "_finish_read" for code in calls) for calls in cycles]
+    kinds = Counter(
+        frozenset(calls.items())
+        for calls, late in zip(cycles, waited, strict=True)
+        if not late or all(waited)
+    )
     return Counter(dict(kinds.most_common(1)[0][0]))
 
 

@@ -16,6 +16,7 @@ ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 JOINT, SERVO = "right_elbow_joint", 4
 SERVOS = {1, 2, 3, 4, 5, 6, 20, 21}
 TORQUE_ENABLE, GOAL_POSITION = 24, 30
+BROADCAST = 254
 
 
 class Run:
@@ -70,7 +71,8 @@ class Run:
             if entry.direction != "in" or len(data) < 7:
                 continue
             if data[4] == 0x03 and data[5] == address:
-                found[data[2]] = int.from_bytes(data[6:-1], "little")
+                servos = SERVOS if data[2] == BROADCAST else {data[2]}
+                found |= dict.fromkeys(servos, int.from_bytes(data[6:-1], "little"))
             elif data[4] == 0x83 and data[5] <= address < data[5] + data[6]:
                 size, offset = data[6] + 1, address - data[5] + 1
                 rows = [data[at : at + size] for at in range(7, len(data) - 1, size)]
