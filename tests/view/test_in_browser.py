@@ -56,6 +56,9 @@ def test_a_log_plays_and_jumps(recorded: RecordedRobot, serve: Serve, browser: B
     moved = browser.differing(before, browser.picture("#scene"))
     assert 0.01 < moved < 0.6
     assert browser.value("document.querySelector('#now').textContent").startswith("8.00 of ")
+    legend = "parseFloat(document.querySelector('.legend b').textContent)"
+    table = "parseFloat(document.querySelectorAll('#joints tbody tr')[0].cells[2].textContent)"
+    assert abs(browser.value(f"{legend} - {table}")) < 1.0, "the legend has the value of another time"
     browser.value("document.querySelector('#speed').value = '4', document.querySelector('#play').click()")
     browser.until("parseFloat(document.querySelector('#now').textContent) > 9.5")
     browser.value("document.querySelector('[data-tab=events]').click()")

@@ -138,8 +138,9 @@ class Chart {
     });
     if (!tables.length) { this.plot.setData([[]]); return; }
     this.plot.setData(uPlot.join(tables, tables.map(() => [0, 2])));
-    tables.forEach(([, values], at) => {
-      const shown = values[values.length - 1];
+    tables.forEach(([times, values], at) => { // of a log where its time line is
+      const behind = cursor === undefined ? -1 : times.findIndex((time) => time > cursor);
+      const shown = values[(behind < 0 ? values.length : Math.max(behind, 1)) - 1];
       const item = this.legend.children[at];
       if (item?.value) item.value.textContent = shown === null || shown === undefined ? "" : figure(shown);
     });
