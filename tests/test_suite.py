@@ -124,7 +124,7 @@ def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
 RUNTIME = ROOT / "runtime"
 MOST_ENTRIES = 16
 MOST_ROOMS = 18
-"""In the package itself, whose rooms docs/architecture.md lists."""
+"""In the package itself, whose rooms docs/explanation/architecture.md lists."""
 
 
 def entries(folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""docs/analyze.md has every code of a finding, and no other."""
+"""analyze.md has every code of a finding, and no other."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.kit.pages import page_text
+
 import dxlrun_analysis
 from dxlrun_analysis.finding import ROBOT
 from dxlrun_analysis.joints.kinds import KINDS
 from dxlrun_analysis.lost import CODES
 
-PAGE = Path(__file__).parents[2] / "docs" / "analyze.md"
+PAGE = page_text("analyze.md")
 FILES = Path(next(iter(dxlrun_analysis.__path__))).rglob("*.py")
 MADE_BY = ("Finding", "Failing", "_Rule", "cause", "slow_servo")
 """Calls whose first argument is a code, or is computed by what else is looked at."""
@@ -56,7 +58,7 @@ def test_the_page_has_every_code_of_a_finding_and_no_other() -> None:
     codes = {code for file in FILES for code in codes_of(file) if code.islower()} | {ROBOT}
     codes |= {*CODES.values(), *KINDS}
     assert {"jammed_joint", "latency_timer", "device_hangs", "slow_writes"} <= codes
-    page = PAGE.read_text()
+    page = PAGE
     table = page[page.index("| code |") :].partition("\n\n")[0]
     documented = {
         code for row in table.splitlines()[2:] for code in re.findall(r"`([a-z_]+)`", row.split("|")[1])

@@ -1,4 +1,4 @@
-"""The figures and commands of docs/bench.md are those of the program."""
+"""The figures and commands of docs/explanation/bench.md are those of the program."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun.cli import main
 from dxlrun_lab.highest_rate import ALLOWED, HIGHEST_HZ
@@ -16,12 +17,12 @@ from exchange.hosts import HOSTS
 from exchange.rounds import WARM, measure
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "bench.md").read_text()
+PAGE = page_text("bench.md")
 FLAT = " ".join(PAGE.split())
 PROGRAM = "python tests/bench/exchange"
 EXCHANGES = [
     line
-    for path in sorted(ROOT.glob("docs/*.md"))
+    for path in sorted(ROOT.glob("docs/**/*.md"))
     for line in re.findall(rf"(?:^ *|`){PROGRAM}[^`\n]*", path.read_text(), re.MULTILINE)
 ]
 

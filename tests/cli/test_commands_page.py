@@ -1,4 +1,4 @@
-"""docs/commands.md has every command and every option of the program, and no others."""
+"""commands.md has every command and every option of the program, and no others."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.pages import page_text
 
-PAGE = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
+PAGE = page_text("commands.md")
 SECTIONS: dict[str, str] = dict(re.findall(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S))
 RUN = "dxlrun ROBOT.yaml"
 STEER = {

@@ -7,6 +7,8 @@ import re
 import shlex
 from pathlib import Path
 
+from tests.kit.pages import page_text
+
 from dxlrun.compile.robot import compile_files
 from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.faults.fault import parse_fault
@@ -67,7 +69,7 @@ def test_items_of_a_board_are_read_and_written(dxlrun, simulated_line):
     ]
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "devices.md").read_text()
+PAGE = page_text("devices.md")
 ROBOT = """\
 name: board_of_the_page
 buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}}

@@ -39,7 +39,11 @@ from dxlrun_view import dxlrun_commands
 ROOT = Path(__file__).parents[2]
 ROOTS = (ROOT, ROOT / "runtime/dxlrun", ROOT / "plugins")
 """Where a page's path to a file may begin."""
-PATHS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+PATHS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted({*ROOT.glob("docs/**/*.md")} - {*ROOT.glob("docs/changes/*")}),
+]
 PAGES = {path.name: path.read_text() for path in PATHS}
 PROJECT = (ROOT / "pyproject.toml").read_text()
 SOURCES = [
@@ -62,7 +66,7 @@ TESTS = {
         "tests/lab/sweep/test_command.py",
         "tests/lab/tracking/test_command.py",
     ),
-    "by_hand.md": ("tests/hand/test_terminal.py",),
+    "by-hand.md": ("tests/hand/test_terminal.py",),
     "frames.md": ("tests/cli/test_frames.py",),
     "logs.md": (
         "tests/analysis/season/test_logs.py",
@@ -266,8 +270,12 @@ def test_the_files_that_a_page_names_exist(path: Path) -> None:
 
 
 def test_every_page_is_in_the_index() -> None:
-    pages = {path.name for path in ROOT.glob("docs/*.md")} - {"index.md"}
-    assert pages <= set(re.findall(r"\]\(([\w-]+\.md)\)", PAGES["index.md"]))
+    pages = {str(path.relative_to(ROOT / "docs")) for path in PATHS[2:]} - {"index.md"}
+    assert pages <= set(re.findall(r"\]\(((?:[\w-]+/)?[\w-]+\.md)\)", PAGES["index.md"]))
+
+
+def test_the_name_of_a_page_is_unique() -> None:
+    assert len(PAGES) == len(PATHS)
 
 
 def test_what_the_code_cites_is_in_the_repository() -> None:
@@ -275,10 +283,15 @@ def test_what_the_code_cites_is_in_the_repository() -> None:
     cited = {
         (name, path.name)
         for path in SOURCES
-        for name in re.findall(r"(?<![\w/*.{}-])((?:docs/)?[a-zA-Z-]+\.md)\b", path.read_text())
+        for name in re.findall(r"(?<![\w/*.{}-])((?:docs/(?:[\w-]+/)?)?[a-zA-Z-]+\.md)\b", path.read_text())
     }
     assert ("protocol.md", "line.py") in cited
-    assert {(name, where) for name, where in cited if name.removeprefix("docs/") not in pages} == set()
+    lost = {
+        (name, where)
+        for name, where in cited
+        if not ((ROOT / name).exists() if "/" in name else name in pages)
+    }
+    assert lost == set()
     headings = anchors(PAGES["protocol.md"])
     sections = [
         one for path in SOURCES for one in re.findall(r"\(protocol\.md, ([A-Z]\w+)", path.read_text())

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
 from dxlrun.testing import kinematics
@@ -135,7 +136,7 @@ def test_the_commands_of_the_page_work(
     """Of frames.md."""
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "frames.md").read_text()
+    page = page_text("frames.md")
     lines = [line for line in re.findall(r"^    dxlrun (.+)$", page, re.MULTILINE) if "frames" in line]
     assert len(lines) > 2
     for line in lines:

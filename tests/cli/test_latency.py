@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.pages import page_text
 
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.latency import latency_log
@@ -163,7 +164,7 @@ def test_the_commands_of_a_page_are_understood(
     monkeypatch.setattr(measurement, "require_grants", lambda *_: ())
     monkeypatch.setattr(measurement, "compiled_yardstick", lambda *_: nullcontext(""))
     monkeypatch.setattr(measurement, "keep_cores_awake", lambda *_: None)
-    text = (Path(__file__).parents[2] / "docs" / page).read_text()
+    text = page_text(page)
     lines = re.findall(r"^    dxlrun (latency .+)$", text, re.MULTILINE)
     assert lines
     for line in lines:

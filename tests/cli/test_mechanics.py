@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.pages import page_text
 
 ROOT = Path(__file__).parents[2]
 
@@ -19,7 +20,7 @@ def test_the_commands_of_the_page_work(
     """Of mechanics.md."""
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "mechanics.md").read_text()
+    page = page_text("mechanics.md")
     check, run = re.findall(r"^    dxlrun (.+)$", page, re.MULTILINE)
     shown = dxlrun(*shlex.split(check))
     assert shown.code == 0

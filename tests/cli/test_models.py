@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 
 import dxlrun as dxlrun_package
 from dxlrun.cli.tools.models import runs, unit_of
@@ -166,7 +167,7 @@ def test_units_are_those_that_people_read(item, unit):
     assert unit_of(control_table("XM430-W350").items[item]) == unit
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "models.md").read_text()
+PAGE = page_text("models.md")
 
 
 @pytest.mark.parametrize("line", re.findall(r"^    (dxlrun .+)$", PAGE, re.MULTILINE))
@@ -182,7 +183,7 @@ def test_the_page_shows_hooks_that_there_are():
     hooks = re.findall(r"^@hookimpl\ndef (\w+)\(\) -> (.+):$", code, re.MULTILINE)
     assert [name for name, _ in hooks] == ["dxlrun_contract", "dxlrun_servo_models"]
     assert all(hasattr(HookSpecs, name) for name, _ in hooks)
-    compile(code, "docs/models.md", "exec")
+    compile(code, "models.md", "exec")
 
 
 def test_the_page_names_files_that_there_are():

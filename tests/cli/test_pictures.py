@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import PATHS
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
@@ -58,14 +59,14 @@ def size_of(picture: Path) -> tuple[int, int]:
 
 
 def test_the_pages_show_them_and_they_are_small() -> None:
-    shown = re.findall(r"!\[.+\]\((docs/pictures/.+)\)", (ROOT / "README.md").read_text())
-    on_page = re.findall(r"!\[.+\]\((pictures/.+)\)", (ROOT / "docs/view.md").read_text())
-    shown += [f"docs/{one}" for one in on_page]
-    assert {Path(one).name for one in shown} == {
-        path.name for path in PICTURES.iterdir() if path.suffix != ".py"
+    shown = {
+        (path.parent / target).resolve()
+        for path in (ROOT / "README.md", *PATHS.values())
+        for target in re.findall(r"!\[[^\]]+\]\(([^)\s]+)\)", path.read_text())
     }
+    assert shown == {path for path in PICTURES.iterdir() if path.suffix != ".py"}
     for one in shown:
-        assert (ROOT / one).stat().st_size < 200_000
-        if one.endswith(".svg"):
-            text = (ROOT / one).read_text()
-            assert not re.search(r"(href|src)=\"(?!#)|url\((?!#)|@import|<script", text)
+        assert one.stat().st_size < 200_000, one
+        if one.suffix == ".svg":
+            text = one.read_text()
+            assert not re.search(r"(href|src)=\"(?!#)|url\((?!#)|@import|<script", text), one

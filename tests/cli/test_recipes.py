@@ -1,4 +1,4 @@
-"""The programs of docs/recipes.md and the notebook, on simulated robots.
+"""The programs of docs/how-to/recipes.md and the notebook, on simulated robots.
 
 The notebook's cell is executed in this process: a Jupyter kernel would be many packages more to install, and
 would run the same lines. What only waits for goals runs on virtual time.
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.hands import LiveRobot
+from tests.kit.pages import page_text
 
 import dxlrun as face
 from dxlrun import RemoteRobot, connect
@@ -29,7 +30,7 @@ from dxlrun.testing import plan_of
 from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "recipes.md").read_text()
+PAGE = page_text("recipes.md")
 PROGRAMS = dict(
     re.findall(r"^## ([^\n]+)$(?:(?!^## ).)*?^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 )

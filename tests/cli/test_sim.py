@@ -18,6 +18,7 @@ from fcntl import ioctl
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun.simulation.bus.ledger import read_ledger
 
@@ -164,7 +165,7 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
     assert sim.stop(signal.SIGTERM) == (0, "", "")
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+PAGE = page_text("simulation.md")
 
 
 def test_the_programs_of_the_page_run_against_the_servos_of_the_page(start, tmp_path):

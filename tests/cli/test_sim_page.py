@@ -1,4 +1,4 @@
-"""docs/simulation.md says what is so."""
+"""simulation.md says what is so."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun.cli.sim import sim
 from dxlrun.plan.simulation_plan import SimulationConfig
@@ -15,7 +16,7 @@ from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "simulation.md").read_text()
+PAGE = page_text("simulation.md")
 COMMANDS = re.findall(r"^    (dxlrun sim .+)$", PAGE, re.MULTILINE)
 
 

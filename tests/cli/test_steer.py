@@ -1,4 +1,4 @@
-"""The verbs for a robot that runs, as a person types them, on one running torso; and docs/steering.md."""
+"""The verbs for a robot that runs, as a person types them, on one running torso; and steering.md."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
 from dxlrun.cli.verbs import PLACES_WHILE_IT_RUNS
 from dxlrun.remote.sockets import SocketLink
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "steering.md").read_text()
+PAGE = page_text("steering.md")
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 DEADLINE_S = 60.0

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
+from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in, robot_text
 
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
@@ -47,7 +47,7 @@ def test_a_right_graph_has_no_problem_and_its_order():
 
 
 def test_the_chain_of_the_page_is_right():
-    page = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
+    page = page_text("robot-file.md")
     (chain,) = [text for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "into:" in text]
     assert problems_in(ROBOT.replace("controllers:\n", "") + chain) == ()
 

@@ -1,11 +1,11 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 
 import re
-from pathlib import Path
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.compile.joints.registers import declarable, register_value, steered_value
@@ -79,7 +79,7 @@ def test_any_value_is_taken_or_refused_with_a_sentence(value):
         assert "; " in found if isinstance(found, str) else found.value in range(-(1 << 31), 1 << 32)
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "registers.md").read_text()
+PAGE = page_text("registers.md")
 
 
 def test_the_page_names_what_cannot_be_declared():

@@ -1,11 +1,11 @@
 """The page on real time says what the program does."""
 
 import re
-from pathlib import Path
 from types import ModuleType
 from typing import get_args
 
 import pluggy
+from tests.kit.pages import page_text
 
 from dxlrun.contract.hookspecs import GROUP, HookSpecs
 from dxlrun.control import realtime
@@ -13,7 +13,7 @@ from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
 from dxlrun.plan.loop_plan import OverrunPolicy
 
-PAGE = (Path(__file__).parents[2] / "docs" / "real-time.md").read_text()
+PAGE = page_text("real-time.md")
 FLAT = " ".join(PAGE.split())
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 from tests.kit import desk
 from tests.kit.desk import TORSO
+from tests.kit.pages import page_text
 
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
@@ -37,7 +37,7 @@ from dxlrun.description.robot import (
     TorqueStep,
 )
 
-PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
+PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 ROWS = {
     row[0]: row

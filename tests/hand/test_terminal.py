@@ -1,4 +1,4 @@
-"""The dialogues at a terminal: the commands of docs/by_hand.md, Ctrl-C, and what is no terminal."""
+"""The dialogues at a terminal: the commands of docs/how-to/by-hand.md, Ctrl-C, and what is no terminal."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 from tests.kit.hands import LiveRobot, Screen, written
+from tests.kit.pages import page_text
 
 from dxlrun.description.motion import read_motion
 
-PAGE = (Path(__file__).parents[2] / "docs" / "by_hand.md").read_text()
+PAGE = page_text("by-hand.md")
 COMMANDS = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
 ROBOT = """\
 name: arm

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from tests.kit.pages import page_text
 
 from dxlrun.errors import Refused
 from dxlrun.testing import plan_of
@@ -82,7 +83,7 @@ class Stage:
 
 def commands_of(page: str, verb: str, section: str = "") -> list[list[str]]:
     """Return the words of the commands of a page in docs, or of a section of it."""
-    text = (ROOT / "docs" / page).read_text()
+    text = page_text(page)
     if section:
         text = text.partition(section)[2].partition("\n## ")[0]
     found = re.findall(rf"^    dxlrun ({verb} .*)$", text, re.MULTILINE)

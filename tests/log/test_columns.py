@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as RosWriter
+from tests.kit.pages import page_text
 
 import dxlrun
 from dxlrun import LogError, open_log
@@ -312,7 +313,7 @@ def test_messages_in_another_encoding_are_refused_with_a_sentence(
 
 
 def test_the_example_of_the_page_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "analyze.md").read_text()
+    page = page_text("analyze.md")
     example = page.split("```python\n")[1].split("```")[0]
     assert "open_log" in example
     exec(example.replace('"LOG"', repr(str(path))), {})  # noqa: S102  the page is ours

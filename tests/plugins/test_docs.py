@@ -1,4 +1,4 @@
-"""docs/controllers.md, typed as it stands: its commands, its excerpts, and what it says of errors."""
+"""controllers.md, typed as it stands: its commands, its excerpts, and what it says of errors."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from textwrap import dedent
 from typing import Any
 
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun import CONTRACT_VERSION
 from dxlrun.cli import main
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/controllers.md").read_text()
+PAGE = page_text("controllers.md")
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [
     line.strip() for line in PAGE.splitlines() if line.startswith("    ") and not line.startswith("     ")

@@ -1,4 +1,4 @@
-"""docs/standard-controllers.md: its keys are all there are, its snippets are accepted, its script runs."""
+"""standard-controllers.md: its keys are all there are, its snippets are accepted, its script runs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from tests.kit.pages import page_text
 
 import dxlrun
 from dxlrun.control.controllers.plugins import load_plugins
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/standard-controllers.md").read_text()
+PAGE = page_text("standard-controllers.md")
 SECTIONS = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 OFFERS = load_plugins().controllers
 TYPES = {name: section for name, section in SECTIONS.items() if name in OFFERS}
@@ -85,5 +86,5 @@ def test_the_mirroring_script_sends_fresh_positions_only(monkeypatch: pytest.Mon
 
 
 def test_every_robot_is_in_the_table_of_examples() -> None:
-    named = set(re.findall(r"\(\.\./robots/(\w+)\.yaml\)", PAGE))
+    named = set(re.findall(r"\(\.\./\.\./robots/(\w+)\.yaml\)", PAGE))
     assert named == {path.stem for path in (ROOT / "robots").glob("*.yaml")}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from pydantic import create_model
+from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.commands import MOST_PER_CYCLE
@@ -589,7 +590,7 @@ def test_events_of_both_processes_are_returned_whole_and_once(desk):
 
 
 def test_the_page_has_every_code_of_a_refusal():
-    page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
+    page = page_text("steering.md")
     assert [code for code in Code if f"`{code}`" not in page] == []
 
 
@@ -603,7 +604,7 @@ def test_every_refusal_has_a_sentence_of_its_fields(code):
 
 
 def test_the_page_gives_the_limits_that_are_kept():
-    page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
+    page = page_text("steering.md")
     rates = f"{requests.MOST_LOOKS:.0f} GETs, {requests.MOST_SET_POINTS:.0f} set-points or"
     assert f"{rates} {requests.MOST_OPERATIONS:.0f} other requests a second" in page
     assert f"{asked.CHARGED_BYTES >> 10} KiB of a body count as one more" in page

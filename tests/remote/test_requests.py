@@ -1,15 +1,15 @@
 """The table of requests: routes, client and description follow from it, and answers are what it says."""
 
 import re
-from pathlib import Path
 
 import pytest
 from jsonschema import Draft202012Validator
+from tests.kit.pages import page_text
 
 from dxlrun.remote.gateway import _HANDLERS
 from dxlrun.remote.requests.table import COMMAND, REGISTER, REQUESTS
 
-STEERING = Path(__file__).parents[2] / "docs" / "steering.md"
+STEERING = page_text("steering.md")
 
 
 @pytest.fixture
@@ -24,12 +24,12 @@ def test_each_request_is_answered_described_and_documented(description):
     assert len({(one.method, one.path) for one in REQUESTS}) == len(REQUESTS)
     described = {(method.upper(), path) for path, found in description["paths"].items() for method in found}
     assert described == {(one.method, one.path.replace(":path", "")) for one in REQUESTS}
-    page = STEERING.read_text()
+    page = STEERING
     for one in REQUESTS:
         path = re.sub(
             r"\{(\w+)(:path)?\}", lambda word: "N" if word[1] == "number" else word[1].upper(), one.path
         )
-        assert re.search(rf"`[^`]*{re.escape(path)}[`?]", page), f"docs/steering.md has no {path}"
+        assert re.search(rf"`[^`]*{re.escape(path)}[`?]", page), f"steering.md has no {path}"
 
 
 def test_the_description_is_whole(description):

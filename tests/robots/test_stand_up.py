@@ -1,4 +1,4 @@
-"""docs/examples/stand_up.py: robots/stand_up.yaml, pushed as in docs/recipes.md, gets up and walks again."""
+"""docs/examples/stand_up.py: robots/stand_up.yaml, pushed as in recipes.md, gets up and walks again."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.pages import page_text
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.events import EventCode
@@ -23,7 +24,7 @@ from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
 
 ROOT = Path(__file__).parents[2]
 PLAN = plan_of(ROOT / "robots" / "stand_up.yaml")
-PUSHES = re.findall(r"^    dxlrun send (.+)$", (ROOT / "docs" / "recipes.md").read_text(), re.MULTILINE)
+PUSHES = re.findall(r"^    dxlrun send (.+)$", page_text("recipes.md"), re.MULTILINE)
 TORQUE_ENABLE = 64
 """e-Manual, X series"""
 StandUp = runpy.run_path(str(ROOT / "docs" / "examples" / "stand_up.py"))["StandUp"]

@@ -1,4 +1,4 @@
-"""docs/sensors.md, typed as it stands."""
+"""sensors.md, typed as it stands."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from tests.kit.pages import page_text
 
 from dxlrun import SensorContext
 from dxlrun.cli import main
@@ -20,7 +21,7 @@ from dxlrun_controllers.sensors.serial_imu import SerialImuParameters
 from dxlrun_controllers.sensors.simulated_imu import Accelerometer, Gyroscope, ImuParameters, Magnetometer
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/sensors.md").read_text()
+PAGE = page_text("sensors.md")
 COMMANDS = [line.strip() for line in PAGE.splitlines() if line.startswith("    dxlrun ")]
 
 

@@ -1,4 +1,4 @@
-"""The commands of docs/teleoperation.md, and its robot with an arm at each of two ports."""
+"""The commands of docs/how-to/teleoperation.md, and its robot with an arm at each of two ports."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 from tests.kit.driven import changes
+from tests.kit.pages import page_text
 
 from dxlrun.testing import simulated_robot
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "teleoperation.md").read_text()
+PAGE = page_text("teleoperation.md")
 COMMANDS = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
 TWO_PORTS = ROOT / "robots" / "leader_follower_two_ports.yaml"
 GOAL_POSITION = 116

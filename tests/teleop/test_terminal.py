@@ -1,6 +1,6 @@
 """`dxlrun teleop` at a terminal: keys move a base; by Ctrl-C and a kill it holds.
 
-The base and `dxlrun teleop` are the first two commands of docs/teleoperation.md.
+The base and `dxlrun teleop` are the first two commands of docs/how-to/teleoperation.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`dxlrun view`: what it prints, what it refuses, how it ends; runs the commands of docs/view.md."""
+"""`dxlrun view`: what it prints, what it refuses, how it ends; runs the commands of docs/how-to/view.md."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.pages import page_text
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = re.findall(r"^    dxlrun (view.*)$", (ROOT / "docs/view.md").read_text(), re.MULTILINE)
+COMMANDS = re.findall(r"^    dxlrun (view.*)$", page_text("view.md"), re.MULTILINE)
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 View = Callable[..., subprocess.Popen[str]]
 

@@ -20,7 +20,7 @@ CauseKind = Literal[
     "plan",
     "unexplained",
 ]
-"""Where time went that a cycle was not planned to take; docs/analyze.md has what each of them means."""
+"""Where time went that a cycle was not planned to take; analyze.md has what each means."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
         return None
     except ValueError as error:
         what = f"{device.model} of {name} is no control table of a device: {error}"
-        file.error(mark, what, "correct that file; docs/devices.md has its form")
+        file.error(mark, what, "correct that file; docs/how-to/devices.md has its form")
         return None
     if bus is not None and table.protocol != bus.protocol:
         what = f"{table.model} of {name} speaks Protocol {table.protocol}"

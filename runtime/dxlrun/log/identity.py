@@ -19,7 +19,7 @@ from pathlib import Path
 from dxlrun.contract.hookspecs import GROUP
 
 IDENTITY_NAME = "identity"
-"""The metadata record; docs/logs.md has its keys."""
+"""The metadata record; docs/how-to/logs.md has its keys."""
 ROBOT, INCLUDED, MOTION, URDF, PLUGIN, RUNTIME = "robot", "included", "motion", "urdf", "plugin", "runtime"
 """What a hash is of: the first word of its key; all but URDF and RUNTIME are followed by the file's name."""
 HOST, KERNEL, REVISION, CHANGED = "host", "kernel", "git revision", "git changed"

@@ -1,6 +1,6 @@
 """Gateway: what can be asked of a running robot, over HTTP on a Unix socket; JSON in, JSON out.
 
-`requests.py` has all of it, docs/steering.md what each means. The answer is
+`requests.py` has all of it, docs/reference/steering.md what each means. The answer is
 `{"done": true, "cycle": N}`, of a goal with its number in `"goals"`, of a set-point instead `"clamped"`, the
 number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
 "fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the

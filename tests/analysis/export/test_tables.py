@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
@@ -19,7 +20,7 @@ from dxlrun.testing import simulated_robot
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")
-PAGE = Path(__file__).parents[3] / "docs" / "logs.md"
+PAGE = page_text("logs.md")
 
 
 ROBOTS = Path(__file__).parents[3] / "robots"
@@ -177,7 +178,7 @@ def test_logs_md_its_exports_are_made(
     run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    lines = re.findall(r"^    dxlrun export (.+)$", PAGE.read_text(), re.MULTILINE)
+    lines = re.findall(r"^    dxlrun export (.+)$", PAGE, re.MULTILINE)
     assert len(lines) == 5
     for line in lines:
         log, output, *options = line.split()

@@ -1,4 +1,4 @@
-"""`dxlrun replay` as a person types it, and docs/replay.md as it stands."""
+"""`dxlrun replay` as a person types it, and docs/how-to/replay.md as it stands."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from tests.kit.anew import no_commands, put, versions
+from tests.kit.pages import page_text
 
 from dxlrun.cli import main
 
 ROOT = Path(__file__).parents[3]
-TEXT = (ROOT / "docs/replay.md").read_text()
+TEXT = page_text("replay.md")
 COMMANDS = [line.strip() for line in TEXT.splitlines() if line.startswith("    dxlrun ")]
 OUTPUTS = re.findall(r"```\n(.*?)```", TEXT, re.DOTALL)
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.commands import Dxlrun, Said
+from tests.kit.pages import page_text
 
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
@@ -206,7 +207,7 @@ def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here
 
 
 def test_logs_md_its_questions_are_answered(known: Path, dxlrun: Dxlrun) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "logs.md").read_text()
+    page = page_text("logs.md")
     lines = re.findall(r"^    dxlrun logs (.+)$", page, re.MULTILINE)
     assert len(lines) == 4
     for line in lines:

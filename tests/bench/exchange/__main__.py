@@ -1,4 +1,4 @@
-"""What one exchange with the servos costs, ours beside dynamixel-sdk's and rustypot's; see docs/bench.md.
+"""What one exchange with the servos costs, ours beside dynamixel-sdk's and rustypot's; see bench.md.
 
 python tests/bench/exchange [--servos 1,8,20] [--protocol 1.0,2.0] [--against canned,simulated] [--json]
 """

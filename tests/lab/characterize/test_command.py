@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.kit.experiments import ROOT, commands_of
+from tests.kit.experiments import commands_of
+from tests.kit.pages import page_text
 
 from dxlrun_lab.characterize import procedure
 
@@ -59,6 +60,6 @@ def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
 
 
 def test_every_figure_of_a_result_is_on_the_page():
-    text = (ROOT / "docs/experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]
+    text = page_text("experiments.md").partition("## characterize")[2].partition("\n## ")[0]
     for name in FIGURES:
         assert name in text, name

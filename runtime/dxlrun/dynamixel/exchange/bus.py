@@ -32,7 +32,7 @@ from dxlrun.plan.transaction import (
 
 NEVER = 1 << 62
 QUIET_BYTES = 20
-"""A line that was silent for so many byte times is silent (docs/protocol.md: drain until it is)."""
+"""A line that was silent for so many byte times is silent (docs/reference/protocol.md: drain until it is)."""
 LEAST_QUIET_NS = 200_000
 DRAIN_LIMIT_NS = 5_000_000  # A line that babbles longer than this is not waited for
 LOST_LINE_STEP_NS = 200_000  # How often the other lines are looked at while one is lost
