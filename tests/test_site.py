@@ -1,0 +1,138 @@
+"""The documentation site: it builds without a warning, no link is dead, no page scrolls sideways."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import re
+import threading
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from tests.kit.browser import CHROMIUM, Browser
+
+import dxlrun
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("site_of_dxlrun", ROOT / "docs/site.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def sources(site: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages as zensical gets them."""
+    source = tmp_path_factory.mktemp("sources") / "docs"
+    site.gather(source)
+    return source
+
+
+def test_each_link_of_the_site_has_a_file(sources: Path) -> None:
+    links = [
+        (path, link)
+        for path in sources.rglob("*.md")
+        if "." not in path.stem  # not a file of another kind, shown on a page
+        for link in re.findall(r"\]\(([^)\s#]+)[^)\s]*\)", path.read_text())
+        if not link.startswith("http")
+    ]
+    assert len(links) > 100
+    assert [(path.name, link) for path, link in links if not (path.parent / link).exists()] == []
+    assert [
+        path
+        for path in sources.rglob("*.md")
+        if re.search("^<!-- (keys|commands|api)", path.read_text(), re.M)
+    ] == []
+
+
+def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
+    names = (sources / "reference/api.md").read_text()
+    units = {one for one in dxlrun.__all__ if str(getattr(dxlrun, one)).startswith("typing.Annotated")}
+    values = {"CONTRACT_VERSION", "Commands", "Floats", "States"}
+    assert (
+        set(re.findall(r"^### `(\w+)`", names, re.MULTILINE))
+        == {*dxlrun.__all__, "simulated_robot"} - units - values
+    )
+    assert "#### `send`" in names
+
+
+class Names(HTMLParser):
+    """Where a built page leads, and the places in it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.places: set[str] = {""}
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.places.add(value or "")
+            if name in {"href", "src"} and value and not re.match("[a-z]+:", value):
+                self.links.append(value)
+
+
+@pytest.fixture(scope="module")
+def built(site: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("zensical", reason="pip install 'zensical>=0.0.73'")
+    into = tmp_path_factory.mktemp("site") / "site"
+    assert site.build(into) == 0  # strict: a warning is an error
+    return into
+
+
+def test_no_link_of_the_built_site_is_dead(built: Path) -> None:
+    found = {path: Names(path) for path in built.rglob("*.html") if path.name != "404.html"}
+    assert len(found) > 30
+    for path, page in found.items():
+        for link in page.links:
+            target, _, place = link.partition("#")
+            leads = (path.parent / target).resolve() if target else path
+            assert leads.exists(), (path, link)
+            if leads in found:
+                assert place in found[leads].places, (path, link)
+
+
+@pytest.fixture
+def address(built: Path) -> Iterator[str]:
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None: ...
+
+    handler = functools.partial(Quiet, directory=str(built))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_no_page_scrolls_sideways(built: Path, address: str, tmp_path: Path) -> None:
+    browser = Browser(tmp_path)
+    pages = [
+        str(path.relative_to(built)) for path in sorted(built.rglob("*.html")) if path.name != "404.html"
+    ]
+    wide = {}
+    for width in (1280, 390):
+        for page in pages:
+            browser.open(f"{address}/{page}", width)
+            browser.until(f"document.readyState === 'complete' && location.pathname === '/{page}'")
+            wide[page, width] = browser.value("document.documentElement.scrollWidth") - width
+    answers = [
+        one["params"]["response"] for one in browser.events if one.get("method") == "Network.responseReceived"
+    ]
+    browser.close()
+    assert {page: over for page, over in wide.items() if over > 0} == {}
+    assert len(answers) >= len(pages)
+    assert [
+        one["url"] for one in answers if one["status"] >= 400 or not one["url"].startswith((address, "data:"))
+    ] == []
