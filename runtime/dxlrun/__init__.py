@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         RobotModel,
     )
     from dxlrun.contract.hookspecs import CONTRACT_VERSION, Command, hookimpl
+    from dxlrun.contract.joint_controller import JointController, reading
     from dxlrun.contract.sensor import Sensor, SensorContext
     from dxlrun.description.form import ParametersModel
     from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
@@ -35,11 +36,13 @@ if TYPE_CHECKING:
         AngularJerk,
         AngularVelocity,
         Duration,
+        Frequency,
         Length,
         LinearAcceleration,
         LinearJerk,
         LinearVelocity,
         Mass,
+        Time,
         Voltage,
     )
     from dxlrun.errors import (
@@ -83,11 +86,13 @@ __all__ = [
     "Duration",
     "DxlrunError",
     "Floats",
+    "Frequency",
     "Goal",
     "GoalState",
     "GoalTimeout",
     "InputError",
     "Interfaces",
+    "JointController",
     "JointLimits",
     "Length",
     "LinearAcceleration",
@@ -117,6 +122,7 @@ __all__ = [
     "States",
     "Stream",
     "Stribeck",
+    "Time",
     "Topic",
     "TopicMessage",
     "TopicState",
@@ -124,6 +130,7 @@ __all__ = [
     "connect",
     "hookimpl",
     "open_log",
+    "reading",
     "running",
 ]
 
@@ -141,6 +148,7 @@ _ROOMS = {
         "RobotModel",
     ),
     "dxlrun.contract.hookspecs": ("CONTRACT_VERSION", "Command", "hookimpl"),
+    "dxlrun.contract.joint_controller": ("JointController", "reading"),
     "dxlrun.contract.sensor": ("Sensor", "SensorContext"),
     "dxlrun.description.form": ("ParametersModel",),
     "dxlrun.description.joints.motor": ("MotorLoad", "MotorModel", "Stribeck"),
@@ -151,11 +159,13 @@ _ROOMS = {
         "AngularJerk",
         "AngularVelocity",
         "Duration",
+        "Frequency",
         "Length",
         "LinearAcceleration",
         "LinearJerk",
         "LinearVelocity",
         "Mass",
+        "Time",
         "Voltage",
     ),
     "dxlrun.errors": (

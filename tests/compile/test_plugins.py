@@ -54,7 +54,7 @@ def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
     offers["publishing"] = Offer("publishing", Publishing, "elsewhere 2.1")
     offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
     plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
-    monkeypatch.setattr(robot, "load_plugins", lambda: plugins)
+    monkeypatch.setattr(robot, "load_plugins", lambda **_: plugins)
 
 
 FOREIGN = PAIR.partition("controllers:")[0] + "controllers:\n  mine: {type: foreign}\n"

@@ -75,7 +75,7 @@ def dozen(tmp_path, monkeypatch):
     """Build the robot on virtual time, with a log."""
     offers = {**load_plugins().controllers, "blinker": Offer("blinker", Blinker, "elsewhere 2.1")}
     for room in (robot, virtual_run, replay):
-        monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}))
+        monkeypatch.setattr(room, "load_plugins", lambda *_, **__: PlugIns(offers, {}))
 
     def build(duration_s):
         lines = [

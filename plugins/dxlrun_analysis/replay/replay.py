@@ -95,7 +95,8 @@ def replay_log(
     """
     reader = open_log(log)
     read = overview(reader)
-    inputs, plugins = recorded(read), load_plugins()
+    inputs = recorded(read)
+    plugins = load_plugins(files=inputs.plan.included)
     plan = with_settings(with_arguments(inputs.plan, inputs.loop, arguments or {}), settings, plugins)
     _offered(reader.path, plan, plugins)
     prepared = PreparedComparison(inputs)

@@ -80,7 +80,9 @@ class RobotOnVirtualTime:
         for descriptor in astuple(memory):
             os.close(descriptor)
         joints = {joint.name: joint for joint in loop.joints}
-        preparation = Preparation(joints, load_plugins(), loop.sources, plan.urdf, plan.groups)
+        preparation = Preparation(
+            joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups
+        )
         log_path = str(log) if log else None
         seconds = itertools.count()  # one a request: an experiment may make as many as it likes
         self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Set
 from contextlib import suppress
 
+from dxlrun.compile.controllers import read_controller_files
 from dxlrun.compile.joints.described_servos import described_servos
+from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.document import KeyPath
 from dxlrun.description.problems import keys_at, path_text
@@ -99,7 +101,8 @@ def _takes(description: Description, container: KeyPath, key: str | int, *, last
         return last
     if container[:1] == ("controllers",) and len(container) >= 2:
         entry = description.robot.controllers.get(str(container[1]))
-        offer = load_plugins().controllers.get(entry.type) if entry is not None else None
+        files = read_controller_files(RobotFile(description))
+        offer = load_plugins(files=files).controllers.get(entry.type) if entry is not None else None
         known = () if offer is None else keys_at(offer.controller.Parameters, container[2:])[0]
         return key in known or (len(container) == 2 and key in _OWN_KEYS)
     return key not in Robot.read_before and key in keys_at(Robot, container)[0]

@@ -168,7 +168,7 @@ def without_names(plan: Plan) -> Plan:
         loop=loop,
         source_file="",
         source_text="",
-        included={},
+        included={name: text for name, text in plan.included.items() if name.endswith(".py")},  # is executed
         played={},
         arguments={},
         recording=RecordingPlan(),

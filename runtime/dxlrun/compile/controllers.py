@@ -18,6 +18,7 @@ from dxlrun.contract.controller import Interfaces
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
+from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
@@ -51,6 +52,28 @@ class CompiledController(msgspec.Struct, frozen=True):
     motors: tuple[str, ...] = ()  # Figures of its joints' motors that it needs
     asked_by: Mapping[CommandName, KeyPath] = {}
     """The key of its parameters for which it claims a command interface, see `Interfaces`."""
+
+
+def read_controller_files(file: RobotFile) -> dict[str, str]:
+    """Return the texts of the files beside the robot file whose classes are controllers, by name."""
+    folder = file.description.path.parent
+    texts: dict[str, str] = {}
+    for controller, entry in file.robot.controllers.items():
+        if not is_of_file(entry.type):
+            continue
+        mark, name = file.at("controllers", controller, "type"), file_of(entry.type)
+        path = folder / (name or "")
+        if name is None or path.resolve().parent != folder.resolve():
+            what = f"{entry.type} of {controller} is no class of a file beside the robot file"
+            file.error(mark, what, "write ./wave.py:Wave for the class Wave of wave.py in the same folder")
+            continue
+        try:
+            texts[name] = path.read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
+            what = f"{name} of controller {controller} cannot be read ({why})"
+            file.error(mark, what, f"its place is {path}")
+    return texts
 
 
 def compile_controllers(
@@ -199,13 +222,13 @@ def _every(file: RobotFile, name: str, rate: float | None) -> int:
 
 def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offer | None:
     offer = plugins.controllers.get(type_name)
-    if offer is None:
+    mark = file.at("controllers", name, "type")
+    if offer is None and is_of_file(type_name):
+        if type_name in plugins.broken:  # else its file could not be read
+            file.error(mark, f"{type_name} of {name} cannot be used", plugins.broken[type_name])
+    elif offer is None:
         what = f"no plug-in offers the controller type {type_name} of {name}"
-        file.error(
-            file.at("controllers", name, "type"),
-            what,
-            where_to_get(type_name, tuple(plugins.controllers), plugins.broken),
-        )
+        file.error(mark, what, where_to_get(type_name, tuple(plugins.controllers), plugins.broken))
     return offer
 
 

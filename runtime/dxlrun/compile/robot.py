@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
-from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes
+from dxlrun.compile.controllers import (
+    check_robot,
+    compile_controllers,
+    compile_modes,
+    read_controller_files,
+)
 from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
     CompiledJoint,
@@ -159,7 +164,8 @@ def compile_robot(
     Raises InputError with every problem of the robot file and the motions.
     """
     file = RobotFile(description)
-    plugins = load_plugins()  # first, as they may bring the servo models of joints along
+    code = read_controller_files(file)
+    plugins = load_plugins(files=code)  # first, as they may bring the servo models of joints along
     motors = read_motors(file)
     joints = compile_joints(file, models or {}, motors)
     _check_scheduler(file)
@@ -227,7 +233,7 @@ def compile_robot(
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),
-        included={os.path.relpath(name, folder): text for name, text in texts.items()},
+        included={os.path.relpath(name, folder): text for name, text in texts.items()} | code,
         played={os.path.relpath(motion.path, folder): motion.text for motion in motions},
         frames=frames,
         simulation=simulation,

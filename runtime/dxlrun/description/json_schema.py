@@ -32,6 +32,11 @@ _ARGUMENT: Schema = {
     "pattern": r"\$\{\s*[A-Za-z_][A-Za-z0-9_]*\s*\}",
     "description": "The value of an argument.",
 }
+_OF_FILE: Schema = {
+    "type": "string",
+    "pattern": r"^\./[A-Za-z_][A-Za-z0-9_]*\.py:[A-Za-z_][A-Za-z0-9_]*$",
+    "description": "A class of a file of Python beside the robot file: ./wave.py:Wave.",
+}
 _GROUPED: Schema = {
     "type": "string",
     "pattern": r"^[-+]?[0-9]+(_[0-9]+)+$",
@@ -157,7 +162,7 @@ def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
     """
     written = {
         "description": entry["properties"]["type"]["description"],
-        "anyOf": [{"enum": kinds}, {"$ref": "#/$defs/argument"}],
+        "anyOf": [{"enum": kinds}, {"$ref": "#/$defs/argument"}] + [_OF_FILE] * (not room),
     }
     branches = [
         {

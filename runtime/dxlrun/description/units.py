@@ -202,6 +202,7 @@ temperature = Quantity("a temperature", "degC", {"degC": 1.0}, "70 degC")
 fraction = Quantity("a share of the maximum", "1", {"%": 1e-2}, "40 %")
 register_time = Quantity("a time", "s", _TIME, "500 us or 1 ms")
 rate = Quantity("a rate", "Hz", {"Hz": 1.0, "kHz": 1e3}, "50, 50 Hz or 1 kHz", bare=True)
+frequency = Quantity("a frequency", "Hz", {"Hz": 1.0, "kHz": 1e3}, "0.5 Hz or 2 kHz")
 seconds = Quantity(
     "a time",
     "s",
@@ -308,6 +309,8 @@ ViscousFriction = Annotated[float, viscous_friction]
 Stiffness = Annotated[float, stiffness]
 Share = Annotated[float, share]
 Rate = Annotated[float, rate]
+Frequency = Annotated[float, frequency]
+Time = Annotated[float, register_time]
 Effort = Annotated[Measure, effort]
 Position = Annotated[Measure, position]
 Speed = Annotated[Measure, speed]

@@ -40,7 +40,8 @@ class Plan(msgspec.Struct, frozen=True):
     source_text: str  # The robot file as it was read
     arguments: dict[str, str]  # The arguments of the robot file as this run took them
     included: dict[str, str] = {}
-    """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
+    """Text of each file that the robot file includes, or names as a motor or a controller, by its name seen
+    from there."""
     played: dict[str, str] = {}
     """Text of each motion file that is played, by its name seen from the robot file."""
     frames: FramesPlan | None = None

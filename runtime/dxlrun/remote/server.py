@@ -60,7 +60,8 @@ def main() -> None:
     try:
         link = Link(plan, job.memory, job.epoch_offset_ns)
         joints = {joint.name: joint for joint in plan.loop.joints}
-        preparation = Preparation(joints, load_plugins(), plan.loop.sources, plan.urdf, plan.groups)
+        plugins = load_plugins(files=plan.included)
+        preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:

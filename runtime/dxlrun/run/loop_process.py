@@ -149,7 +149,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     )
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
-    plugins = load_plugins(_looked_at(heartbeat))
+    plugins = load_plugins(_looked_at(heartbeat), plan.included)
     plugins.import_all()
     robot = assemble(
         plan,

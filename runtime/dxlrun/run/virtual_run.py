@@ -74,7 +74,7 @@ class VirtualRobot:
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         if simulated.sensed is not None:
             fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
-        plugins = load_plugins()
+        plugins = load_plugins(files=plan.included)
         slots = self._start_sensors(plugins, mechanics)
         self.stop = StopFlag()
         self.inbox = QueueInbox()

@@ -12,7 +12,8 @@ from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast
+from types import MappingProxyType
+from typing import Any, Never, TypeAlias, TypeVar, cast
 
 import msgspec
 import pluggy
@@ -21,7 +22,9 @@ from pydantic import ValidationError
 
 from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Mismatch, RobotModel
 from dxlrun.contract.hookspecs import CONTRACT_VERSION, GROUP, HookSpecs
+from dxlrun.contract.joint_controller import LAWS, JointController, laws_of
 from dxlrun.contract.sensor import Sensor
+from dxlrun.control.controllers.single_files import class_in_file, file_of, publisher_of
 from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
@@ -59,6 +62,7 @@ _DECLARED = {
 }
 """What a controller's class declares, with its type and an example."""
 _HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
+_NO_FILES: Mapping[str, str] = MappingProxyType({})
 Decide: TypeAlias = Callable[[int, int, int], object]
 """What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
 
@@ -89,24 +93,35 @@ Make: TypeAlias = Callable[[], Offered]
 """Imports and checks a class; raises PlugInError."""
 
 
+def _nothing_else(name: str) -> Never:
+    raise KeyError(name)
+
+
 class Offers(Mapping[str, Offered]):
     """What plug-ins offer, by type; a class that is named by its place is imported when it is asked for.
 
     Where that fails the type is missing from then on, and `broken` says why.
     """
 
-    def __init__(self, makes: Mapping[str, Make[Offered]], broken: dict[str, str]) -> None:
+    def __init__(
+        self,
+        makes: Mapping[str, Make[Offered]],
+        broken: dict[str, str],
+        unlisted: Callable[[str], Offered] = _nothing_else,
+    ) -> None:
+        """`unlisted` makes what is not among `makes`, such as types of single files, or raises KeyError."""
         self._makes: dict[str, Make[Offered]] = dict(makes)
+        self._unlisted: Callable[[str], Offered] = unlisted
         self._made: dict[str, Offered] = {}
         self._broken = broken
 
     def __getitem__(self, name: str) -> Offered:
         if name not in self._made:
-            make = self._makes[name]
+            make = self._makes.get(name) or partial(self._unlisted, name)
             try:
                 self._made[name] = make()
             except PlugInError as error:
-                del self._makes[name]
+                self._makes.pop(name, None)
                 self._broken[name] = str(error)
                 raise KeyError(name) from error
         return self._made[name]
@@ -212,9 +227,12 @@ class PlugIns(msgspec.Struct, frozen=True):
         return PlugInError(f"no plug-in offers the type {plan.type} of {what} {plan.name}{why}")
 
 
-def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
+def load_plugins(
+    after_each: Callable[[str], None] = _any_threads, files: Mapping[str, str] = _NO_FILES
+) -> PlugIns:
     """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
 
+    `files` are the texts of single files by name, whose classes are offered as `./wave.py:Wave` too.
     `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
     raises passes through: the loop's process counts its threads there, and again when a controller was
     configured. Itself raises nothing.
@@ -231,7 +249,18 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
         after_each(f"{name} ({publisher})")
     controllers = _together("controller", [(one.distribution, one.controllers) for one in loaded], broken)
     sensors = _together("sensor", [(one.distribution, one.sensors) for one in loaded], broken)
-    return PlugIns(Offers(controllers, broken), broken, tuple(loaded), after_each, Offers(sensors, broken))
+    offers = Offers(controllers, broken, partial(_offer_of_file, files))
+    return PlugIns(offers, broken, tuple(loaded), after_each, Offers(sensors, broken))
+
+
+def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
+    """Return what a single file offers. Raises KeyError for another type, and PlugInError."""
+    controller, file = class_in_file(name, files), file_of(name) or ""
+
+    def refuse(what: str, fix: str) -> PlugInError:
+        return PlugInError(f"{file} {what}; {fix}")
+
+    return _offer(publisher_of(file, files[file]), refuse, name, controller)
 
 
 def _together(
@@ -407,7 +436,7 @@ def controller_breach(controller: object) -> Breach | None:
     """Check a class that is offered as a controller."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is no controller", "derive a class from dxlrun.Controller"
-    if breach := methods_breach(controller, Controller, _METHODS):
+    if breach := methods_breach(controller, Controller, _METHODS) or _laws_breach(controller):
         return breach
     if not is_model(controller.Parameters, ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
@@ -417,6 +446,14 @@ def controller_breach(controller: object) -> Breach | None:
         except msgspec.ValidationError as error:
             return f"whose {name} is of a wrong type: {error}", fix
     return _commands_breach(controller) or _topics_breach(controller.Topics)
+
+
+def _laws_breach(controller: ControllerClass) -> Breach | None:
+    if not issubclass(controller, JointController):
+        return None
+    if not laws_of(controller):
+        return f"which has no method {', '.join(LAWS)}", "write `def positions(self, time, dt):`"
+    return methods_breach(controller, JointController, ("begin", *LAWS))
 
 
 def _commands_breach(controller: ControllerClass) -> Breach | None:

@@ -1,0 +1,227 @@
+"""JointController: the shortest way to write a law of motion: annotated fields, and one method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import Field, create_model
+from pydantic.errors import PydanticUserError
+
+from dxlrun.channels.cycle import Floats
+from dxlrun.contract.controller import LIVE, Context, Controller, Interfaces
+from dxlrun.description.form import ParametersModel
+from dxlrun.description.modes import CommandName
+from dxlrun.errors import ControllerFault, counted
+
+LAWS: dict[str, CommandName] = {"positions": "position", "velocities": "velocity", "efforts": "effort"}
+"""Methods of a JointController, and the command interface that each of them claims."""
+_MOST_SHOWN = 60
+_TAKEN = ("start", "context", "parameters", "type", "active", "rate", "fallback", "into")
+"""Names beside the class's own that no field can have: of each controller, and of each entry of one."""
+
+
+class _Reading(str):
+    """Default of a field that is read: the name of its interface."""
+
+    __slots__ = ()
+
+
+def reading(interface: str = "") -> float:
+    """Return a field of a JointController that has the value of an interface: `reading("imu/orientation.y")`.
+
+    A state of a sensor, a device, another controller or another joint, as `Interfaces.reads` names them; the
+    controller begins when it is first known. The robot file may name another one; it must where this names
+    none.
+    """
+    return cast("float", _Reading(interface))  # what the field has; the class makes a property of it
+
+
+class JointParameters(ParametersModel):
+    """Keys that each JointController has."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    """The joints that it moves, in the order of its arrays."""
+
+
+class JointController(Controller[JointParameters]):
+    """A controller of some joints, written as a formula. A whole one:
+
+        class Wave(JointController):
+            amplitude: Angle = 0.3
+            frequency: Frequency = 0.5
+
+            def positions(self, time, dt):  # s since it began, s since the last call
+                return self.start + self.amplitude * np.sin(2 * np.pi * self.frequency * time)
+
+    Annotated fields are the keys of its entry in the robot file beside `joints`; numbers and bools of them
+    can be changed in a run. `positions` (rad, or m of a linear joint), `velocities` (rad/s; beside
+    `positions` the magnitude of the speed toward these) and `efforts` (unit of the state's effort) return one
+    number a joint: which of them it has decides what it claims. All else is of Controller.
+    """
+
+    Parameters: ClassVar[type[ParametersModel]] = JointParameters
+    start: Floats
+    """Where its joints were when it began: what was last sent to them, else what was read."""
+    _readings: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls) -> None:
+        """Make parameters of the annotated fields. Raises TypeError for one that cannot be a parameter."""
+        super().__init_subclass__()
+        fields: dict[str, Any] = dict(_fields(cls))
+        read = [name for name in fields if isinstance(vars(cls).get(name), _Reading)]
+        cls._readings = (*cls._readings, *read)
+        base = cls.Parameters
+        cls.Parameters = create_model(f"{cls.__name__}Parameters", __base__=base, **fields)
+        for name in fields:
+            setattr(cls, name, _shown(name, cls._readings.index(name) if name in read else None))
+
+    @classmethod
+    def interfaces(cls, parameters: JointParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim on its joints what it has methods for."""
+        command = tuple(LAWS[name] for name in laws_of(cls))
+        return Interfaces(
+            parameters.joints, command, reads=tuple(getattr(parameters, name) for name in cls._readings)
+        )
+
+    def begin(self) -> None:
+        """Make what is kept from cycle to cycle: called before the first cycle of each activation."""
+
+    def positions(self, time: float, dt: float) -> Floats:
+        """Return a position for each joint, `time` s after it began and `dt` s after the last call."""
+        raise NotImplementedError
+
+    def velocities(self, time: float, dt: float) -> Floats:
+        """Return a velocity for each joint."""
+        raise NotImplementedError
+
+    def efforts(self, time: float, dt: float) -> Floats:
+        """Return an effort for each joint."""
+        raise NotImplementedError
+
+    @property
+    def position(self) -> Floats:
+        """Measured positions of its joints, rad or m, to be read only; NaN before the first."""
+        return self.context.states.position
+
+    @property
+    def velocity(self) -> Floats:
+        """Measured velocities, as `position`."""
+        return self.context.states.velocity
+
+    @property
+    def effort(self) -> Floats:
+        """Measured efforts, as `position`."""
+        return self.context.states.effort
+
+    def on_configure(self, context: Context) -> None:
+        """Find what each method commands."""
+        super().on_configure(context)
+        laws, commands = type(self), context.commands
+        self._laws = tuple(
+            (name, getattr(laws, name), getattr(commands, LAWS[name])) for name in laws_of(laws)
+        )
+
+    def on_activate(self, time_ns: int) -> None:
+        """Begin anew."""
+        self.start = np.full(len(self.context.joints), np.nan)
+        self._began_ns = -1
+        self._settling = True
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command what its methods return. Raises ControllerFault where that is not one number a joint."""
+        if self._settling:
+            self._take_start()
+            if self._began_ns < 0:
+                if np.isnan(self.context.reads).any():
+                    return  # nothing is commanded yet: the joints hold
+                self._began_ns = time_ns
+                self.begin()
+        time, dt = (time_ns - self._began_ns) * 1e-9, period_ns * 1e-9
+        for name, law, command in self._laws:
+            values = _one_a_joint(law(self, time, dt), name, self.context.joints)
+            if self._settling:  # later on, NaN behind a number is found for every controller
+                self._check_known(name, values)
+            command[:] = values
+        self._settling = self._settling and bool(np.isnan(self.start).any())
+
+    def _take_start(self) -> None:
+        """Find where the joints are; those that were not known yet begin where they are heard first."""
+        for known in (self.context.goals.position, self.context.states.position):
+            np.copyto(self.start, known, where=np.isnan(self.start))
+
+    def _check_known(self, name: str, values: Floats) -> None:
+        wrong = np.isnan(values) & ~np.isnan(self.start)
+        if wrong.any():
+            joint = self.context.joints[int(np.argmax(wrong))]
+            raise ControllerFault(f"returned NaN for {joint} from {name}; return a number")
+
+
+def laws_of(controller: type[JointController]) -> tuple[str, ...]:
+    """Return which of the methods in `LAWS` a class has."""
+    return tuple(name for name in LAWS if getattr(controller, name) is not getattr(JointController, name))
+
+
+def _one_a_joint(returned: object, name: str, joints: tuple[str, ...]) -> Floats:
+    try:
+        values: Floats = np.asarray(returned, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(())
+    if values.shape == (len(joints),):
+        return values
+    what = f"an array of shape {returned.shape}" if isinstance(returned, np.ndarray) else repr(returned)
+    wanted = f"an array of {counted(len(joints), 'number', 'numbers')}, one a joint ({', '.join(joints)})"
+    raise ControllerFault(f"returned {what[:_MOST_SHOWN]} from {name}; return {wanted}")
+
+
+def _shown(name: str, place: int | None) -> property:
+    """Return the property of a field: a parameter, or the value of `Context.reads` in a place."""
+
+    def value(self: JointController) -> object:
+        return getattr(self.parameters, name) if place is None else float(self.context.reads[place])
+
+    def refuse(self: JointController, value: object) -> None:
+        raise AttributeError(f"{name} is a parameter, which only the robot file and clients change")
+
+    return property(value, refuse)
+
+
+def _fields(cls: type[JointController]) -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """Yield the fields of a class with their types and defaults. Raises TypeError, with one sentence."""
+    own = vars(cls)
+    annotated = own.get("__annotations__", {})
+    for name, value in own.items():
+        plain = isinstance(value, bool | int | float | str) and not name.startswith("_")
+        if plain and name not in annotated and not hasattr(Controller, name):
+            kind = "float" if isinstance(value, _Reading) else type(value).__name__
+            raise TypeError(f"{cls.__name__}.{name} has no type; write {name}: {kind} = ...")
+    try:
+        hints = get_type_hints(cls, include_extras=True)
+    except NameError as error:
+        raise TypeError(f"a field of {cls.__name__} has an unknown type ({error}); import it") from None
+    for name in annotated:
+        if not name.startswith("_") and get_origin(hints[name]) is not ClassVar:
+            yield name, _field(f"{cls.__name__}.{name}", name, hints[name], own.get(name, ...))
+
+
+def _field(shown: str, name: str, kind: object, default: object) -> tuple[object, object]:
+    """Return the type and the default of a parameter."""
+    if hasattr(JointController, name) or name in _TAKEN:
+        raise TypeError(f"{shown} has a name that each controller has already; rename it")
+    if isinstance(default, _Reading):
+        return Annotated[str, Field(min_length=1)], str(default) or ...
+    probe: dict[str, Any] = {name: (kind, ...)}
+    try:
+        create_model(name, **probe)
+    except PydanticUserError:
+        raise TypeError(
+            f"{shown} has the type {getattr(kind, '__name__', kind)}, which no key of a robot file can have; "
+            "write float, int, bool, str, Angle, Frequency ..."
+        ) from None
+    plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if plain not in (float, int, bool):
+        return kind, default
+    if default is not ... and not isinstance(default, int | float):
+        raise TypeError(f"{shown} has the default {default!r}; write a number, in SI units")
+    return Annotated[kind, LIVE], default

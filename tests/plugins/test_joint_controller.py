@@ -1,0 +1,320 @@
+"""JointController and single files: whole controllers in a few lines, and one sentence for a wrong one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+from tests.kit.stages import Stage
+
+from dxlrun import Floats, InputError, JointController, reading
+from dxlrun.cli import main
+from dxlrun.contract.joint_controller import _TAKEN
+from dxlrun.control.controllers.plugins import controller_breach
+from dxlrun.description.robot import ControllerEntry
+from dxlrun.log.identity import IDENTITY_NAME
+from dxlrun.remote.client import RemoteRobot
+from dxlrun.testing import plan_of, read_log, simulated_robot
+from dxlrun_analysis.replay import replay_log
+from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
+
+SHORT = Path(__file__).with_name("short")
+WAVE = (SHORT / "wave.py").read_text()
+LAW = "self.start + self.amplitude * np.sin(2 * np.pi * self.frequency * time)"
+MARK = "robot.yaml:7:16: "
+ROBOT = """\
+name: short
+loop: {rate: 50}
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
+joint_defaults: {bus: main, model: XM430-W350, reference: 180 deg, direction: 1}
+joints: {pan: {id: 1}, tilt: {id: 2}}
+controllers:
+  head: {type: ./wave.py:Wave, joints: [pan, tilt], frequency: 2 Hz}
+"""
+Written = Callable[..., Path]
+
+
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Written:
+    """Write wave.py with some text replaced, and a robot file that uses it; return the robot file."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(old: str = "", new: str = "", *, robot: str = ROBOT) -> Path:
+        assert old in WAVE
+        Path("wave.py").write_text(WAVE.replace(old, new) if old else WAVE + new)
+        Path("robot.yaml").write_text(robot)
+        return Path("robot.yaml")
+
+    return write
+
+
+def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    robot = simulated_robot(SHORT / "short.yaml", duration_s=1.0, log=log)
+    assert robot.run().detail == ""
+    assert all(len(path.read_text().splitlines()) < 20 for path in SHORT.glob("*.py"))
+    commands = read_log(log).cycles
+    wave, sway = commands["command_position"][:, :2].T
+    np.testing.assert_allclose(wave - wave[0], 0.3 * np.sin(4 * np.pi * 0.01 * np.arange(100)), atol=1e-12)
+    assert np.ptp(sway) > 0.01  # the gyroscope is on the link that the wave moves
+    assert np.isfinite(commands["command_effort"][:, 2:]).all()
+    assert replay_log(log).sentence == "short: 100 cycles replayed, 0 differences"
+
+
+def test_the_law_is_the_formula_to_the_last_bit(written: Written) -> None:
+    written()
+    log = Path("run.mcap")
+    simulated_robot("robot.yaml", duration_s=0.5, log=log).run()
+    read = read_log(log)
+    start = read.activation[0]["goal_position"]
+    start = np.where(np.isnan(start), read.activation[0]["position"], start)
+    times = np.arange(25) * 20_000_000 * 1e-9
+    law = [start + 0.3 * np.sin(2 * np.pi * 2.0 * time) for time in times]
+    np.testing.assert_array_equal(read.cycles["command_position"], law)
+
+
+def test_the_log_has_the_file_and_a_replay_runs_that_one(written: Written) -> None:
+    file, log = written(), Path("run.mcap")
+    simulated_robot(file, duration_s=0.3, log=log).run()
+    read = read_log(log)
+    assert read.attachments["included/wave.py"].decode() == WAVE
+    digest = read.metadata[IDENTITY_NAME]["included wave.py"]
+    assert read.metadata["plugins"]["./wave.py:Wave"] == f"wave.py {digest[:12]}"
+    written(LAW, "self.start")
+    report = replay_log(log)
+    assert report.same
+    assert report.remarks == ("wave.py has changed since the run; the replay ran the one in the log",)
+    Path("wave.py").unlink()
+    assert (replay_log(log).same, replay_log(log).remarks) == (True, ())
+
+
+def test_all_processes_of_a_run_have_it(written: Written) -> None:
+    file = written()
+    program = "import sys; from dxlrun.cli import main; sys.exit(main())"
+    words = [sys.executable, "-c", program, file, "--duration", "0.3"]
+    ran = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert replay_log(next(Path("logs").glob("*.mcap"))).same
+
+
+def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Written) -> None:
+    link = RobotOnVirtualTime(plan_of(written()), log=None, each_cycle=lambda cycle: None)
+    robot = RemoteRobot("short", link)
+    try:
+        values = {one.name: one.value for one in robot.parameter_table("head")}
+        assert values == {"joints": ["pan", "tilt"], "amplitude": "0.3 rad", "frequency": "2.0 Hz"}
+        changed = robot.set_parameters("head", {"amplitude": "0.5 rad"})
+        assert changed == {"amplitude": ("0.3 rad", "0.5 rad")}
+        with pytest.raises(Exception, match=r"0\.3 has no unit"):
+            robot.set_parameters("head", {"amplitude": 0.3})
+    finally:
+        link.close()
+
+
+def test_check_shows_it_and_an_editor_takes_it(written: Written, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(written()), "--json"]) == 0
+    (shown,) = json.loads(capsys.readouterr().out)["controllers"]
+    entry = json.loads((SHORT.parents[2] / "robots/robot.schema.json").read_text())["$defs"][
+        "ControllerEntry"
+    ]
+    kind = Draft202012Validator({**entry["properties"]["type"], "$defs": {"argument": {"pattern": r"\$"}}})
+    assert [kind.is_valid(one) for one in ("./wave.py:Wave", "../wave.py:Wave", "./wave.py")] == [
+        True,
+        False,
+        False,
+    ]
+    assert (shown["type"], shown["distribution"].split()[0]) == ("./wave.py:Wave", "wave.py")
+
+
+WRONG = {
+    "a syntax error": (("np.sin(", "np.sin(("), "; wave.py:13: SyntaxError: '(' was never closed"),
+    "a name that is not there": (
+        ("import numpy as np", "import numpy_"),
+        "; wave.py:1: ModuleNotFoundError: ",
+    ),
+    "no class of that name": (
+        ("class Wave", "class Waves"),
+        "; wave.py has no class Wave; did you mean Waves?",
+    ),
+    "no controller": (
+        ("(JointController)", ""),
+        "; wave.py offers Wave as ./wave.py:Wave, which is no controller",
+    ),
+    "no law": (
+        ("def positions", "def position_s"),
+        "which has no method positions, velocities, efforts; write",
+    ),
+    "a law without dt": (
+        (", dt: float", ""),
+        "whose positions(time) cannot be called as positions(time, dt)",
+    ),
+    "a field without a type": (
+        (": Angle = 0.3", " = 0.3"),
+        "Wave.amplitude has no type; write amplitude: float = ",
+    ),
+    "an unknown type": ((": Angle", ": Angel"), "NameError: name 'Angel' is not defined"),
+    "an unknown type as text": (
+        (": Angle", ": 'Angel'"),
+        "has an unknown type (name 'Angel' is not defined); import",
+    ),
+    "a type that no key has": (
+        (": Angle = 0.3", ": np.ndarray"),
+        "wave.py:6: TypeError: Wave.amplitude has the type ",
+    ),
+    "a default that is no number": (
+        ("= 0.3", "= '20 deg'"),
+        "has the default '20 deg'; write a number, in SI units",
+    ),
+    "a name of a method": (
+        ("frequency: ", "velocity: "),
+        "Wave.velocity has a name that each controller has already",
+    ),
+    "a name of the entry": (
+        ("frequency: ", "rate: "),
+        "Wave.rate has a name that each controller has already; rename",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_class_is_one_sentence_at_its_place(written: Written, wrong: str) -> None:
+    change, sentence = WRONG[wrong]
+    file = written(*change)
+    with pytest.raises(InputError) as refused:
+        plan_of(file)
+    text = str(refused.value)
+    assert text.startswith(f"{MARK}./wave.py:Wave of head cannot be used; wave.py")
+    assert sentence in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "sentence"),
+    [
+        (
+            "../wave.py:Wave",
+            "../wave.py:Wave of head is no class of a file beside the robot file; write ./wave.py:Wave",
+        ),
+        ("/home/wave.py:Wave", "/home/wave.py:Wave of head is no class of a file beside the robot file; "),
+        ("wave.py", "wave.py of head is no class of a file beside the robot file; "),
+        ("./out.py:Wave", "./out.py:Wave of head is no class of a file beside the robot file; "),
+        (
+            "./gone.py:Wave",
+            "gone.py of controller head cannot be read (No such file or directory); its place is gone.py",
+        ),
+        ("./bytes.py:Wave", "bytes.py of controller head cannot be read (it is no UTF-8); "),
+    ],
+)
+def test_only_files_beside_the_robot_file_are_read(
+    written: Written, tmp_path_factory: pytest.TempPathFactory, kind: str, sentence: str
+) -> None:
+    file = written(robot=ROBOT.replace("./wave.py:Wave", kind))
+    outside = tmp_path_factory.mktemp("outside") / "out.py"
+    outside.write_text(WAVE)
+    Path("out.py").symlink_to(outside)
+    Path("bytes.py").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError) as refused:
+        plan_of(file)
+    assert str(refused.value).startswith(MARK + sentence)
+    assert "\n" not in str(refused.value)
+
+
+def test_wrong_keys_have_their_place(written: Written) -> None:
+    with pytest.raises(InputError) as refused:
+        plan_of(written(robot=ROBOT.replace("2 Hz", "2, joint: pan")))
+    first, second = str(refused.value).splitlines()
+    assert first.startswith(
+        "robot.yaml:7:64: controllers.head.frequency: 2 has no unit; write a frequency with its"
+    )
+    assert second.startswith(
+        "robot.yaml:7:67: controllers.head has an unknown key 'joint'; did you mean joints?"
+    )
+
+
+FAULTS = {
+    "None": ("None", "returned None from positions; return an array of 2 numbers, one a joint (pan, tilt)"),
+    "a number": ("0.5", "returned 0.5 from positions; return an array of 2 numbers"),
+    "three": ("np.zeros(3)", "returned an array of shape (3,) from positions; "),
+    "words": ("['a', 'b']", "returned ['a', 'b'] from positions; "),
+    "NaN": ("self.start * [1, np.nan]", "returned NaN for tilt from positions; return a number"),
+    "NaN later": (
+        "self.start + (np.nan if time > 0.1 else 0)",
+        "commanded pan/position = nan after a finite value",
+    ),
+    "infinity": ("self.start + np.inf", "commanded pan/position = inf"),
+    "what raises": (
+        "self.start + self.amplitud",
+        "raised in update: AttributeError: 'Wave' object has no attribute",
+    ),
+    "a field that is set": (
+        "setattr(self, 'amplitude', 1.0)",
+        "raised in update: AttributeError: amplitude is a parameter, which only",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", FAULTS)
+def test_a_wrong_result_ends_the_controller_by_the_policy_of_a_fault(written: Written, wrong: str) -> None:
+    law, sentence = FAULTS[wrong]
+    robot = simulated_robot(written(LAW, law), duration_s=0.3)
+    assert f"controller head {sentence}" in robot.run().detail
+
+
+class Lean(JointController):
+    """Reads another joint."""
+
+    other: float = reading("knee/position")
+    gain: float = 1.0
+    TABLE: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def begin(self) -> None:
+        self.began = self.start.copy()
+
+    def positions(self, time: float, dt: float) -> Floats:
+        return self.began + self.gain * self.other + time
+
+
+class Quick(Lean):
+    """With a speed, and one field more."""
+
+    speed: float = 2.0
+
+    def velocities(self, time: float, dt: float) -> Floats:
+        return np.full(2, self.speed * dt)
+
+
+def test_it_begins_when_all_that_it_reads_is_known_and_time_counts_from_there() -> None:
+    stage = Stage(Quick, {"joints": ["a", "b"], "other": "hip/position"}).activate()
+    assert stage.interfaces.reads == ("hip/position",)
+    assert stage.interfaces.command == ("position", "velocity")
+    assert np.isnan(stage.update(1.0, follow=False)).all()
+    stage.context.reads[:] = 0.5
+    assert stage.update(2.0, follow=False).tolist() == [0.3 + 0.5, -0.2 + 0.5]
+    assert stage.update(3.0, follow=False).tolist() == [0.3 + 0.5 + 1.0, -0.2 + 0.5 + 1.0]
+    assert stage.commands.velocity.tolist() == [0.04, 0.04]
+    stage.change(gain=0.0)
+    assert stage.update(4.0, follow=False).tolist() == [0.3 + 2.0, -0.2 + 2.0]
+
+
+def test_a_joint_that_was_not_heard_yet_begins_where_it_is_heard() -> None:
+    class Hold(JointController):
+        def positions(self, time: float, dt: float) -> Floats:
+            return self.start + 0.0
+
+    stage = Stage(Hold, {"joints": ["a", "b"]}, present=(0.3, np.nan)).activate()
+    assert stage.update(0.0, follow=False).tolist()[0] == 0.3
+    assert np.isnan(stage.commands.position[1])
+    stage.states.position[1] = 0.7
+    assert stage.update(0.1, follow=False).tolist() == [0.3, 0.7]
+
+
+def test_names_of_the_entry_are_no_fields_and_the_class_fits_the_contract() -> None:
+    assert set(ControllerEntry.model_fields) - {"parameters"} <= set(_TAKEN)
+    assert controller_breach(Quick) is None
