@@ -98,11 +98,16 @@ def values(entry: dict[str, Any]) -> Iterator[str]:
 
 def keys(name: str) -> str:
     """Return the table of the keys of one part of a robot file."""
-    whole = json.loads(said("schema"))
-    part = whole if name == "robot" else whole["$defs"][name]
+    schemas = {kind: json.loads(said("schema", kind)) for kind in ("robot", "motion", "motor")}
+    parts = {**schemas, **{own: part for each in schemas.values() for own, part in each["$defs"].items()}}
+    entries = parts[name]["properties"]
     rows = ["| key | value | default | |", "|---|---|---|---|"]
-    for key, entry in part["properties"].items():
-        if key in {"type", "active", "rate", "fallback", "into"} and name[0].islower() and name != "robot":
+    for key, entry in entries.items():
+        if (
+            key in {"type", "active", "rate", "fallback", "into"}
+            and "fallback" in entries
+            and name != "ControllerEntry"
+        ):
             continue  # of every controller: ControllerEntry has them
         given, example = entry.get("default"), (entry.get("examples") or [None])[0]
         default = "" if given is None else f"`{json.dumps(given)}`"

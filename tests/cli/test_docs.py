@@ -22,6 +22,7 @@ from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
 from dxlrun.cli import verbs
+from dxlrun.cli.examples import schema_text
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
 from dxlrun.compile.robot import compile_files
@@ -392,8 +393,8 @@ def test_failures_md_names_events_and_keys_that_exist() -> None:
     events = {code.name.lower() for code in EventCode}
     names = set(re.findall(r"`([a-z]+_[a-z_]+)`", PAGES["failures.md"]))
     assert {"servo_lost", "on_exit"} <= names
-    for name in names - events:
-        assert f"`{name}`" in PAGES["robot-file.md"] or name.startswith("on_") or name == "clamped", name
+    for name in names - events - {"clamped"}:
+        assert f'"{name}": {{' in schema_text("robot"), name
 
 
 def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:

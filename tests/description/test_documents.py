@@ -1,15 +1,15 @@
-# ruff: noqa: E501 (what is written and what is read stand side by side)
-
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
 from tests.kit import desk
-from tests.kit.desk import TORSO
 from tests.kit.pages import page_text
 
+from dxlrun.cli.examples import schema_text
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
+from dxlrun.description.devices import Device, DeviceSimulation
 from dxlrun.description.form import Form
 from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
 from dxlrun.description.joints.mechanics import (
@@ -23,12 +23,10 @@ from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, Point
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
-    Group,
     GroupPolicies,
     Loop,
     Policies,
     PoseStep,
-    Processes,
     Recording,
     Robot,
     RobotModel,
@@ -36,17 +34,12 @@ from dxlrun.description.robot import (
     Simulation,
     TorqueStep,
 )
+from dxlrun.description.sensors import SensorEntry
 
 PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-ROWS = {
-    row[0]: row
-    for row in (
-        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
-        for line in PAGE.splitlines()
-        if line.startswith("| `")
-    )
-}
+TABLES = set(re.findall(r"^<!-- keys: (\w+) -->$", PAGE, re.MULTILINE))
+"""Which the site has, from the schema."""
 
 
 def test_the_examples_of_the_page_are_read() -> None:
@@ -71,54 +64,65 @@ def test_the_examples_of_the_page_are_read() -> None:
     assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
 
 
-@pytest.mark.parametrize(
-    ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("groups.*.", Group), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
-     ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
-     ("", FormulaPart), ("points[].", Point), ("", MotorForm)],
-)  # fmt: skip
-def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
+PARTS = [
+    *(
+        Bus,
+        Adapter,
+        SlowRegisters,
+        BusSimulation,
+        Joint,
+        Limits,
+        OneOfServos,
+        Transmission,
+        TransmissionServo,
+    ),
+    *(JointSimulation, Loop, Scheduler, Policies, PoseStep, TorqueStep, GroupPolicies, ControllerEntry),
+    *(
+        SensorEntry,
+        Device,
+        DeviceSimulation,
+        Recording,
+        Gateway,
+        RobotModel,
+        Simulation,
+        PointsPart,
+        FormulaPart,
+    ),
+]
+
+
+def test_every_part_has_a_table() -> None:
+    assert {part.__name__ for part in PARTS} | {"robot", "motor"} == TABLES
+
+
+@pytest.mark.parametrize("part", [*PARTS, Robot, SharedJoint, MotorForm, Motion, Point, Target])
+def test_every_key_is_described(part: type[Form]) -> None:
     for key, field in part.model_fields.items():
-        if key == "parameters" or (isinstance(field.default, Form) and key != "adapter"):
-            continue  # parts of their own, whose keys are on the page
-        assert prefix + key in ROWS
-    for key in Robot.read_before:
-        assert key in ROWS
+        assert field.description, key
 
 
 @pytest.mark.parametrize(
-    ("row", "text"),
-    [("adapter.latency", "{{adapter: {{latency: {}}}}}"), ("return_delay_time", "{{return_delay_time: {}}}")],
-)
-def test_the_defaults_of_a_bus_are_the_pages(row: str, text: str) -> None:
-    def bus(more: str) -> object:
-        return desk.robot(
-            f"name: x\nbuses:\n  m: &m {{port: sim, protocol: 1.0, baud_rate: 57600{more}}}\nloop: {{rate: 1}}\n"
-            "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: 1}}\n"
-        ).robot.buses["m"]
-
-    written = text.format(ROWS[row][2])[1:-1]
-    assert bus(f", {written}") == bus("")
-
-
-@pytest.mark.parametrize(
-    "row",
+    ("part", "key"),
     [
-        "on_exit",
-        "on_fault",
-        "on_lost_servo",
-        "on_returned_servo",
-        "groups",
-        "on_stale_command",
-        "exit_timeout",
+        ("Adapter", "latency"),
+        ("Bus", "return_delay_time"),
+        ("Policies", "on_returned_servo"),
+        ("Policies", "exit_timeout"),
     ],
 )
-def test_the_defaults_of_the_policies_are_the_pages(row: str) -> None:
-    head = TORSO[: TORSO.index("policies:")]
-    assert (
-        desk.robot(head + f"policies: {{{row}: {ROWS[row][2]}}}\n").robot.policies
-        == desk.robot(head).robot.policies
+def test_a_default_of_the_schema_is_that_of_the_program(part: str, key: str) -> None:
+    written = json.loads(schema_text("robot"))["$defs"][part]["properties"][key]["default"]
+    keys = {"Bus": f"{key}: {written}", "Adapter": f"adapter: {{{key}: {written}}}"}.get(
+        part, "baud_rate: 57600"
     )
+    robot = (
+        "name: x\nbuses:\n  m: {port: sim, protocol: 1.0, %s}\nloop: {rate: 1}\n"
+        "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: 1}}\n"
+    )
+    bus = "baud_rate: 57600"
+    policies = f"policies: {{{key}: {written}}}\n" if part == "Policies" else ""
+    given = robot % (bus if keys == bus else f"{bus}, {keys}") + policies
+    assert desk.robot(given).robot == desk.robot(robot % bus).robot
 
 
 def test_targets_and_formulas_have_the_same_three_quantities() -> None:

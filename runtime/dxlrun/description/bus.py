@@ -39,7 +39,9 @@ class Adapter(Form):
         "An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.", "direct", None
     )
     latency: Duration = key(
-        "How long it may keep bytes back before it hands them over; kind says it, too.", "1 ms", 16_000_000
+        "How long it may keep bytes back before it hands them over; kind says it, too (1 ms, or none).",
+        "1 ms",
+        16_000_000,
     )
 
     @property
@@ -89,7 +91,10 @@ class Bus(Form):
     adapter: Adapter = key("The adapter.", "{latency: 1 ms}", Adapter())
     return_delay_time: Duration = key("How long a servo waits before it answers.", "500 us", 500_000)
     bus_watchdog: AutoDuration = key(
-        "After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.", "200 ms", "auto"
+        "A servo of Protocol 2.0 stops after this time without instructions, 2.54 s at most; 0 ms: never; "
+        "auto: 200 ms, more below 15 Hz.",
+        "200 ms",
+        "auto",
     )
     slow_registers: SlowRegisters = key(
         "What is read now and then, between the cycles.", "{rate: 2}", SlowRegisters()

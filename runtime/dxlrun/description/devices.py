@@ -105,7 +105,7 @@ class Device(Form):
     """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
     bus: str = key("Name of its bus.", "main")
-    id: int = key("Its ID.", "241", ge=0, le=253)
+    id: int = key("Its ID, which no servo of the bus has.", "241", ge=0, le=253)
     model: str = Field(
         min_length=1,
         description="Its model, as `dxlrun models` lists it, or the TOML file of its control table.",

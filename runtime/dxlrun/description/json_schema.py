@@ -9,10 +9,17 @@ time) is for `dxlrun check`.
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
 from collections.abc import Mapping
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core.core_schema import ModelSchema
 
 from dxlrun.description.arguments import Argument
 from dxlrun.description.document import plain_value
@@ -101,7 +108,8 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
         entry = definitions[form]
         entry["properties"].pop("parameters")
         for kind, model in sorted(models.items()):
-            own = model.model_json_schema(ref_template=f"#/$defs/{room}{kind}.{{model}}")
+            named = f"#/$defs/{room}{kind}.{{model}}"
+            own = model.model_json_schema(ref_template=named, schema_generator=_Documented)
             for name, node in own.pop("$defs", {}).items():
                 definitions[f"{room}{kind}.{name}"] = shaped.node(node)
             definitions[room + kind] = _entry_of(kind, entry, shaped.node(own))
@@ -190,6 +198,33 @@ def _and_none_of(condition: Schema, others: list[Schema]) -> Schema:
     return {**condition, "not": {"anyOf": [*others]}} if others else condition
 
 
+class _Documented(GenerateJsonSchema):
+    """Pydantic's schema, where the docstring below a field describes its key."""
+
+    def model_schema(self, schema: ModelSchema) -> Schema:
+        """Return the schema of a model."""
+        found = super().model_schema(schema)
+        for kind in schema["cls"].__mro__:
+            for key, text in _docstrings(kind).items():
+                if key in found.get("properties", {}):
+                    found["properties"][key].setdefault("description", text)
+        return found
+
+
+def _docstrings(kind: type) -> dict[str, str]:
+    """Return the docstrings below the fields of a class, by field; of a class without source none."""
+    with suppress(OSError, TypeError, SyntaxError):
+        (made,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        return {
+            field.target.id: " ".join(below.value.value.split())
+            for field, below in pairwise(made.body if isinstance(made, ast.ClassDef) else [])
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            if isinstance(below.value.value, str)
+        }
+    return {}
+
+
 class _Shaper:
     """Turns nodes of pydantic's schema into nodes of ours; `used` are the definitions that these name."""
 
@@ -235,7 +270,7 @@ class _Shaper:
         for arm in arms:
             if arm not in single:
                 single.append(arm)
-        about = _readable(about, kinds)
+        about = _readable(about, kinds, "".join(_patterns({"anyOf": arms})))
         return about | (single[0] if len(single) == 1 else {"anyOf": single})
 
     def _use(self, name: str, definition: Schema) -> Schema:
@@ -243,21 +278,44 @@ class _Shaper:
         return {"$ref": f"#/$defs/{name}"}
 
 
-def _readable(about: Schema, kinds: set[str | None]) -> Schema:
+def _readable(about: Schema, kinds: set[str | None], pattern: str) -> Schema:
     """Return description, default and examples as they are written in a file.
 
-    A default of a quantity is held in SI, and None means that a key is left out: neither can be written.
+    A default of a quantity is held in SI, and gets its unit from the `pattern`; None means that a key is left
+    out, which cannot be written.
     """
     found = dict(about)
     text = kinds <= {"string", "null"}
     scalar = kinds <= {*_SCALARS, "null"}
     default = found.pop("default", None)
-    if scalar and default is not None and (isinstance(default, str) or not text):
+    if pattern and isinstance(default, int | float) and not kinds & {"integer", "number"}:
+        default = _written(default, pattern)
+    if isinstance(default, str | int | float) and default != "":
         found["default"] = default
     examples = found.pop("examples", None)
     if scalar and examples:
         found["examples"] = examples if text else [plain_value(str(each)) for each in examples]
     return found
+
+
+def _patterns(node: Schema) -> list[str]:
+    """Return the patterns of what may stand at one place, or in a mapping there, without names."""
+    arms = [one for key in ("anyOf", "oneOf") for one in node.get(key, ())]
+    inner = [node["additionalProperties"]] if isinstance(node.get("additionalProperties"), dict) else []
+    own = [node["pattern"]] if r"\s*$" in node.get("pattern", "") else []
+    return own + [pattern for one in arms + inner for pattern in _patterns(one)]
+
+
+def _written(default: float, pattern: str) -> str | None:
+    """Return a quantity in SI (a time in ns, as it is held) with a unit of a pattern that `units` made."""
+    units = pattern.rpartition("(")[2].partition(")")[0].replace("\\", "").split("|")
+    if units == ["%"]:
+        return f"{default * 100:g} %"
+    if "ns" not in units:
+        return f"{default:g} {next((one for one in units if one.startswith('rad')), units[0])}"
+    sizes = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+    unit = next(one for one, size in sizes.items() if default % size == 0)
+    return f"{default / sizes[unit]:g} {unit}"
 
 
 def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON document)

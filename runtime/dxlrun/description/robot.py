@@ -79,7 +79,7 @@ class Loop(Form):
     rate: Rate = key("Cycles per second, Hz.", "50", ge=0.001, le=100_000)
     scheduler: Scheduler = key("Real-time settings of the loop.", "{policy: round_robin}", Scheduler())
     overrun: Literal["skip", "catch_up", "stop"] = key(
-        "After a late cycle, whole periods are skipped, or caught up with, or the run ends.",
+        "After a late cycle whole periods are skipped, or up to 5 follow at once, or the run ends.",
         "catch_up",
         "skip",
     )
@@ -150,7 +150,9 @@ class GroupPolicies(Form):
         (),
     )
     on_lost_servo: Literal["hold", "limp", "stop"] | None = key(
-        "hold: its controllers wait; limp: the group loses its torque; stop: the run ends.", "limp", None
+        "hold: its controllers wait; limp: the group loses its torque; stop: the run ends by on_fault.",
+        "limp",
+        None,
     )
     on_returned_servo: Word | None = key("As the policy of that name, for this group.", "hold", None)
 
@@ -158,10 +160,16 @@ class GroupPolicies(Form):
 class Policies(Form):
     """What happens at the end of a run, and on faults."""
 
-    on_exit: Policy = key("At the end of a run.", "[{pose: home, speed: 60 deg/s}, limp]", "limp")
-    on_fault: Policy = key("When the loop, a bus or a controller failed.", "limp", "limp")
+    on_exit: Policy = key(
+        "At Ctrl-C, SIGTERM, `dxlrun stop` and the end of the motions.",
+        "[{pose: home, speed: 60 deg/s}, limp]",
+        "limp",
+    )
+    on_fault: Policy = key(
+        "When a controller failed without a fallback, a bus is gone, or by `overrun: stop`.", "limp", "limp"
+    )
     on_lost_servo: Policy = key(
-        "When a servo stopped answering; hold: its controllers wait, the others go on.", "hold", "hold"
+        "When a servo missed 3 replies in a row, and 50 ms; hold: its controllers wait.", "hold", "hold"
     )
     on_returned_servo: Word = key(
         "When a servo answers again that has rebooted; hold: it gets torque where it stands.", "hold", "limp"
@@ -203,7 +211,7 @@ class Recording(Form):
 
     directory: str = key("Where logs are written, from the working directory.", "logs", "logs", min_length=1)
     split: SizeOrDuration | None = key(
-        "Size or duration after which a log goes on in another file.", "100 MB", None
+        "Size or duration, 1 MB or 1 s at least, after which a log goes on in another file.", "100 MB", None
     )
     keep: Duration | None = key(
         "Files whose newest record is older are deleted while the run goes on; needs split.", "10 min", None

@@ -107,7 +107,9 @@ class ServoJoint(BareJoint):
     """
 
     bus: str = key("Name of its bus.", "main")
-    model: str = key("Model of its servo, or auto: it is asked.", "AX-12A", min_length=1)
+    model: str = key(
+        "Model of its servo (`dxlrun models`), or auto: read from the servo.", "AX-12A", min_length=1
+    )
     reference: Angle = key("Angle of the servo, from its zero, where the joint's is zero.", "150 deg")
     direction: Direction = key("1: the joint's angle grows as the servo's does, -1: against it.", "1")
     gear_ratio: GearRatio = key("Turns of the servo for one turn of the joint.", "2.5", 1.0)
@@ -147,7 +149,9 @@ class SharedJoint(ServoJoint):
         "Its servos; what one does not have is the joint's.", "[{id: 1}, {id: 2, direction: -1}]"
     )
     tolerance: Tolerance | None = key(
-        "By how much its servos may disagree, as a position of the joint.", "3 deg", None
+        "By how much its servos may disagree, as a position of the joint; 3 deg or 1 mm when absent.",
+        "3 deg",
+        None,
     )
 
 

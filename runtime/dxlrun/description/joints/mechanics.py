@@ -72,7 +72,11 @@ class Limits(Form):
     """Where a joint may go, and how fast; the last gate before the bus holds it there."""
 
     position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
-        key("Lower and upper limit of the joint's position.", "[-90 deg, 90 deg]", None)
+        key(
+            "Lower and upper limit of the joint's position; none: the servo's reach.",
+            "[-90 deg, 90 deg]",
+            None,
+        )
     )
     velocity: Annotated[Speed, Field(gt=0)] | None = key(
         "Highest speed; none: the servo's own.", "2 rad/s", None
