@@ -101,14 +101,11 @@ def keys(name: str) -> str:
     schemas = {kind: json.loads(said("schema", kind)) for kind in ("robot", "motion", "motor")}
     parts = {**schemas, **{own: part for each in schemas.values() for own, part in each["$defs"].items()}}
     entries = parts[name]["properties"]
+    common = {"type", "active", "rate", "fallback", "into"} if "fallback" in entries else set()
     rows = ["| key | value | default | |", "|---|---|---|---|"]
     for key, entry in entries.items():
-        if (
-            key in {"type", "active", "rate", "fallback", "into"}
-            and "fallback" in entries
-            and name != "ControllerEntry"
-        ):
-            continue  # of every controller: ControllerEntry has them
+        if key in common and name != "ControllerEntry":
+            continue
         given, example = entry.get("default"), (entry.get("examples") or [None])[0]
         default = "" if given is None else f"`{json.dumps(given)}`"
         about = [
