@@ -32,7 +32,14 @@ __all__ = [
     "get_requires_for_build_sdist",
     "get_requires_for_build_wheel",
 ]
-SOURCES = (Path("dxlrun/dynamixel/exchange/kernel.c"), Path("dxlrun/control/gate.c"))
+SOURCES = tuple(
+    Path("dxlrun", *path)
+    for path in (
+        ("dynamixel", "exchange", "kernel.c"),
+        ("control", "gate.c"),
+        ("channels", "shared_memory.c"),
+    )
+)
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: states and goals have the same bits on every processor."""

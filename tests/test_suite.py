@@ -128,9 +128,10 @@ MOST_ROOMS = 18
 
 
 def entries(folder: Path) -> list[Path]:
-    """Return what a reader finds in a folder: its modules and rooms."""
+    """Return what a reader finds in a folder: its modules, with what they have in C, and rooms."""
     made = {"__init__.py", "py.typed", "__pycache__"}
-    return [path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"]
+    found = [path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"]
+    return [path for path in found if path.suffix != ".c" or not path.with_suffix(".py").exists()]
 
 
 def test_no_folder_of_the_package_is_crowded() -> None:

@@ -33,7 +33,6 @@ from zlib import crc32
 import numpy as np
 from msgspec.structs import replace
 
-from dxlrun.channels import fence
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.packets import PacketBatch, decode_packets
 from dxlrun.channels.ring import Handover
@@ -41,6 +40,7 @@ from dxlrun.clock import VirtualClock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.control_table.device_table import read_device_table
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.devices import device_blocks
@@ -486,7 +486,7 @@ def difference(found, expected, where):
 def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
     """Compare so many streams; raises AssertionError where kernel and parser differ."""
     rng, tally = random.Random(seed), Tally()
-    fence.LIBRARY = Path(os.environ.get(LIBRARY, fence.LIBRARY))
+    kernel.LIBRARY = Path(os.environ.get(LIBRARY, kernel.LIBRARY))
     while tally.streams < streams:
         name, count = rng.choice(names), rng.choice((1, 1, 3))
         plans, dialect = robot(name, count)
@@ -526,7 +526,7 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
 
 def sanitized(folder: str) -> dict[str, str]:
     """Compile the kernel with the sanitizers of gcc; return the environment in which Python can load it."""
-    gcc, source, target = shutil.which("gcc") or "gcc", fence.SOURCE, str(Path(folder, "libkernel.so"))
+    gcc, source, target = shutil.which("gcc") or "gcc", kernel.SOURCE, str(Path(folder, "libkernel.so"))
     flags = ["-std=c11", "-O1", "-g", "-fPIC", "-shared", "-ffp-contract=off", "-fno-sanitize-recover=all"]
     flags += ["-fsanitize=address,undefined", f"-DSOURCE_CRC={crc32(source.read_bytes())}u"]
     subprocess.run([gcc, *flags, "-o", target, str(source), "-lm"], check=True)

@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels import fence
+from dxlrun.channels import shared_memory
 from dxlrun.control import gate
 from dxlrun.control.realtime import UNLIMITED
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
 
 GOOD = {
@@ -340,7 +341,11 @@ def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
     assert found.mend == "install dxlrun again"
 
 
-@pytest.mark.parametrize("what", ["kernel", "gate"])
+@pytest.mark.parametrize("what", ["kernel", "gate", "shared_memory"])
 def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr({"kernel": fence, "gate": gate}[what], "SOURCE", tmp_path / f"{what}.c")
+    monkeypatch.setattr(
+        {"kernel": kernel, "gate": gate, "shared_memory": shared_memory}[what],
+        "SOURCE",
+        tmp_path / f"{what}.c",
+    )
     assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again, on Linux"

@@ -16,7 +16,6 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
-from dxlrun.channels import fence
 from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.packets import RECORD_HEADER, PacketKind
@@ -35,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_numbers_that_both_sides_share_are_the_same():
     """The structs are read from `kernel.c`; these have a type in Python."""
-    text = fence.SOURCE.read_text()
+    text = kernel.SOURCE.read_text()
     found = {name: int(value) for name, value in re.findall(r"#define (\w+) (\d+)", text)}
     for names in re.findall(r"^enum \{(.*?)\}", text, re.MULTILINE):
         place = -1
@@ -124,14 +123,14 @@ def test_kernel_and_parser_agree_on_many_streams():
 
 
 def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monkeypatch):
-    shutil.copy(fence.LIBRARY, tmp_path / "libkernel.so")
-    fence.library(path=tmp_path / "libkernel.so")
+    shutil.copy(kernel.LIBRARY, tmp_path / "libkernel.so")
+    kernel.library(path=tmp_path / "libkernel.so")
     (tmp_path / "kernel.c").write_text("int changed;")
-    monkeypatch.setattr(fence, "SOURCE", tmp_path / "kernel.c")
+    monkeypatch.setattr(kernel, "SOURCE", tmp_path / "kernel.c")
     with pytest.raises(StartUpError, match=r"of another source than kernel\.c .* install dxlrun again"):
-        fence.library(path=tmp_path / "libkernel.so")
+        kernel.library(path=tmp_path / "libkernel.so")
     with pytest.raises(StartUpError, match=r"^the compiled kernel is missing: install dxlrun again"):
-        fence.library(path=tmp_path / "absent.so")
+        kernel.library(path=tmp_path / "absent.so")
 
 
 def test_structs_of_c_are_read_with_their_pointers_arrays_and_functions(tmp_path):
@@ -401,7 +400,7 @@ def test_a_build_asks_for_a_compiler_where_none_works(build, tmp_path, monkeypat
     why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so")
     assert bool(why) != works
     if works:
-        fence.library(path=tmp_path / "libkernel.so")
+        kernel.library(path=tmp_path / "libkernel.so")
 
 
 def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, monkeypatch):
@@ -416,7 +415,11 @@ def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, m
 def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
     hook, data = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel"), {"force_include": {}}
     hook.initialize("standard", data)
-    names = ["dxlrun/dynamixel/exchange/libkernel.so", "dxlrun/control/libgate.so"]
+    names = [
+        "dxlrun/dynamixel/exchange/libkernel.so",
+        "dxlrun/control/libgate.so",
+        "dxlrun/channels/libshared_memory.so",
+    ]
     assert list(data["force_include"].values()) == names
     assert all(Path(made).stat().st_size for made in data["force_include"])
     hook.finalize("standard", data, "")

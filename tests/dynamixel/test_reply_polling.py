@@ -4,11 +4,10 @@ import ctypes
 
 import pytest
 
-from dxlrun.channels import fence
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
 
-LIBRARY = fence.library()
+LIBRARY = kernel.library()
 
 CYCLE_NS = 1_000_000
 WAKE_NS = 50_000

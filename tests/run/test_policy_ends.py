@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels import process
 from dxlrun.channels.events import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.plan.policy_plan import TORQUE_STAYS
@@ -187,7 +187,7 @@ def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop,
 def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start, tmp_path):
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
-    desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))
+    desk = PacketBatch(RingWriter(memory.packets), mapped(memory.desk))
     desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
     master, slave = os.openpty()
     SafeStop(guardian_job(plan, {}, memory, take_over=False))._take_over([slave])

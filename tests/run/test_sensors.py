@@ -26,6 +26,7 @@ import pytest
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.sensors.readings import Readings
@@ -109,7 +110,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
         def emit(self, code, severity, source, text):
             events.append(text.removeprefix("sensor imu").lstrip(": "))
 
-    slots = [slot.shared(descriptor) for descriptor in memory.sensors]
+    slots = [mapped(descriptor) for descriptor in memory.sensors]
     readings = Readings(plan.loop, slots, record, time.monotonic_ns, Sink())
     sensor = supervisor._SensorProcess(plan, 0, memory, start_sensor(plan, 0, memory))
 
@@ -305,7 +306,7 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
     child = start_sensor(plan, 0, memory)
     sensor = supervisor._SensorProcess(plan, 0, memory, child)
     child.ready()
-    reader = SlotReader(slot.shared(memory.sensors[0]))
+    reader = SlotReader(mapped(memory.sensors[0]))
     until = time.monotonic() + 20
     while not (restarted := child.process.poll() is not None) and reader.state is not SlotState.FAILED:
         assert time.monotonic() < until

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from dxlrun.channels import slot
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
 
 VALUES = 6
 HAMMER = """
 import sys, numpy as np
-from dxlrun.channels import slot
-writer, values, number = slot.SlotWriter(slot.shared(int(sys.argv[1]))), np.zeros(6), 0
+from dxlrun.channels import shared_memory, slot
+writer, values, number = slot.SlotWriter(shared_memory.mapped(int(sys.argv[1]))), np.zeros(6), 0
 while True:
     number += 1
     values.fill(number)
@@ -79,19 +80,28 @@ def test_a_torn_sample_is_not_used(ends, place):
 def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch):
     writer, reader = ends
     seen = []
-    monkeypatch.setattr(slot, "fence", lambda: seen.append((reader.samples, writer._places[1].copy())))
+
+    def stored(words, index, value):
+        seen.append((words[index], writer._places[1].copy(), bytes(writer._text[:4])))
+        words[index] = value
+
+    monkeypatch.setattr(slot, "store", stored)
     writer.write(7, np.full(VALUES, 1.0))
-    ((count, sample),) = seen
+    ((count, sample, _),) = seen
     assert count == 0
     assert sample.tolist() == writer._places[1].tolist()
     writer._places[1].fill(0)
-    monkeypatch.setattr(slot, "fence", lambda: np.copyto(writer._places[1], sample))
-    assert reader.read() == 7  # the sample came to be seen at the fence
+
+    def loaded(words, index):  # the sample comes to be seen with its count
+        np.copyto(writer._places[1], sample)
+        return words[index]
+
+    monkeypatch.setattr(slot, "load", loaded)
+    assert reader.read() == 7
     writer.say(SlotState.OPEN, "said")
     number = writer._words[2]
-    monkeypatch.setattr(slot, "fence", lambda: seen.append((writer._words[2], bytes(writer._text[:4]))))
     writer.say(SlotState.OPEN, "more")
-    assert seen[-1] == (number, b"more")
+    assert (seen[-1][0], seen[-1][2]) == (number, b"more")
 
 
 def test_texts_are_heard_once_and_cut(ends):
@@ -134,7 +144,7 @@ def test_the_memory_of_a_sensor_keeps_its_size():
 
 def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only():
     descriptor = slot.create("test", VALUES)
-    reader = SlotReader(slot.shared(descriptor))
+    reader = SlotReader(mapped(descriptor))
     child = subprocess.Popen([sys.executable, "-c", HAMMER, str(descriptor)], pass_fds=[descriptor])
     try:
         got, heard, last = 0, 0, 0

@@ -3,18 +3,17 @@
 A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
 store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
 clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
-visible behind what was shown before it (`fence.py`).
+visible behind what was shown before it.
 """
 
 from __future__ import annotations
 
-import mmap
-import os
 from contextlib import suppress
 from enum import IntEnum, unique
 from pathlib import Path
 
-from dxlrun.channels.fence import fence
+from dxlrun.channels import shared_memory
+from dxlrun.channels.shared_memory import load, store
 
 _PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
 _NAMES = 4096
@@ -60,10 +59,8 @@ class ControllerMethod(IntEnum):
 
 
 def create() -> int:
-    """Return the descriptor of fresh memory (memfd): nothing is left behind in /dev/shm."""
-    descriptor = os.memfd_create("dxlrun-heartbeat")
-    os.ftruncate(descriptor, _SIZE)
-    return descriptor
+    """Return the descriptor of a fresh page."""
+    return shared_memory.create("heartbeat", _SIZE)
 
 
 class Heartbeat:
@@ -72,7 +69,7 @@ class Heartbeat:
     __slots__ = ("_beats", "_memory", "_words")
 
     def __init__(self, descriptor: int) -> None:
-        self._memory = memoryview(mmap.mmap(descriptor, _SIZE))
+        self._memory = shared_memory.mapped(descriptor)
         self._words = self._memory.cast("Q")
         self._beats = 0
 
@@ -92,8 +89,7 @@ class Heartbeat:
 
     def enter(self, phase: Phase) -> None:
         """Show that a phase begins."""
-        fence()
-        self._words[_PHASE] = phase
+        store(self._words, _PHASE, phase)
 
     def name_controller(self, place: int, name: str) -> None:
         """Keep the name of the controller in this place; a very long one is cut."""
@@ -125,7 +121,7 @@ class Heartbeat:
     @property
     def phase(self) -> Phase:
         """The phase that was entered last."""
-        return Phase(self._words[_PHASE])
+        return Phase(load(self._words, _PHASE))
 
     @property
     def beats(self) -> int:

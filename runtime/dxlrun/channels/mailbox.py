@@ -14,13 +14,11 @@ whole is dropped, and counted. Layout, little-endian, 64-bit words aligned:
 
 from __future__ import annotations
 
-import fcntl
 import mmap
-import os
 import struct
 from collections.abc import Sequence
 
-from dxlrun.channels import ring
+from dxlrun.channels import ring, shared_memory
 from dxlrun.channels.answers import Answer, Answered, encode_answer
 from dxlrun.channels.commands import (
     LONGEST_COMMAND,
@@ -28,8 +26,8 @@ from dxlrun.channels.commands import (
     Command,
     encode_command,
 )
-from dxlrun.channels.fence import fence
-from dxlrun.channels.ring import Appender, Record, RecordKind, RingReader, RingWriter, record_size
+from dxlrun.channels.ring import Appender, Gap, Record, RecordKind, RingReader, RingWriter, record_size
+from dxlrun.channels.shared_memory import load, store
 from dxlrun.channels.tagged import Tagged, decode
 
 LONGEST_SET_POINT = 4096
@@ -37,8 +35,6 @@ LONGEST_SET_POINT = 4096
 MOST_BYTES = 64 * 1024
 """After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
 log takes some 2 ms [measured]."""
-MOST_LOOKS = 5
-"""Cycles in which a command is awaited that is not whole: it may come a moment later than its head."""
 LONGEST_ANSWER = 2048
 """Bytes of an answer's record; long texts of a refusal are cut."""
 ANSWERS_CAPACITY = 256 * 1024
@@ -54,10 +50,8 @@ _FIXED = struct.Struct("=QQ")
 
 
 def create(places: int) -> int:
-    """Create a mailbox with a place for each of so many streams; return its memfd, sealed in its size."""
-    descriptor = os.memfd_create("dxlrun-mailbox", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    os.ftruncate(descriptor, _size(places))
-    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+    """Create a mailbox with a place for each of so many streams; return its descriptor."""
+    descriptor = shared_memory.create("mailbox", _size(places))
     with mmap.mmap(descriptor, 0) as mapped, memoryview(mapped) as memory:
         _FIXED.pack_into(memory, 0, _MAGIC, places)
         operations, *rings = _parts(memory, places)
@@ -87,7 +81,7 @@ def _parts(memory: memoryview, places: int) -> list[memoryview]:
 
 def _mapped(descriptor: int) -> tuple[memoryview, list[memoryview]]:
     """Map a mailbox; return the words of its header, and its parts. Raises ValueError when it is none."""
-    memory = memoryview(mmap.mmap(descriptor, 0))
+    memory = shared_memory.mapped(descriptor)
     magic, places = _FIXED.unpack_from(memory)
     if magic != _MAGIC or len(memory) != _size(places):
         raise ValueError("this descriptor is not a mailbox of this version")
@@ -123,8 +117,9 @@ class MailboxWriter:
         if len(payload) > LONGEST_SET_POINT:
             return False
         self._places[place].append(RecordKind.TAGGED, payload)
-        fence()  # last: the loop looks at the places only after it has changed
-        self._words[_GENERATION] += 1
+        store(
+            self._words, _GENERATION, self._words[_GENERATION] + 1
+        )  # last: then the loop looks at the places
         return True
 
 
@@ -137,7 +132,6 @@ class Mailbox:
         self._places = [RingReader(place) for place in places]
         self._answers = answers
         self._generation = 0
-        self._looks = 0  # cycles in a row in which something was not whole
         self.dropped = 0
 
     def take(self) -> Sequence[Command]:
@@ -147,40 +141,29 @@ class Mailbox:
         if lane.head <= lane.position and generation == self._generation:
             return ()
         commands: list[Command] = []
-        begin, awaits = lane.position, False
+        begin = lane.position
         for _ in range(MOST_PER_CYCLE):
-            if lane.head <= lane.position or lane.position - begin > MOST_BYTES:
+            if lane.position - begin > MOST_BYTES or (record := lane.read()) is None:
                 break
-            record = lane.take()
-            if record is None:
-                if awaits := self._looks < MOST_LOOKS:
-                    break
-                lane.skip()  # where the next one begins is not known
             self._decode(record, commands)
         lane.report_taken()
         if generation != self._generation:
-            fence()
-            self._generation = generation
+            self._generation = load(self._words, _GENERATION)  # the places are no older
             for place in self._places:
                 if place.head > place.position:
-                    record = place.newest()
-                    if record is None and self._looks < MOST_LOOKS:
-                        awaits, self._generation = True, generation - 1  # looks again in the next cycle
-                        continue
-                    self._decode(record, commands)
-        self._looks = self._looks + 1 if awaits else 0
+                    self._decode(place.newest() or Gap(1), commands)
         return commands
 
     def answer(self, number: int, answer: Answer) -> None:
         """Answer a command of the gateway; long texts in a refusal's fields are cut."""
         self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
 
-    def _decode(self, record: Record | None, commands: list[Command]) -> None:
-        found = None if record is None else _found(record)
+    def _decode(self, record: Record | Gap, commands: list[Command]) -> None:
+        found = _found(record) if isinstance(record, Record) else None
         if isinstance(found, Command):
             commands.append(found)
         else:
-            self.dropped += 1
+            self.dropped += record.lost if isinstance(record, Gap) else 1
 
 
 class Answers:

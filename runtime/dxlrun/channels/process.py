@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import io
-import mmap
 import os
 import select
 import signal
@@ -63,11 +62,6 @@ def memory_file(name: str, content: bytes = b"") -> int:
     descriptor = os.memfd_create(name)
     os.pwrite(descriptor, content, 0)
     return descriptor
-
-
-def shared_memory(descriptor: int) -> memoryview:
-    """Map a nameless file to be written by one process and read by others."""
-    return memoryview(mmap.mmap(descriptor, 0))
 
 
 def whole(descriptor: int) -> bytes:

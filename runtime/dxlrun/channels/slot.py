@@ -8,21 +8,19 @@ Layout of the memory, little-endian, everything aligned to 8 bytes:
 
 The writer fills the sample that is not the newest, and counts it when it is whole: so a reader finds the
 newest one untouched unless two more come while it copies, which the number and the CRC-32 show. It then keeps
-what it had, and looks again in the next cycle. Fences keep the order on every processor, see `fence.py`.
+what it had, and looks again in the next cycle.
 """
 
 from __future__ import annotations
 
-import fcntl
-import mmap
-import os
 from enum import IntEnum, unique
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.fence import fence
+from dxlrun.channels import shared_memory
+from dxlrun.channels.shared_memory import load, store
 
 Floats = NDArray[np.float64]
 LONGEST_TEXT = 480
@@ -54,22 +52,13 @@ def size(values: int) -> int:
 
 
 def create(name: str, values: int) -> int:
-    """Return the descriptor of a fresh slot in memory without a name (memfd)."""
-    descriptor = os.memfd_create(f"dxlrun-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    os.ftruncate(descriptor, size(values))
-    seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL  # nor may a driver add another one
-    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
-    return descriptor
+    """Return the descriptor of a fresh slot."""
+    return shared_memory.create(name, size(values))
 
 
 def private(values: int) -> memoryview:
     """Return a fresh slot in the memory of this process."""
     return memoryview(bytearray(size(values)))
-
-
-def shared(descriptor: int) -> memoryview:
-    """Map a slot that another process reads or writes."""
-    return memoryview(mmap.mmap(descriptor, 0))
 
 
 class _Slot:
@@ -107,8 +96,7 @@ class SlotWriter(_Slot):
         np.copyto(self._floats, values)
         sample[-1] = crc32(self._bytes)
         np.copyto(self._places[number & 1], sample)
-        fence()  # the whole sample is visible before its count
-        self._words[_SAMPLES] = number
+        store(self._words, _SAMPLES, number)  # the whole sample is seen before its count
 
     def say(self, state: SlotState, text: str) -> None:
         """Leave what the writer does now, and a sentence, in place of the one before."""
@@ -116,9 +104,8 @@ class SlotWriter(_Slot):
         words, number = self._text_words, (self._words[_TEXTS] + 1 & _LAST) or 1
         words[0], words[1], words[2] = number, len(data), crc32(data)
         self._text[: len(data)] = data
-        fence()
-        self._words[_STATE] = state
-        self._words[_TEXTS] = number
+        store(self._words, _STATE, state)
+        store(self._words, _TEXTS, number)
 
 
 class SlotReader(_Slot):
@@ -147,11 +134,9 @@ class SlotReader(_Slot):
 
     def read(self) -> int | None:
         """Copy the newest sample; return its time, ns, or None where there is no newer one, or it is torn."""
-        number = self._words[_SAMPLES]
-        if number == self._seen:
+        if self._words[_SAMPLES] == self._seen:
             return None
-        sample = self._sample
-        fence()  # the sample is no older than its count
+        number, sample = load(self._words, _SAMPLES), self._sample  # which is no older than its count
         np.copyto(sample, self._places[number & 1])
         if sample.item(0) != number or sample.item(-1) != crc32(self._bytes):
             return None  # two more came meanwhile: they are there for the next look
@@ -160,11 +145,9 @@ class SlotReader(_Slot):
 
     def hear(self) -> str:
         """Return the newest sentence if it was not returned before; empty where there is none."""
-        number = self._words[_TEXTS]
+        number, words = load(self._words, _TEXTS), self._text_words
         if number == self._spoken:
             return ""
-        fence()
-        words = self._text_words
         data = bytes(self._text[: min(words[1], LONGEST_TEXT)])
         if words[0] != number or crc32(data) != words[2]:
             return ""  # another one is being written

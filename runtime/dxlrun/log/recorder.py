@@ -57,9 +57,6 @@ class Recorder:
                 break
         while self._turn():
             self._supervisor.send(Draining())
-        for name, ring in self._rings:
-            if lost := ring.give_up():
-                self._log.gap(name, lost)
         self._next_sample_ns = 0
         self._sample_machine()
         summary = self._log.close()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from dxlrun.channels import fence
+from dxlrun.channels import shared_memory
 from dxlrun.channels.compiled import compiled
 from dxlrun.control import gate
 from dxlrun.control.realtime import (
@@ -27,6 +27,7 @@ from dxlrun.control.realtime import (
     lockable_bytes,
     user,
 )
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
 from dxlrun.errors import StartUpError
 
@@ -109,7 +110,7 @@ def may_schedule() -> bool:
 
 def _compiled() -> str:
     try:
-        for source in (fence.SOURCE, gate.SOURCE):
+        for source in (shared_memory.SOURCE, kernel.SOURCE, gate.SOURCE):
             compiled(source, PyDLL)
     except StartUpError as error:
         return f"{error}"

@@ -28,6 +28,7 @@ from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, Standstil
 from dxlrun.channels.packets import PacketBatch, salvage
 from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.channels.ring import RingReader, RingWriter
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.dynamixel.device.safe_values import make_safe
@@ -168,7 +169,7 @@ class SafeStop:
     def _take_over(self, descriptors: Sequence[int]) -> tuple[Lines, PacketBatch]:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
         job, memory = self._job, self._job.memory
-        cycle = salvage(process.shared_memory(memory.desk), RingReader(memory.packets).head, self._ring)
+        cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(
             [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
         )

@@ -19,7 +19,7 @@ import msgspec
 from msgspec import structs
 from msgspec.json import Decoder
 
-from dxlrun.channels import process, slot
+from dxlrun.channels import process
 from dxlrun.channels.commands import CommandRing
 from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
@@ -29,6 +29,7 @@ from dxlrun.channels.messages import MessageRing
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.process import LineReturned, MessageChannel
 from dxlrun.channels.ring import RingWriter
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
@@ -165,7 +166,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
         kept=msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates),
-        slots=[slot.shared(descriptor) for descriptor in job.memory.sensors],
+        slots=[mapped(descriptor) for descriptor in job.memory.sensors],
     )
     heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)  # what is taken over may have torque
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
@@ -210,7 +211,7 @@ def main() -> None:
     heartbeat = Heartbeat(job.memory.heartbeat)
     happened = RingWriter(job.memory.events)
     events = EventRing(happened, clock)
-    packets = PacketBatch(RingWriter(job.memory.packets), process.shared_memory(job.memory.desk))
+    packets = PacketBatch(RingWriter(job.memory.packets), mapped(job.memory.desk))
     sinks = Sinks(
         RingWriter(job.memory.cycles),
         packets,

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.channels import fence, heartbeat, mailbox, process, ring, slot
+from dxlrun.channels import heartbeat, mailbox, process, ring, shared_memory, slot
 from dxlrun.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.channels.events import LONGEST_EVENT, event_capacity
@@ -46,9 +46,10 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     """Create the memory of a run, its rings sized for ten seconds of this robot.
 
-    `kept`: what its controllers kept in earlier runs. Raises StartUpError where its order is not ensured.
+    `kept`: what its controllers kept in earlier runs. Raises StartUpError where what shares it was
+    not compiled.
     """
-    fence.library()
+    shared_memory.library()
     servos = sum(len(bus.servos) for bus in plan.buses)
     sensed = sensed_bodies(plan)
     period, cycle = plan.loop.period_ns, plan.loop.layout.size

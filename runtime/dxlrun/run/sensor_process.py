@@ -16,8 +16,9 @@ from typing import NoReturn
 import msgspec
 import numpy as np
 
-from dxlrun.channels import process, slot
+from dxlrun.channels import process
 from dxlrun.channels.process import Failed, MessageChannel, Ready
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
 from dxlrun.contract.body import LinkMotion, Shafts
 from dxlrun.control.controllers.plugins import load_plugins
@@ -102,10 +103,10 @@ def main() -> int:
 
 
 def _run(job: SensorJob, channel: MessageChannel[msgspec.Struct]) -> int:
-    plan, writer = job.plan, SlotWriter(slot.shared(job.slot))
+    plan, writer = job.plan, SlotWriter(mapped(job.slot))
     body = None
     if job.bodies is not None:
-        body = RemoteBody(job.bodies, SlotReader(slot.shared(job.shafts)))
+        body = RemoteBody(job.bodies, SlotReader(mapped(job.shafts)))
     try:
         sensor = load_plugins().built_sensor(plan)
     except PlugInError as error:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from msgspec.structs import replace
 
-from dxlrun.channels import process, slot
+from dxlrun.channels import process
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.events import Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase, Standstill
@@ -35,6 +35,7 @@ from dxlrun.channels.process import (
     RunMemory,
     Stop,
 )
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.realtime import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
@@ -113,7 +114,7 @@ class _SensorProcess:
             self.child = None
             self.restart_s = time.monotonic() + _RESTART_S
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-            writer = SlotWriter(slot.shared(self.memory.sensors[self.index]))
+            writer = SlotWriter(mapped(self.memory.sensors[self.index]))
             writer.say(SlotState.ENDED, f"its process ended ({how}), another one is started")
 
     def end(self) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from msgspec.json import Decoder
 
-from dxlrun.channels import process, slot
+from dxlrun.channels import process
+from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import DxlrunError
@@ -32,7 +33,7 @@ def main() -> int:
         add_control_table(text)
     with Ledger(Path(job.ledger) if job.ledger else None, keep=False) as ledger:
         try:
-            shafts = None if job.shafts < 0 else SlotWriter(slot.shared(job.shafts))
+            shafts = None if job.shafts < 0 else SlotWriter(mapped(job.shafts))
             server = Server(job.config, ledger, starter, shafts)
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             starter.send(SimulationMessage(error=str(error)))

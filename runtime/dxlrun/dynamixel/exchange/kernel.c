@@ -12,7 +12,6 @@
 #include <errno.h>
 #include <math.h>
 #include <poll.h>
-#include <stdatomic.h>
 #include <stdint.h>
 #include <string.h>
 #include <time.h>
@@ -892,95 +891,6 @@ void dxl_abandon(Kernel *k)
         k->lines[i].done = k->lines[i].have = k->lines[i].pieces = 0;
     }
 }
-
-/* Rings: channels/ring.py has their layout, and packets.py that of a batch */
-
-#ifdef AT_FENCE /* tests look at the memory there */
-void (*dxl_at_fence)(void);
-#define FENCE() dxl_at_fence()
-#else
-#define FENCE() atomic_thread_fence(memory_order_acq_rel)
-#endif
-#define RING_HEADER 64
-#define ENTRY_HEADER 24
-#define PACKETS 2 /* RecordKind */
-#define MARK_BITS 16
-enum { HEAD = 3, INTENT, LATEST, TAKEN, NUMBER };
-enum { USED, POSITION, EARLIER, CYCLE };
-
-static uint32_t crc32_table[16][256];
-
-__attribute__((constructor)) static void fill_crc32_table(void)
-{
-    for (uint32_t i = 0; i < 256; i++) {
-        uint32_t crc = i;
-        for (int bit = 0; bit < 8; bit++)
-            crc = crc & 1 ? crc >> 1 ^ 0xedb88320 : crc >> 1;
-        crc32_table[0][i] = crc;
-    }
-    for (int n = 1; n < 16; n++)
-        for (int i = 0; i < 256; i++)
-            crc32_table[n][i] = crc32_table[n - 1][i] >> 8 ^ crc32_table[0][crc32_table[n - 1][i] & 0xff];
-}
-
-/* CRC-32 as zlib's, sixteen bytes at a time; begun and ended with all bits inverted. */
-static uint32_t crc32(uint32_t crc, const uint8_t *data, uint64_t size)
-{
-    for (; size >= 16; size -= 16, data += 16) {
-        uint64_t words[2]; /* little-endian, as all that processes share */
-        memcpy(words, data, 16);
-        words[0] ^= crc;
-        crc = 0;
-#pragma GCC unroll 8
-        for (int n = 0; n < 8; n++)
-            crc ^= crc32_table[15 - n][words[0] >> 8 * n & 0xff] ^ crc32_table[7 - n][words[1] >> 8 * n & 0xff];
-    }
-    while (size--)
-        crc = crc >> 8 ^ crc32_table[0][(crc ^ *data++) & 0xff];
-    return crc;
-}
-
-/* Copies one record behind the last of a ring; returns the position behind it, -1 when it is too long. What bounds
- * it comes with the call: other processes share the memory. */
-int64_t dxl_append(volatile uint64_t *ring, uint64_t capacity, uint64_t longest, uint32_t kind,
-                   const uint8_t *payload, uint64_t size)
-{
-    uint64_t position = ring[HEAD], end = position + (ENTRY_HEADER + size + 7) / 8 * 8;
-    uint8_t *entry = (uint8_t *)(uintptr_t)ring + RING_HEADER + position % capacity;
-    uint64_t mark = position + 1;
-    uint32_t fields[3] = {(uint32_t)ring[NUMBER], (uint32_t)size, kind};
-    if (size > longest)
-        return -1;
-    ring[INTENT] = end;
-    FENCE(); /* a reader of what is overwritten now sees the intent before the first byte changes */
-    memcpy(entry, &mark, 8);
-    memcpy(entry + 8, fields, 12);
-    uint32_t crc = ~crc32(crc32(~0u, entry, 20), payload, size);
-    memcpy(entry + 20, &crc, 4);
-    memcpy(entry + ENTRY_HEADER, payload, size);
-    FENCE(); /* and the whole record before the head behind it */
-    ring[NUMBER] = fields[0] + 1u;
-    ring[LATEST] = position;
-    ring[HEAD] = end;
-    return (int64_t)end;
-}
-
-/* Hands on the batch of packets that was collected. */
-void dxl_commit(volatile uint64_t *ring, uint64_t capacity, uint64_t longest, volatile uint64_t *desk)
-{
-    if (desk[USED]) {
-        const uint8_t *batch = (const uint8_t *)(uintptr_t)(desk + EARLIER);
-        int64_t position = dxl_append(ring, capacity, longest, PACKETS, batch, 16 + desk[USED]);
-        desk[USED] = 0; /* first: nothing is found twice where this process dies here */
-        desk[POSITION] = (uint64_t)position;
-    }
-    uint64_t number = desk[CYCLE] >> MARK_BITS;
-    desk[CYCLE] = number << MARK_BITS; /* from here on the earlier one means nothing */
-    desk[EARLIER] = number;
-}
-
-/* Orders the memory accesses before it and behind it for other processes: channels/fence.py. */
-void dxl_fence(void) { atomic_thread_fence(memory_order_acq_rel); }
 
 /* Checksum of this source: kernel.py takes the structs from it. */
 uint32_t dxl_source(void) { return SOURCE_CRC; }

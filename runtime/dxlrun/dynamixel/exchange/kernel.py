@@ -12,15 +12,16 @@ from collections.abc import Callable, Iterator, Sequence
 from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.compiled import structs
+from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Commands, Floats
-from dxlrun.channels.fence import SOURCE, array_of, library
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
+from dxlrun.channels.shared_memory import array_of
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
@@ -53,7 +54,8 @@ _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
 
-
+SOURCE = Path(__file__).with_name("kernel.c")
+LIBRARY = SOURCE.with_name("libkernel.so")  # Where the build puts it
 STRUCTS = structs(SOURCE.read_text())
 _Field, _Servo, _DeviceField, _Block, _Device = (
     STRUCTS[name] for name in ("Field", "Servo", "DeviceField", "Block", "Device")
@@ -61,6 +63,23 @@ _Field, _Servo, _DeviceField, _Block, _Device = (
 _Part, _Packet, _Read, _Cell, _SyncWrite = (
     STRUCTS[name] for name in ("Part", "Packet", "Read", "Cell", "SyncWrite")
 )
+
+
+def library(path: Path | None = None) -> ctypes.CDLL:
+    """Return the functions of the compiled kernel. Raises StartUpError where it was not built, or of another
+    source."""
+    found = compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
+    for name, result, arguments in (
+        ("read", c_int32, (c_void_p,)),
+        ("write", c_int32, (c_void_p,)),
+        ("abandon", None, (c_void_p,)),
+        ("take", None, (c_void_p, c_int32, c_int32, c_void_p, c_int64)),
+        ("settle", c_int32, (c_void_p, c_int64)),
+        ("show", None, (c_void_p, c_int64)),
+    ):
+        function = getattr(found, f"dxl_{name}")
+        function.argtypes, function.restype = arguments, result
+    return found
 
 
 def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
@@ -186,7 +205,7 @@ class Kernel:
         goals: Commands,
         packets: PacketLog,
     ) -> None:
-        self._library = library(ctypes.CDLL)
+        self._library = library()
         self._buses = lines.buses
         self._shared = tuple(shared)
         self._packets = packets
