@@ -16,6 +16,7 @@ import pytest
 from tests.kit.browser import CHROMIUM, Browser
 
 import dxlrun
+from dxlrun.cli.verbs import names as names_of_verbs
 
 ROOT = Path(__file__).parents[1]
 
@@ -64,6 +65,11 @@ def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
         == {*dxlrun.__all__, "simulated_robot"} - units - values
     )
     assert "#### `send`" in names
+    verbs = (sources / "reference/commands.md").read_text()
+    sections = dict(re.findall(r"^### ([a-z -]+)\n(.*?)(?=^### |\Z)", verbs, re.MULTILINE | re.DOTALL))
+    assert {name.split()[0] for name in sections} == set(names_of_verbs())
+    assert {"bench rate", "experiment tracking"} <= set(sections)
+    assert all(f"| `{option}" in sections["send"] for option in ("--wait", "--in STR", "--json", "TARGET"))
 
 
 class Names(HTMLParser):
