@@ -35,7 +35,7 @@ def package(tmp_path: Path) -> Path:
 def test_its_excerpts_are_in_the_package_and_its_sketches_are_python(package: Path) -> None:
     texts = [path.read_text() for path in package.rglob("*.py")]
     excerpts = [block for block in BLOCKS if any(block in text for text in texts)]
-    assert len(excerpts) == 5
+    assert len(excerpts) == 4
     for sketch in BLOCKS:
         if sketch not in excerpts:
             compile(dedent(sketch), "controllers.md", "exec")

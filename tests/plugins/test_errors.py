@@ -18,7 +18,7 @@ TYPE_MARK = "example.yaml:12:16: "
 NAME_MARK = "example.yaml:12:3: "
 WHO = "plug-in easing of dxlrun-easing 0.1.0"
 NOT_OFFERED = "no plug-in offers the controller type easing_position_controller of head; "
-CONTROLLER = (EXAMPLE / "src/dxlrun_easing/controller.py").read_text()
+CONTROLLER = (Path(__file__).parent / "plain/controller.py").read_text()
 PLUGIN = (EXAMPLE / "src/dxlrun_easing/plugin.py").read_text()
 
 Told = Callable[..., list[str]]

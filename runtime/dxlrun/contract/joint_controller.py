@@ -61,7 +61,7 @@ class JointController(Controller[JointParameters]):
     number a joint: which of them it has decides what it claims. All else is of Controller.
     """
 
-    Parameters: ClassVar[type[ParametersModel]] = JointParameters
+    Parameters: ClassVar[type[JointParameters]] = JointParameters
     start: Floats
     """Where its joints were when it began: what was last sent to them, else what was read."""
     _readings: ClassVar[tuple[str, ...]] = ()
@@ -86,7 +86,7 @@ class JointController(Controller[JointParameters]):
         )
 
     def begin(self) -> None:
-        """Make what is kept from cycle to cycle: called before the first cycle of each activation."""
+        """Make what is kept from cycle to cycle: called at each activation, as soon as it can begin."""
 
     def positions(self, time: float, dt: float) -> Floats:
         """Return a position for each joint, `time` s after it began and `dt` s after the last call."""
@@ -119,43 +119,38 @@ class JointController(Controller[JointParameters]):
         """Find what each method commands."""
         super().on_configure(context)
         laws, commands = type(self), context.commands
+        self._began_ns, self._first = -1, True
         self._laws = tuple(
             (name, getattr(laws, name), getattr(commands, LAWS[name])) for name in laws_of(laws)
         )
 
     def on_activate(self, time_ns: int) -> None:
         """Begin anew."""
-        self.start = np.full(len(self.context.joints), np.nan)
         self._began_ns = -1
-        self._settling = True
+        self._begin(time_ns)
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command what its methods return. Raises ControllerFault where that is not one number a joint."""
-        if self._settling:
-            self._take_start()
-            if self._began_ns < 0:
-                if np.isnan(self.context.reads).any():
-                    return  # nothing is commanded yet: the joints hold
-                self._began_ns = time_ns
-                self.begin()
+        if self._began_ns < 0 and not self._begin(time_ns):
+            return  # nothing is commanded yet: the joints hold
         time, dt = (time_ns - self._began_ns) * 1e-9, period_ns * 1e-9
         for name, law, command in self._laws:
             values = _one_a_joint(law(self, time, dt), name, self.context.joints)
-            if self._settling:  # later on, NaN behind a number is found for every controller
-                self._check_known(name, values)
+            if self._first and np.isnan(values).any():  # NaN after a number is found for every controller
+                joint = self.context.joints[int(np.argmax(np.isnan(values)))]
+                raise ControllerFault(f"returned NaN for {joint} from {name}; return a number")
             command[:] = values
-        self._settling = self._settling and bool(np.isnan(self.start).any())
+        self._first = False
 
-    def _take_start(self) -> None:
-        """Find where the joints are; those that were not known yet begin where they are heard first."""
-        for known in (self.context.goals.position, self.context.states.position):
-            np.copyto(self.start, known, where=np.isnan(self.start))
-
-    def _check_known(self, name: str, values: Floats) -> None:
-        wrong = np.isnan(values) & ~np.isnan(self.start)
-        if wrong.any():
-            joint = self.context.joints[int(np.argmax(wrong))]
-            raise ControllerFault(f"returned NaN for {joint} from {name}; return a number")
+    def _begin(self, time_ns: int) -> bool:
+        """Begin when its joints and all that it reads are known; return whether they are."""
+        sent, measured = self.context.goals.position, self.context.states.position
+        self.start = np.where(np.isnan(sent), measured, sent)
+        if np.isnan(self.start).any() or np.isnan(self.context.reads).any():
+            return False
+        self._began_ns, self._first = time_ns, True
+        self.begin()
+        return True
 
 
 def laws_of(controller: type[JointController]) -> tuple[str, ...]:
