@@ -51,6 +51,7 @@ ASKED = [
     ("GET", "/robot", None, "/robot"),
     ("GET", "/states", None, "/states"),
     ("GET", "/frames", None, "/frames"),
+    ("GET", "/log-header", None, "/log-header"),
     ("GET", "/events?after=0", None, "/events"),
     ("GET", "/topics", None, "/topics"),
     ("GET", "/goals", None, "/goals"),

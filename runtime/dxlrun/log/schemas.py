@@ -7,6 +7,8 @@ PlotJuggler and Rerun open a log without conversion. Every channel carries the R
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
@@ -15,6 +17,9 @@ from dxlrun.messages import JointState, String
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.plan.recording_plan import RecordingPlan
+
+if TYPE_CHECKING:
+    from dxlrun.plan.robot_plan import Plan
 
 PROFILE = "ros2"
 ENCODING = "cdr"
@@ -287,6 +292,27 @@ class LogHeader(msgspec.Struct, frozen=True):
     """The robot's URDF."""
     frames: FramesPlan | None = None
     """What moves its frames, and how they are logged; None: it has no URDF."""
+
+    @classmethod
+    def of(cls, plan: Plan, epoch_offset_ns: int) -> LogHeader:
+        """Return what the messages of a run are made with; attachments and metadata are left out."""
+        loop = plan.loop
+        return cls(
+            robot=plan.robot,
+            joints=tuple(joint.name for joint in loop.joints),
+            buses=tuple(bus.name for bus in plan.buses),
+            controllers=tuple(
+                LoggedController(controller.name, controller.joints, controller.publishes)
+                for controller in loop.controllers
+            ),
+            period_ns=loop.period_ns,
+            epoch_offset_ns=epoch_offset_ns,
+            references=loop.references,
+            sources=loop.source_states,
+            device_commands=loop.device_commands,
+            robot_description=plan.urdf,
+            frames=plan.frames,
+        )
 
     @property
     def layout(self) -> CycleLayout:

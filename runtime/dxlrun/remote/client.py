@@ -36,6 +36,7 @@ from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, running, so
 if TYPE_CHECKING:
     from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import FrameTree
+    from dxlrun.log.schemas import LogHeader
     from dxlrun.remote.live.states import RobotStates
 
 __all__ = [
@@ -182,6 +183,12 @@ class RemoteRobot:
         moved = {name: value for name, value in positions.items() if name in tree.moved}
         sources = dict(zip(states.source_states, states.source_state.tolist(), strict=True))
         return tree.pose(of, relative_to, moved, tree.orientation(sources))
+
+    def log_header(self) -> LogHeader:
+        """Return what the messages of the log are made with, see `log.run_messages`."""
+        from dxlrun.log.schemas import LogHeader  # numpy: most clients make none
+
+        return self._decoded(self._asked(requests.LOG_HEADER), LogHeader)
 
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""

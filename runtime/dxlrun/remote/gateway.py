@@ -35,6 +35,7 @@ from dxlrun.channels.loop_requests import Cancel, Rate, RebootRequest, Switch, T
 from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
+from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.asked import Allowance, Asked, peer, received
 from dxlrun.remote.computation import computed
@@ -262,6 +263,12 @@ class GatewayApp:
         """Return the URDF and what moves it: a client computes where frames lie by itself."""
         plan = self._link.plan
         return Frames(plan.urdf, plan.frames)
+
+    @_answers(requests.LOG_HEADER)
+    async def log_header(self, asked: Asked[None]) -> Response:
+        """Return what the log's messages are made with: joints, controllers, what a cycle's record has."""
+        header = LogHeader.of(self._link.plan, self._link.topics.epoch_offset_ns)
+        return Response(msgspec.json.encode(header), media_type="application/json")
 
     @_answers(requests.EVENTS)
     async def events(self, asked: Asked[None]) -> Events:

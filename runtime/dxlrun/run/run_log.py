@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
@@ -18,7 +19,7 @@ from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
 from dxlrun.log.log_file import LOG_MODE
 from dxlrun.log.part_writer import FOLDER_MODE
-from dxlrun.log.schemas import KEPT_ATTACHMENT, LoggedController, LogHeader
+from dxlrun.log.schemas import KEPT_ATTACHMENT, LogHeader
 from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 
@@ -34,19 +35,8 @@ def log_header(
     """
     scheduler = plan.loop.scheduler
     machine = platform.uname()
-    return LogHeader(
-        robot=plan.robot,
-        joints=tuple(joint.name for joint in plan.loop.joints),
-        buses=tuple(bus.name for bus in plan.buses),
-        controllers=tuple(
-            LoggedController(controller.name, controller.joints, controller.publishes)
-            for controller in plan.loop.controllers
-        ),
-        period_ns=plan.loop.period_ns,
-        epoch_offset_ns=epoch_offset_ns,
-        references=plan.loop.references,
-        sources=plan.loop.source_states,
-        device_commands=plan.loop.device_commands,
+    return replace(
+        LogHeader.of(plan, epoch_offset_ns),
         attachments={
             "robot.yaml": plan.source_text.encode(),
             "plan.json": to_json(plan),
@@ -54,8 +44,6 @@ def log_header(
             **{f"included/{name}": text.encode() for name, text in plan.included.items()},
             **{f"motion/{name}": text.encode() for name, text in plan.played.items()},
         },
-        robot_description=plan.urdf,
-        frames=plan.frames,
         metadata={
             "run": {
                 "robot_file": plan.source_file,

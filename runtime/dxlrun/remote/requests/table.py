@@ -89,6 +89,7 @@ Done: TypeAlias = Executed[int]
 ROBOT = Request("GET", "/robot", NoneType, RobotInfo, MOST_LOOKS)
 STATES = Request("GET", "/states", NoneType, bytes, MOST_LOOKS)
 FRAMES = Request("GET", "/frames", NoneType, Frames, MOST_LOOKS)
+LOG_HEADER = Request("GET", "/log-header", NoneType, bytes, MOST_LOOKS)
 EVENTS = Request("GET", "/events", NoneType, Events, MOST_LOOKS, ("after",))
 TOPICS = Request("GET", "/topics", NoneType, Topics, MOST_LOOKS)
 STREAM = Request("GET", "/stream", NoneType, bytes, MOST_LOOKS, ("topic", "newest", "rate", "once"))

@@ -1,0 +1,225 @@
+"""Messages of a run: the log's topics, made of the records of the rings, for a file or a live viewer."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.channels.events import Event
+from dxlrun.channels.messages import OpenedTopic, TopicMessage
+from dxlrun.channels.packets import BatchedPacket, split_packets
+from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.channels.tagged import decode
+from dxlrun.log import schemas
+from dxlrun.log.packing.bus_messages import pack_packets
+from dxlrun.log.packing.diagnostics import Diagnostics
+from dxlrun.log.packing.frame_messages import Stamp, frame_messages
+from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.messages.definition import MessageType
+
+_MOST_PACKETS, _MOST_CYCLES = 1000, 250
+"""In one message. The index has 16 bytes a message, and arrays of many cycles compress better."""
+JOINT_COMMANDS_NS = 10_000_000
+"""In so much time there is one message of /joint_commands; /cycle has the goals of each cycle."""
+
+
+class RunMessages(ABC):
+    """Makes the messages of all topics; what is done with them is a subclass' matter."""
+
+    def __init__(self, header: LogHeader) -> None:
+        self.header = header
+        self._layout = header.layout
+        self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
+        """Channels with one message, and what makes it of the time of the first record."""
+        self.topics: dict[bytes, None] = {}
+        """Records of the topics that were opened."""
+        self._topic_channels: dict[int, int] = {}
+        """Channels of topics by their numbers."""
+        self._machine_channel: int | None = None
+        self._takers: dict[int, Callable[[Payload], None]] = {
+            RecordKind.CYCLE: self.cycle,
+            RecordKind.PACKETS: self._packets,
+            RecordKind.TAGGED: self._tagged,
+        }
+        self._diagnostics = Diagnostics(header.joints)
+        messages = (schemas.EVENT, schemas.ROS_LOG, schemas.JOINT_STATE, schemas.COMMAND)
+        self._event, self._ros_log, self._joint_state, self._command = map(Codec, messages)
+
+    @abstractmethod
+    def _channel(self, topic: str, message: MessageType, *, latched: bool = False) -> int:
+        """Return a new channel; `latched`: its one message is for late readers too."""
+
+    @abstractmethod
+    def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
+        """Take a message: its time on the run's clock and as ns since 1970, and CDR."""
+
+    def _add(self, channel: int, t_ns: int, data: bytes) -> None:
+        if self._firsts:  # the run begins with its first record, not when the log is opened
+            firsts, self._firsts = self._firsts, []
+            for first, message in firsts:
+                self._add(first, t_ns, message(self._stamp(t_ns)))
+        self._put(channel, t_ns, max(0, t_ns + self.header.epoch_offset_ns), data)
+
+    def _open_channels(self) -> None:
+        """Open the channels that every run has."""
+        header = self.header
+        self._cycle_channel = self._channel(schemas.CYCLE_TOPIC, schemas.CYCLE)
+        self._activation_channel = self._channel(schemas.ACTIVATION_TOPIC, schemas.CYCLE)
+        self._taken_channel = self._channel(schemas.COMMANDS_TOPIC, schemas.COMMAND)
+        self._states_channel = self._channel(schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
+        self._commands_channel = self._channel(schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
+        self._diagnostics_channel = self._channel(schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
+        self._event_channel = self._channel(schemas.EVENT_TOPIC, schemas.EVENT)
+        self._rosout_channel = self._channel(schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
+        self._bus_channels = [
+            self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
+        ]
+        self._waiting: list[list[BatchedPacket]] = [[] for _ in header.buses]
+        """Packets that are not in a message yet, for each bus."""
+        self._oldest: int | None = None
+        """Cycle of the first of them."""
+        self._commands_slot: int | None = None
+        self._publishers = [
+            (
+                1 << index,
+                controller.joints,
+                np.array([header.joints.index(j) for j in controller.joints], int),
+            )
+            for index, controller in enumerate(header.controllers)
+            if schemas.JOINT_STATES_TOPIC in controller.publishes
+        ]
+        if header.robot_description is not None:
+            channel = self._channel(schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched=True)
+            description = Codec(schemas.STRING).pack(header.robot_description)
+            self._firsts.append((channel, lambda _: description))
+        self._frames = frame_messages(header)
+        if self._frames is not None:
+            self._frames_channel = self._channel(schemas.FRAMES_TOPIC, schemas.FRAMES)
+            if self._frames.any_still:
+                channel = self._channel(schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched=True)
+                self._firsts.append((channel, self._frames.still))
+
+    def cycle(self, payload: Payload) -> None:
+        """Make the messages of a cycle: /cycle, its goals and frames, and the states that controllers marked.
+
+        Of the record before the first cycle /activation.
+        """
+        data = bytes(payload)
+        record = np.frombuffer(data, dtype=self._layout.dtype)[0]
+        written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
+        if int(record["cycle"]) < 0:
+            self._add(self._activation_channel, written_ns, ENCAPSULATION + data)
+            return
+        self._add(self._cycle_channel, written_ns, ENCAPSULATION + data)
+        published = int(record["published"])
+        for bit, joints, rows in self._publishers:
+            if published & bit:
+                self._joint_states(read_ns, joints, record, rows)
+        frames = None if self._frames is None else self._frames.of(record, self._stamp(read_ns))
+        if frames is not None:
+            self._add(self._frames_channel, read_ns, frames)
+        slot = int(record["scheduled_ns"]) // JOINT_COMMANDS_NS
+        if slot != self._commands_slot:
+            self._commands_slot = slot
+            self._joint_commands(written_ns, record)
+        diagnostics = self._diagnostics.of(record, written_ns, self._stamp(written_ns))
+        if diagnostics is not None:
+            self._add(self._diagnostics_channel, written_ns, diagnostics)
+
+    def _joint_commands(self, t_ns: int, record: np.void) -> None:
+        goals = (record[name] for name in ("goal_position", "goal_velocity", "goal_effort"))
+        data = self._joint_state.pack((self._stamp(t_ns), ""), self.header.joints, *goals)
+        self._add(self._commands_channel, t_ns, data)
+
+    def _joint_states(
+        self, t_ns: int, joints: tuple[str, ...], record: np.void, rows: NDArray[np.int_]
+    ) -> None:
+        stale = ~record["valid"][rows]
+        values = []
+        for name in ("position", "velocity", "effort"):
+            row = record[name][rows]
+            row[stale] = np.nan
+            values.append(row)
+        data = self._joint_state.pack((self._stamp(t_ns), ""), joints, *values)
+        self._add(self._states_channel, t_ns, data)
+
+    def _stamp(self, t_ns: int) -> Stamp:
+        return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
+
+    def _packets(self, payload: Payload) -> None:
+        """Take one batch of packets; those of many cycles become one message, for a small index."""
+        for packet in split_packets(payload):
+            if self._oldest is None:
+                self._oldest = packet[0]
+            packets = self._waiting[packet[1]]
+            packets.append(packet)
+            if len(packets) >= _MOST_PACKETS or packet[0] - self._oldest >= _MOST_CYCLES:
+                self._write_packets()
+
+    def _write_packets(self) -> None:
+        """Write the packets that wait, one message a bus, each at the time of its last packet."""
+        self._oldest = None
+        for channel, packets in zip(self._bus_channels, self._waiting, strict=True):
+            if packets:
+                data, t_ns = pack_packets(packets), packets[-1][5]
+                packets.clear()
+                self._add(channel, t_ns, data)
+
+    def _tagged(self, payload: Payload) -> None:
+        match decode(payload):
+            case Event() as event:
+                self.event(event)
+            case TakenCommand() as command:
+                self._taken_command(command)
+            case OpenedTopic(number, topic=topic):
+                self.topics[bytes(payload)] = None
+                self._topic_channels[number] = self._channel(topic.name, topic.type)
+            case TopicMessage(t_ns, number, data=data) if number in self._topic_channels:
+                self._add(self._topic_channels[number], t_ns, data)
+            case other:
+                raise ValueError(
+                    f"{type(other).__name__} does not belong into a log, or its topic was not opened"
+                )
+
+    def _taken_command(self, command: TakenCommand) -> None:
+        data = self._command.pack(
+            command.t_ns,
+            command.cycle,
+            command.planned,
+            command.lease_ns,
+            command.controller,
+            command.kind,
+            command.origin,
+            command.text,
+            command.numbers,
+            command.request.decode(errors="replace"),
+        )
+        self._add(self._taken_channel, command.t_ns, data)
+
+    def event(self, event: Event) -> None:
+        """Make the messages of an event, for /events and /rosout."""
+        data = self._event.pack(
+            event.t_ns,
+            event.code,
+            event.severity,
+            0,
+            event.name,
+            event.source,
+            event.text,
+            event.data.decode(errors="replace"),
+        )
+        self._add(self._event_channel, event.t_ns, data)
+        log = self._ros_log.pack(
+            self._stamp(event.t_ns), event.severity, event.source, event.text, "", event.name, 0
+        )
+        self._add(self._rosout_channel, event.t_ns, log)
+
+    def _machine(self, t_ns: int, data: bytes) -> None:
+        if self._machine_channel is None:
+            self._machine_channel = self._channel(schemas.MACHINE_TOPIC, schemas.MACHINE)
+        self._add(self._machine_channel, t_ns, data)
