@@ -108,11 +108,12 @@ def keys(name: str) -> str:
             continue
         given, example = entry.get("default"), (entry.get("examples") or [None])[0]
         default = "" if given is None else f"`{json.dumps(given)}`"
-        about = [
-            *entry.get("description", "").split(),
+        about = entry.get("description") or parts.get(entry.get("$ref", "")[8:], entry).get("description", "")
+        words = [
+            *about.partition("\n\n")[0].split(),
             *([] if example is None else [f"Example: `{example}`."]),
         ]
-        cells = (f"`{key}`", " or ".join(dict.fromkeys(values(entry))), default, " ".join(about))
+        cells = (f"`{key}`", " or ".join(dict.fromkeys(values(entry))), default, " ".join(words))
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(rows)
 

@@ -40,20 +40,26 @@ class LinearLimits(ParametersModel):
     """Limits forward and backward; what is left out is not limited."""
 
     velocity: Annotated[LinearVelocity, Field(gt=0)] | None = None
+    """Greatest speed."""
     acceleration: Annotated[LinearAcceleration, Field(gt=0)] | None = None
+    """By how much the speed may grow."""
     deceleration: Annotated[LinearAcceleration, Field(gt=0)] | None = None
     """Toward a standstill; as `acceleration` where it is left out."""
     jerk: Annotated[LinearJerk, Field(gt=0)] | None = None
+    """By how much the acceleration may change."""
 
 
 class AngularLimits(ParametersModel):
     """Limits to the left and to the right; what is left out is not limited."""
 
     velocity: Annotated[AngularVelocity, Field(gt=0)] | None = None
+    """Greatest rate of turn."""
     acceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = None
+    """By how much the rate may grow."""
     deceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = None
     """Toward a standstill; as `acceleration` where it is left out."""
     jerk: Annotated[AngularJerk, Field(gt=0)] | None = None
+    """By how much the acceleration may change."""
 
 
 _SAME = 1e-9
@@ -76,7 +82,9 @@ class DiffDriveParameters(ParametersModel):
     separation_multiplier: Annotated[Multiplier, LIVE] = 1.0
     """Calibration: what the separation is multiplied by."""
     left_radius_multiplier: Annotated[Multiplier, LIVE] = 1.0
+    """Calibration: what the radius of the left wheels is multiplied by."""
     right_radius_multiplier: Annotated[Multiplier, LIVE] = 1.0
+    """Calibration: what the radius of the right wheels is multiplied by."""
     linear: LinearLimits = LinearLimits()
     angular: AngularLimits = AngularLimits()
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000

@@ -47,6 +47,7 @@ class PayloadParameters(ParametersModel):
     link: str
     """That carries it"""
     mass: Annotated[Mass, Field(ge=0), LIVE]
+    """Of the payload, kg."""
     position: Annotated[tuple[Length, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
     """Of its centre of mass, in the axes of the link."""
 
@@ -62,6 +63,7 @@ class GravityParameters(JointsParameters):
     most: PerJoint[Positive] | None = None
     """Largest magnitude of what is added: rad, unit of the effort, part of full voltage."""
     payload: PayloadParameters | None = None
+    """What the robot carries."""
     orientation: str | None = None
     """That of the URDF's first link, a state: `imu/orientation`; without it that link is level."""
     voltage_filter: Duration = 2_000_000_000

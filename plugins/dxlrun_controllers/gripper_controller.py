@@ -66,7 +66,9 @@ class Width(ParametersModel):
     """How far the gripper is open at a position of its joint."""
 
     angle: Way
+    """Position of the joint."""
     width: Length
+    """How far the gripper is open there."""
 
 
 class GripperParameters(ParametersModel):
@@ -75,6 +77,7 @@ class GripperParameters(ParametersModel):
     _lengths: frozenset[str] = PrivateAttr(frozenset())
     """Keys about the joint that are written as lengths"""
     joint: str
+    """The joint that opens and closes it."""
     effort: Annotated[float, Field(gt=0)] | None = None
     """The most that the servo may exert, in the unit that the model measures (Nm, A or the fraction of its
     maximum), unless a goal has its own. Left out: the servo is in position mode, without such a limit."""

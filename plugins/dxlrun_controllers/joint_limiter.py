@@ -37,6 +37,7 @@ class LimiterLimits(ParametersModel):
     velocity: PerJoint[Annotated[AngularVelocity, Field(gt=0)]] | None = None
     """The joint's own limit if that is lower, or none is given."""
     lower: PerJoint[Angle] | None = None
+    """Lowest position; the joint's own limit if that is narrower."""
     upper: PerJoint[Angle] | None = None
     """Positions; the joint's own limits where they are narrower, or none are given."""
 

@@ -66,6 +66,7 @@ class Motion(ParametersModel):
     """A motion: its steps, one after the other, and perhaps another motion after it."""
 
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    """Poses, one after the other."""
     repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
     """How often the steps are played."""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
@@ -82,7 +83,9 @@ class KeyframeParameters(ParametersModel):
     """Keys of a keyframe_player in the robot file."""
 
     joints: JointNames
+    """Its joints."""
     motions: Annotated[dict[str, Motion], Field(min_length=1)]
+    """Motions by their names."""
     command_interface: Literal["position", "posvel"] = "position"
     """`posvel` commands the speed beside the position; where a step names torques, efforts are too."""
     approach: Annotated[AngularVelocity, Field(gt=0)] = 1.0

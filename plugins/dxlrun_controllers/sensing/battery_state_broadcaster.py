@@ -37,6 +37,7 @@ class BatteryParameters(ParametersModel):
     activate: tuple[str, ...] = ()
     """Controllers that take over at `stop`; none: the run ends by the policy `on_fault`."""
     frame: str = ""
+    """Name of the frame in the messages."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -22,6 +22,7 @@ class FallParameters(ParametersModel):
     activate: Annotated[tuple[str, ...], Field(min_length=1)]
     """Controllers that take over; those that command the same leave."""
     roll: Bounds = (-math.pi / 4, math.pi / 4)
+    """Lowest and highest angle; beyond it the robot tips over."""
     pitch: Bounds = (-math.pi / 4, math.pi / 4)
     """rad; of the link, positive forward. Beyond these the robot falls."""
     time: Duration = 60_000_000

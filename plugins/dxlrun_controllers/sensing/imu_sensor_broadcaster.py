@@ -74,6 +74,7 @@ class ImuParameters(ParametersModel):
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
     """ns; after so long without a sample the filter begins anew."""
     frame: str = "imu_link"
+    """Link of the URDF in whose axes the measurements are."""
     covariance: ImuCovariance = ImuCovariance()
 
     @model_validator(mode="after")

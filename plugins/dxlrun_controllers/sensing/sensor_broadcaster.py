@@ -41,6 +41,7 @@ class SensorParameters(ParametersModel):
     """Keys of a sensor_broadcaster in the robot file."""
 
     message: MessageName
+    """Type of the message."""
     fields: dict[str, str | float | dict[str, float]] = Field(default_factory=dict)
     """Fields of the message: a state (`sonar/range`), a number, or states with the factors of their sum."""
     cells: dict[str, Cell] = Field(default_factory=dict)
@@ -48,6 +49,7 @@ class SensorParameters(ParametersModel):
     scale: Annotated[float, Field(gt=0)] = 1.0
     """N for each unit of the cells' states."""
     frame: str = ""
+    """Name of the frame in the messages."""
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
     """ns; with an older value nothing is published."""
 
