@@ -92,6 +92,7 @@ EXTRAS = {
     "mujoco": "physics",
     "pyarrow": "logs",
     "scipy": "identify",
+    "websockets": "foxglove",
     **dict.fromkeys(
         ("Phidget22", "ahrs", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
         "foreign",

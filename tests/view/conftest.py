@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.torso import Run
 from tests.view.served import Served
-from tests.view.torso import Run
 
 from dxlrun_view.live import LiveRobot
 from dxlrun_view.recorded import RecordedRobot

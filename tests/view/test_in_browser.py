@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from tests.kit.awaited import until
 from tests.kit.browser import CHROMIUM, Browser
+from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
-from tests.view.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 
 from dxlrun_view.live import LiveRobot
 from dxlrun_view.recorded import RecordedRobot

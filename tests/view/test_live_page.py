@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from tests.kit.awaited import until
+from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
-from tests.view.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 
 from dxlrun_view.live import LiveRobot
 

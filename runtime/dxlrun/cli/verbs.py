@@ -54,6 +54,7 @@ PLACES_WHILE_IT_RUNS = {
 """Verbs for a robot that runs, in the same way."""
 _PACKAGES = {
     "dxlrun_analysis": ("analyze", "export", "logs"),
+    "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),
     "dxlrun_lab": (
         *("replay", "convert", "bench", "latency", "characterize", "experiment"),

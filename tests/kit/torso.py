@@ -22,8 +22,8 @@ BROADCAST = 254
 class Run:
     """A torso in a process of its own."""
 
-    def __init__(self, place: Path) -> None:
-        self.place = place
+    def __init__(self, place: Path, *, record: bool = False) -> None:
+        self.place, self.record = place, record
         self.ledger = place / "ledger.jsonl"
         self.process: subprocess.Popen[bytes] | None = None
         shutil.copytree(ROBOTS, place / "robots")
@@ -37,7 +37,7 @@ class Run:
         words = [
             "robots/bioloid_torso_imu.yaml",
             "rate:=5",
-            "--no-record",
+            *(() if self.record else ("--no-record",)),
             "--ledger",
             str(self.ledger),
             "--duration",

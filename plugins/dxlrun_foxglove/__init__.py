@@ -1,0 +1,1 @@
+"""A running robot in Foxglove, Lichtblick, and what else speaks their protocol."""

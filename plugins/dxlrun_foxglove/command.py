@@ -1,0 +1,122 @@
+"""`dxlrun foxglove`: a running robot in Foxglove or Lichtblick."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import signal
+import ssl
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+from urllib.parse import quote
+
+from cyclopts import Parameter
+
+from dxlrun import InputError, connect
+from dxlrun.cli.inputs import Flag, leave_real_time
+from dxlrun.output.terminal import show
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server
+
+    from dxlrun_foxglove.server import FoxgloveServer
+
+PORT = 8765
+LOOPBACK = "127.0.0.1"
+APP = "https://app.foxglove.dev"
+"""The viewer on the web, the one page that may connect without `--origin`."""
+
+
+def foxglove(
+    robot: str | None = None,
+    *,
+    control: Flag = False,
+    port: int | None = None,
+    listen: str = LOOPBACK,
+    cert: Path | None = None,
+    key: Path | None = None,
+    origin: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = (),
+    debug: Flag = False,
+) -> int:
+    """Serve a running robot to Foxglove, Lichtblick, and other viewers of their protocol.
+
+    They get the channels of the log, live, and the controllers' parameters. The address that is printed has a
+    token, which is another one at each start; a viewer without it gets nothing.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot, where several run.
+    control
+        Viewers may change parameters, switch controllers and torque, and halt the robot.
+    port
+        Listen on this port; without it on 8765, or if that is taken on a free one.
+    listen
+        Listen on this address. Another one than 127.0.0.1 needs `--cert` and `--key`.
+    cert
+        Certificate of this computer (PEM), for TLS.
+    key
+        Its private key (PEM).
+    origin
+        Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
+    debug
+        Print the traceback of an error.
+    """
+    if port is not None and not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: a port is a number up to 65535")
+    if listen != LOOPBACK and cert is None:
+        raise InputError(
+            f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
+        )
+    leave_real_time()
+    try:
+        from dxlrun_foxglove.server import FoxgloveServer
+    except ImportError as error:
+        raise InputError("Foxglove needs the extra of this name: pip install 'dxlrun[foxglove]'") from error
+    with connect(robot, "dxlrun foxglove") as running:
+        name = running.name
+    served = FoxgloveServer(name, (APP, *origin), control=control)
+    asyncio.run(_serve(served, listen, port, tls_of(cert, key)))
+    return 0
+
+
+async def _serve(served: FoxgloveServer, listen: str, port: int | None, tls: ssl.SSLContext | None) -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    ended = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, ended.set)
+    async with await _listening(served, listen, port, tls) as server:
+        host, taken = next(iter(server.sockets)).getsockname()[:2]
+        url = f"{'wss' if tls else 'ws'}://{host}:{taken}/?token={served.token}"
+        app = f"{APP}/~/view?ds=foxglove-websocket&ds.url={quote(url, safe='')}"
+        show(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends this, not the robot.")
+        await ended.wait()
+
+
+async def _listening(
+    served: FoxgloveServer, listen: str, port: int | None, tls: ssl.SSLContext | None
+) -> Server:
+    """Listen; without a port on the usual one, or if that is taken on any. Raises InputError."""
+    try:
+        return await served.listen(listen, PORT if port is None else port, tls)
+    except OSError as error:
+        if port is None and error.errno == errno.EADDRINUSE:
+            return await _listening(served, listen, 0, tls)
+        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
+        why = f"{listen}:{PORT if port is None else port} cannot be listened on: {error.strerror or error}"
+        raise InputError(f"{why}; give another {other}") from error
+
+
+def tls_of(cert: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    """Return what TLS is made with; None: without. Raises InputError."""
+    if cert is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(cert, key)
+    except OSError as error:
+        raise InputError(
+            f"--cert {cert} with --key {key or cert} cannot be used: {error.strerror or error}; "
+            "give a certificate and its private key, both PEM"
+        ) from error
+    return context

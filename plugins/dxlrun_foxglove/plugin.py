@@ -1,0 +1,20 @@
+"""The verb that serves Foxglove and Lichtblick, by the same hooks as any other package."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun import CONTRACT_VERSION, Command, hookimpl
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for: the one it is published with."""
+    return CONTRACT_VERSION
+
+
+@hookimpl
+def dxlrun_commands() -> Sequence[Command]:
+    """Return the verb."""
+    help_line = "Serve a running robot to Foxglove, Lichtblick, and other viewers of their protocol."
+    return (Command("foxglove", "dxlrun_foxglove.command:foxglove", help_line),)

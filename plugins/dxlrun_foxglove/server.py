@@ -1,0 +1,252 @@
+"""Server of live viewers, with a guard at its door.
+
+A viewer shows the token of the address; where it says which web page it belongs to (Origin, as every browser
+does), that page is one that was named. All that has no token yet has five seconds, and there is room for few.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import ssl
+from asyncio import BaseTransport
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from http import HTTPStatus
+from typing import Any, ClassVar
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.typing import Origin, Subprotocol
+
+from dxlrun import DxlrunError, InputError
+from dxlrun_foxglove import protocol
+from dxlrun_foxglove.protocol import ERROR, Call, Subscription, Words, status, text
+from dxlrun_foxglove.viewed_run import ENCODING, HALT, ViewedRun, advertised, advertised_services
+from dxlrun_foxglove.viewer import MOST_REQUESTS, Channel, Viewer
+
+MOST_VIEWERS = 8
+MOST_HALF_OPEN = 64
+"""Connections without a token yet; of more the oldest is closed."""
+OPENING_S = 5.0
+PING_S = 10.0
+"""Between two pings; a viewer that answers none for twice as long is gone."""
+MOST_BYTES = 1 << 16
+"""Of a frame of a viewer."""
+GOING_AWAY, TRY_AGAIN = 1001, 1013
+ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
+_SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
+
+
+class FoxgloveServer:
+    """Serves the runs of one robot, one after the other, to viewers."""
+
+    def __init__(self, name: str, origins: Sequence[str], *, control: bool = False) -> None:
+        """`origins`: web pages that may connect."""
+        self.name, self.control = name, control
+        self.token = secrets.token_urlsafe(16)
+        self._origins = [None, *map(Origin, origins)]
+        self._viewers: set[Viewer] = set()
+        self._run: ViewedRun | None = None
+        self._following: asyncio.Task[None] | None = None
+        self._beginning = asyncio.Lock()
+
+    async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> Server:
+        """Listen. Raises OSError."""
+        workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)  # none waits for another's
+        asyncio.get_running_loop().set_default_executor(workers)
+        more: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": OPENING_S} if tls else {}
+        return await serve(
+            self._served,
+            host,
+            port,
+            origins=self._origins,
+            subprotocols=[Subprotocol(one) for one in protocol.SUBPROTOCOLS],
+            process_request=self._let_in,
+            create_connection=Visitor,
+            compression=None,
+            server_header=None,
+            open_timeout=OPENING_S,
+            ping_interval=PING_S,
+            ping_timeout=2 * PING_S,
+            close_timeout=1,
+            max_size=MOST_BYTES,
+            logger=_SILENT,
+            **more,
+        )
+
+    # The door
+
+    def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the refusal of a request without the token, or None; what it belongs to is seen later."""
+        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not secrets.compare_digest(given.encode(), self.token.encode()):
+            why = "open the address that `dxlrun foxglove` printed: it has the token\n"
+            return connection.respond(HTTPStatus.UNAUTHORIZED, why)
+        if len(self._viewers) >= MOST_VIEWERS:
+            return connection.respond(
+                HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} viewers look already\n"
+            )
+        return None
+
+    async def _served(self, connection: ServerConnection) -> None:
+        """Serve a viewer until it leaves, or the run ends."""
+        Visitor.half_open.pop(connection, None)
+        viewer = Viewer(connection)
+        self._viewers.add(viewer)
+        sending = asyncio.create_task(viewer.send())
+        try:
+            run = await self._begun()
+            self._greet(viewer, run)
+            async for frame in connection:
+                self._take(viewer, run, frame)
+        except DxlrunError as error:
+            await connection.close(TRY_AGAIN, str(error)[:100])
+        except ConnectionClosed:
+            pass
+        finally:
+            self._viewers.discard(viewer)
+            for task in (sending, *viewer.requests):
+                task.cancel()
+            if not self._viewers and self._following is not None:
+                self._following.cancel()
+                self._run = self._following = None
+
+    # The run
+
+    async def _begun(self) -> ViewedRun:
+        """Return the run that viewers see. Raises DxlrunError when the robot does not run."""
+        async with self._beginning:
+            if self._run is None:
+                run = await asyncio.to_thread(ViewedRun.begun, self.name, self._viewers)
+                run.on_changed = partial(self._tell_parameters, run)
+                self._run, self._following = run, asyncio.create_task(self._follow(run))
+            return self._run
+
+    async def _follow(self, run: ViewedRun) -> None:
+        """Pass on a run's messages; when it has ended close the connections: viewers open them again."""
+        why = await run.follow()
+        if self._run is run:
+            self._run = self._following = None
+        for viewer in tuple(self._viewers):
+            with suppress(ConnectionClosed):
+                await viewer.connection.close(GOING_AWAY, why[:100])
+
+    def _greet(self, viewer: Viewer, run: ViewedRun) -> None:
+        can = ["parameters", "parametersSubscribe", "connectionGraph"]
+        viewer.reply(
+            text(
+                "serverInfo",
+                name=self.name,
+                capabilities=[*can, "services"] if self.control else can,
+                supportedEncodings=[ENCODING],
+                metadata={"robot": self.name},
+                sessionId=str(run.header.epoch_offset_ns),
+            )
+        )
+        viewer.reply(advertised(run.channels))
+        if self.control:
+            viewer.reply(advertised_services())
+
+    # Requests
+
+    def _take(self, viewer: Viewer, run: ViewedRun, frame: str | bytes) -> None:
+        """Do what a frame asks; what is wrong with it is a status for the viewer."""
+        try:
+            received = protocol.received(frame)
+        except ValueError as error:
+            viewer.reply(status(ERROR, f"no frame of this protocol: {error}"))
+            return
+        if isinstance(received, Call):
+            self._ask(viewer, run, received)
+            return
+        match received.op:
+            case "subscribe":
+                channels = {one.number: one for one in run.channels}
+                for one in received.subscriptions:
+                    _subscribe(viewer, one, channels.get(one.channel_id))
+            case "unsubscribe":
+                ended = received.subscription_ids
+                kept = {channel: one for channel, one in viewer.subscriptions.items() if one not in ended}
+                viewer.subscriptions = kept
+            case "subscribeConnectionGraph":
+                viewer.graph = True
+                viewer.reply(run.graph)
+            case "unsubscribeConnectionGraph":
+                viewer.graph = False
+            case "unsubscribeParameterUpdates":
+                viewer.parameters -= set(received.parameter_names or viewer.parameters)
+            case _:
+                self._ask(viewer, run, received)
+
+    def _ask(self, viewer: Viewer, run: ViewedRun, request: Words | Call) -> None:
+        """Have the robot asked beside the messages; of one viewer few at once, halt as often again."""
+        halts = isinstance(request, Call) and request.service == HALT
+        if len(viewer.requests) >= MOST_REQUESTS * (1 + halts):
+            viewer.reply(protocol.failure(request, "too many requests at once; wait for the answers"))
+            return
+        task = asyncio.create_task(self._answer(viewer, run, request))
+        viewer.requests.add(task)
+        task.add_done_callback(viewer.requests.discard)
+
+    async def _answer(self, viewer: Viewer, run: ViewedRun, request: Words | Call) -> None:
+        try:
+            if not self.control and (isinstance(request, Call) or request.op == "setParameters"):
+                raise InputError(ONLY_SHOWN)
+            if isinstance(request, Call):
+                viewer.reply(protocol.response(request, await asyncio.to_thread(run.call, request)))
+                return
+            names = request.parameter_names
+            if request.op == "setParameters":
+                await asyncio.to_thread(run.set_parameters, request.parameters)
+                names = [one.name for one in request.parameters]
+            found = await asyncio.to_thread(run.parameters, names)
+            if request.op == "subscribeParameterUpdates":
+                viewer.parameters |= {one.name for one in found}
+            else:
+                viewer.reply(protocol.values(found, request.id))
+        except DxlrunError as error:
+            viewer.reply(protocol.failure(request, str(error)))
+
+    def _tell_parameters(self, run: ViewedRun, controller: str) -> None:
+        """Send parameters that have changed to the viewers that want to know."""
+        for viewer in self._viewers:
+            names = [one for one in viewer.parameters if one.startswith(f"{controller}.")]
+            if names:
+                self._ask(viewer, run, Words("getParameters", parameter_names=names))
+
+
+def _subscribe(viewer: Viewer, one: Subscription, channel: Channel | None) -> None:
+    known = viewer.subscriptions
+    if channel is None or one.channel_id in known or one.id in known.values():
+        why = f"channel {one.channel_id} is not there, or subscribed to already"
+        viewer.reply(status(ERROR, why))
+        return
+    known[one.channel_id] = one.id
+    if channel.latched and channel.newest is not None:
+        viewer.show(channel, *channel.newest)
+
+
+class Visitor(ServerConnection):
+    """A connection; one that shows no token soon makes room for others."""
+
+    half_open: ClassVar[dict[ServerConnection, None]] = {}
+
+    def connection_made(self, transport: BaseTransport) -> None:
+        """Make room among those without a token."""
+        if len(self.half_open) >= MOST_HALF_OPEN:
+            oldest = next(iter(self.half_open))
+            del self.half_open[oldest]
+            oldest.transport.abort()
+        self.half_open[self] = None
+        super().connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Leave the room."""
+        self.half_open.pop(self, None)
+        super().connection_lost(exc)

@@ -1,0 +1,221 @@
+"""Viewed run: the messages of a running robot for its viewers, and what they ask of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable, Sequence
+
+import msgspec
+
+from dxlrun import DxlrunError, InputError, RemoteRobot, connect
+from dxlrun.channels.events import Event, EventCode
+from dxlrun.channels.loop_requests import Switch, TorqueRequest
+from dxlrun.log import schemas
+from dxlrun.log.run_messages import RunMessages
+from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.messages.definition import MessageType
+from dxlrun.remote.client import TopicMessage
+from dxlrun.remote.requests.replies import RobotInfo
+from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
+from dxlrun_foxglove.viewer import Channel, Viewer
+
+ENCODING = "json"
+"""Of calls of services."""
+LOOK_S = 2.0
+"""Between two looks for topics that were opened meanwhile."""
+_OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
+"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
+
+
+class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a service that needs no words."""
+
+
+SERVICES = (("/halt", Nothing), ("/switch", Switch), ("/torque", TorqueRequest))
+"""Their numbers are their places."""
+HALT = 0
+
+
+class ViewedRun(RunMessages):
+    """One run of a robot, as long as a viewer looks."""
+
+    def __init__(self, name: str, header: LogHeader, viewers: Iterable[Viewer]) -> None:
+        super().__init__(header)
+        self._name, self._viewers = name, viewers
+        self._channels: list[Channel] = []
+        self.on_changed: Callable[[str], object] = lambda controller: None
+        """Called when parameters of a controller have changed."""
+        self._open_channels()
+
+    @classmethod
+    def begun(cls, name: str, viewers: Iterable[Viewer]) -> ViewedRun:
+        """Return the run of a robot as it is now. Raises DxlrunError."""
+        with _robot(name) as robot:
+            return cls(name, robot.log_header(), viewers)
+
+    # Messages
+
+    def _channel(self, topic: str, message: MessageType, *, latched: bool = False) -> int:
+        self._channels.append(Channel(len(self._channels), topic, message, latched))
+        return self._channels[-1].number
+
+    def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
+        put = self._channels[channel]
+        first, put.newest = put.newest is None, (wall_ns, data)
+        for viewer in self._viewers:
+            if first:
+                viewer.reply(advertised((put,)))
+            if first and viewer.graph:
+                viewer.reply(self.graph)
+            viewer.show(put, wall_ns, data)
+
+    async def follow(self) -> str:
+        """Pass on what the robot publishes, until its run has ended; return why nothing more comes."""
+        known: set[str] = set()
+        why = ""
+        try:
+            async with asyncio.TaskGroup() as group:
+                while True:
+                    if new := await asyncio.to_thread(self._topics) - known:
+                        known |= new
+                        group.create_task(self._listen(new))
+                    await asyncio.sleep(LOOK_S)
+        except* DxlrunError as errors:
+            why = str(errors.exceptions[0])
+        return why
+
+    def _topics(self) -> set[str]:
+        """Return the topics that the log has too, or whose messages it makes others of."""
+        with _robot(self._name) as robot:
+            topics = robot.topics()
+        return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.JOINT_STATES_TOPIC}
+
+    async def _listen(self, topics: set[str]) -> None:
+        """Take the messages of topics until the run ends. Raises DxlrunError then, too."""
+        with _robot(self._name) as robot:
+            async for message in await asyncio.to_thread(robot.listen, *topics):
+                self._take(message)
+        raise DxlrunError(f"the run of {self._name} has ended")
+
+    def _take(self, message: TopicMessage) -> None:
+        if message.lost:
+            lost = f"{message.lost} messages of {message.topic} were lost before they came here"
+            for viewer in self._viewers:
+                viewer.reply(status(WARNING, lost))
+        if message.topic == schemas.CYCLE_TOPIC:
+            self.cycle(message.data[len(ENCAPSULATION) :])
+        elif message.topic == schemas.EVENT_TOPIC:
+            fields = message.message
+            numbers = [fields[name] for name in ("t_ns", "code", "severity")]
+            t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
+            source, sentence, data = (str(fields[name]) for name in ("source", "text", "data"))
+            self.event(Event(t_ns, code, severity, source, sentence, data.encode()))
+            if code == EventCode.PARAMETERS:
+                self.on_changed(source)
+        else:
+            self._add(self._loop_channel(message), message.time_ns, message.data)
+
+    def _loop_channel(self, message: TopicMessage) -> int:
+        """Return the channel of a controller's topic; of another type it is another one."""
+        kind = MessageType(message.type, message.definition)
+        for channel in self._channels:
+            if channel.topic == message.topic and channel.type == kind:
+                return channel.number
+        return self._channel(message.topic, kind)
+
+    # What viewers ask
+
+    @property
+    def channels(self) -> list[Channel]:
+        """Those that have had a message."""
+        return [one for one in self._channels if one.newest is not None]
+
+    @property
+    def graph(self) -> str:
+        """The frame with what publishes each topic: controllers, or the robot itself."""
+        names = [one.name for one in self.header.controllers]
+        rows = []
+        for topic in [one.topic for one in self.channels]:
+            declared = [one.name for one in self.header.controllers if topic in one.publishes]
+            owner = topic.split("/")[1]
+            rows.append(
+                {"name": topic, "publisherIds": declared or [owner if owner in names else self._name]}
+            )
+        others = ("subscribedTopics", "advertisedServices", "removedTopics", "removedServices")
+        return text("connectionGraphUpdate", publishedTopics=rows, **dict.fromkeys(others, ()))
+
+    def parameters(self, names: Collection[str]) -> list[Parameter]:
+        """Return these parameters, or all. Raises DxlrunError."""
+        with _robot(self._name) as robot:
+            return [
+                Parameter(f"{controller}.{one.name}", one.value)
+                for controller in _controllers(robot, names)
+                for one in robot.parameter_table(controller)
+                if isinstance(one.value, bool | int | float | str)
+                and (not names or f"{controller}.{one.name}" in names)
+            ]
+
+    def set_parameters(self, parameters: Sequence[Parameter]) -> None:
+        """Change parameters, those of each controller in one cycle. Raises DxlrunError."""
+        with _robot(self._name) as robot:
+            for controller in _controllers(robot, [one.name for one in parameters]):
+                begin = f"{controller}."
+                own = [one for one in parameters if one.name.startswith(begin)]
+                robot.set_parameters(controller, {one.name.removeprefix(begin): one.value for one in own})
+
+    def call(self, call: Call) -> bytes:
+        """Do what a service does; return its answer as JSON. Raises DxlrunError."""
+        if call.service >= len(SERVICES) or call.encoding != ENCODING:
+            raise InputError(f"there is no service {call.service} that takes {call.encoding}")
+        name, kind = SERVICES[call.service]
+        try:
+            body = msgspec.json.decode(call.body, type=kind)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise InputError(f"{name}: {error}") from error
+        with _robot(self._name) as robot:
+            match body:
+                case Switch(activate, deactivate):
+                    done = robot.switch(activate, deactivate)
+                case TorqueRequest(joints, on, release):
+                    done = robot.torque(joints, on, release=release)
+                case _:
+                    done = robot.halt()
+        return msgspec.json.encode(done)
+
+
+def _robot(name: str) -> RemoteRobot:
+    return connect(name, "dxlrun foxglove")
+
+
+def _controllers(robot: RemoteRobot, names: Collection[str]) -> list[str]:
+    """Return the controllers that have parameters of these names; of no names all."""
+    every = [one.name for one in msgspec.convert(robot.info(), RobotInfo).controllers]
+    return [one for one in every if not names or any(name.startswith(f"{one}.") for name in names)]
+
+
+def advertised(channels: Sequence[Channel]) -> str:
+    """Return the frame that makes channels known."""
+    rows = [
+        {
+            "id": one.number,
+            "topic": one.topic,
+            "encoding": schemas.ENCODING,
+            "schemaName": one.type.name,
+            "schema": one.type.text,
+            "schemaEncoding": schemas.SCHEMA_ENCODING,
+        }
+        for one in channels
+    ]
+    return text("advertise", channels=rows)
+
+
+def advertised_services() -> str:
+    """Return the frame that makes the services known."""
+    form = {"encoding": ENCODING, "schemaName": "Executed", "schemaEncoding": "jsonschema", "schema": "{}"}
+    rows = []
+    for number, (name, kind) in enumerate(SERVICES):
+        schema = msgspec.json.schema_components((kind,))[1][kind.__name__]
+        request = {**form, "schemaName": kind.__name__, "schema": msgspec.json.encode(schema).decode()}
+        rows.append({"id": number, "name": name, "type": kind.__name__, "request": request, "response": form})
+    return text("advertiseServices", services=rows)

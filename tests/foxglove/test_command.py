@@ -1,0 +1,26 @@
+"""What `dxlrun foxglove` refuses before it listens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dxlrun import DxlrunError, InputError
+from dxlrun_foxglove.command import foxglove
+
+
+@pytest.fixture(autouse=True)
+def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def test_the_network_is_served_with_tls_alone() -> None:
+    for address in ("10.0.0.1", "192.168.1.2", "::", "localhost"):
+        with pytest.raises(InputError, match=r"only 127\.0\.0\.1 is served without TLS; add --cert"):
+            foxglove(listen=address)
+
+
+def test_a_robot_has_to_run() -> None:
+    with pytest.raises(DxlrunError, match="no robot runs"):
+        foxglove()

@@ -1,0 +1,82 @@
+"""A viewer that is slow, or takes nothing: what waits for it does not grow."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any, cast
+
+from websockets.asyncio.server import ServerConnection
+
+from dxlrun.log.schemas import CYCLE
+from dxlrun_foxglove.viewer import MOST_BYTES, MOST_REPLIES, SLOW, Channel, Viewer
+
+CHANNEL = Channel(3, "/cycle", CYCLE, latched=False)
+
+
+class SlowConnection:
+    """Takes a frame when it is let."""
+
+    def __init__(self) -> None:
+        self.taken: list[Any] = []
+        self.aborted = 0
+        self.transport = self
+        self.let = asyncio.Semaphore(0)
+
+    def abort(self) -> None:
+        self.aborted += 1
+
+    async def send(self, frame: str | bytes) -> None:
+        await self.let.acquire()
+        self.taken.append(frame)
+
+
+def test_the_oldest_messages_are_left_out_for_a_slow_viewer() -> None:
+    async def run() -> None:
+        connection = SlowConnection()
+        viewer = Viewer(cast("ServerConnection", connection))
+        viewer.subscriptions[3] = 7
+        most = MOST_BYTES // (1000 + 13)
+        sending = asyncio.create_task(viewer.send())
+        for number in range(3 * most):
+            viewer.show(CHANNEL, number, b"x" * 1000)
+        connection.let = asyncio.Semaphore(10**6)
+        await asyncio.sleep(0)
+        sending.cancel()
+        sending = asyncio.create_task(viewer.send())
+        while len(connection.taken) < most + 1:
+            await asyncio.sleep(0)
+        sending.cancel()
+        assert json.loads(connection.taken[0])["message"] == SLOW
+        numbers = [int.from_bytes(frame[5:13], "little") for frame in connection.taken[1:]]
+        assert numbers == list(range(2 * most, 3 * most))  # the newest, in order
+        assert connection.aborted == 0
+
+    asyncio.run(run())
+
+
+def test_a_viewer_that_takes_no_replies_is_gone() -> None:
+    async def run() -> None:
+        connection = SlowConnection()
+        viewer = Viewer(cast("ServerConnection", connection))
+        for _ in range(MOST_REPLIES):
+            viewer.reply("{}")
+        assert connection.aborted == 0
+        viewer.reply("{}")
+        assert connection.aborted == 1
+
+    asyncio.run(run())
+
+
+def test_what_it_has_not_subscribed_to_does_not_wait() -> None:
+    async def run() -> None:
+        connection = SlowConnection()
+        viewer = Viewer(cast("ServerConnection", connection))
+        viewer.show(CHANNEL, 0, b"x")
+        connection.let.release()
+        sending = asyncio.create_task(viewer.send())
+        await asyncio.sleep(0)
+        sending.cancel()
+        assert not connection.taken
+
+    asyncio.run(run())
