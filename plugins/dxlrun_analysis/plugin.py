@@ -23,11 +23,18 @@ def dxlrun_commands() -> Sequence[Command]:
             "analyze",
             f"{_PLACE}.analyze:analyze",
             "Analyze a log: latency, duration of each step, skipped periods, packets and errors per servo.",
+            "Every day",
         ),
         Command(
             "export",
             f"{_PLACE}.export:export",
             "Write a log in another format, to a new file or directory; nothing is written over.",
+            "Logs",
         ),
-        Command("logs", f"{_PLACE}.logs:logs", "Show all logs below a directory as a table, one row a log."),
+        Command(
+            "logs",
+            f"{_PLACE}.logs:logs",
+            "Show all logs below a directory as a table, one row a log.",
+            "Logs",
+        ),
     )

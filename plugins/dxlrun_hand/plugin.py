@@ -22,16 +22,19 @@ def dxlrun_commands() -> Sequence[Command]:
         Command(
             "setup",
             f"{_PLACE}.setup:setup",
-            "Give new servos, one after the other, the ID, rate and registers of a robot file.",
+            "Give new servos the ID, rate and registers of a robot file: one after the other.",
+            "Servos",
         ),
         Command(
             "calibrate",
             f"{_PLACE}.calibrate:calibrate",
-            "Measure reference, direction and limits of joints by hand, and write them into the robot file.",
+            "Measure reference, direction and limits of joints by hand: for the robot file.",
+            "Servos",
         ),
         Command(
             "teach",
             f"{_PLACE}.teach:teach",
             "Show a running robot a motion by hand, and save it as a motion file.",
+            "Robots that run",
         ),
     )

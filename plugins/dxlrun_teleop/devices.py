@@ -11,7 +11,7 @@ from contextlib import suppress
 from glob import glob
 from typing import Protocol
 
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.errors import DxlrunError, InputError, missing_extra
 from dxlrun_teleop.keyboard import AXES
 from dxlrun_teleop.source import Given, Press
 
@@ -135,8 +135,8 @@ def chosen(path: str | None) -> Gamepad:
     """
     try:
         from evdev import InputDevice
-    except ImportError:
-        raise InputError("gamepads need evdev; `pip install 'dxlrun[teleop]'` installs it") from None
+    except ImportError as error:
+        raise InputError(missing_extra("a gamepad", "teleop", "evdev") or str(error)) from error
     devices: list[Device] = []
     paths = sorted(glob("/dev/input/event*"))
     for each in paths:

@@ -21,5 +21,6 @@ def dxlrun_commands() -> Sequence[Command]:
             "teleop",
             "dxlrun_teleop.command:teleop",
             "Drive a running robot by hand, from the keyboard or a gamepad.",
+            "Robots that run",
         ),
     )

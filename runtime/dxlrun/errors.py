@@ -21,6 +21,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Literal
 
@@ -219,6 +220,19 @@ def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
     if meant := near(name, known):
         return f"did you mean {' or '.join(meant)}?"
     return otherwise or (f"known: {', '.join(known)}" if known else "there is none")
+
+
+def missing_extra(what: str, extra: str, *libraries: str) -> str:
+    """Return what needs libraries that are not installed, and the line that installs the extra with them.
+
+    Empty: they are all there.
+    """
+    missing = [name for name in libraries if find_spec(name) is None]
+    if not missing:
+        return ""
+    are, them = ("are", "them") if missing[1:] else ("is", "it")
+    line = f"`pip install 'dxlrun[{extra}]'` installs {them}"
+    return f"{what} needs {' and '.join(missing)}, which {are} not installed; {line}"
 
 
 def counted(number: int, one: str, many: str) -> str:

@@ -62,13 +62,13 @@ def test_without_bokeh_one_sentence_has_the_command_that_installs_it(
     log = tmp_path / "run.mcap"
     log.write_bytes(b"a log")
     found = importlib.util.find_spec
-    monkeypatch.setattr("dxlrun.cli.inputs.find_spec", lambda name: None if name == "bokeh" else found(name))
+    monkeypatch.setattr("dxlrun.errors.find_spec", lambda name: None if name == "bokeh" else found(name))
 
     said = dxlrun("analyze", log, "--report", tmp_path / "report.html")
 
     assert said.code == 2
     assert said.errors == [
-        "dxlrun: a report needs bokeh for its plots; `pip install 'dxlrun[report]'` installs it"
+        "dxlrun: a report needs bokeh, which is not installed; `pip install 'dxlrun[report]'` installs it"
     ]
 
 

@@ -21,7 +21,7 @@ def test_a_robot_is_run_to_see_whether_a_rate_is_kept(
     dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(highest_rate, "MOST_TRIES", 1)  # each takes seconds
-    said = dxlrun("bench", "rate", ROBOT, "--seconds", "0.3", "--json")
+    said = dxlrun("bench", "rate", ROBOT, "--duration", "0.3", "--json")
     shown = json.loads(said.out)
     assert said.code == (0 if shown["kept_hz"] else 1)
     assert shown["robot"] == "single_joint"
@@ -38,7 +38,7 @@ def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(
         return RunSummary(0, "ended", 1, 0, 0.1, (), log=str(path))
 
     monkeypatch.setattr(highest_rate, "run_robot", run_robot)
-    said = dxlrun("bench", "rate", ROBOT, "--seconds", "0.3")
+    said = dxlrun("bench", "rate", ROBOT, "--duration", "0.3")
     assert (said.code, said.err) == (0, "")
     running, head, _, row, verdict = said.out.splitlines()
     assert head.split()[:4] == ["rate", "cycles", "overruns", "by"]

@@ -32,7 +32,7 @@ BOARDS = BusConfig(
 
 def test_a_scan_finds_boards_beside_servos_and_drafts_them(dxlrun, simulated_line, tmp_path):
     path, finish = simulated_line(BOARDS)
-    said = dxlrun("scan", path, *NEW, "--write", tmp_path / "found.yaml", "--json")
+    said = dxlrun("scan", path, *NEW, "--output", tmp_path / "found.yaml", "--json")
     assert said.code == 0, said.err
     found = {each["servo_id"]: each for each in json.loads(said.out)["servos"]}
     assert {key: (each["model"], each["device"]) for key, each in found.items()} == {

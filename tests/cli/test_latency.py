@@ -45,7 +45,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @needs_cc
 def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path: Path) -> None:
     pytest.importorskip("bokeh")
-    words = ("--iterations", 50, "--period", "1ms", "--blocks", 2, "--stress", "--compare", "other,c")
+    words = ("--count", 50, "--period", "1ms", "--blocks", 2, "--stress", "--compare", "other,c")
     found = dxlrun("latency", *words, "--report", "page.html", "--json")
     assert (found.code, found.err) == (0, "")
     result = json.loads(found.out)
@@ -77,20 +77,20 @@ def test_a_log_that_the_disk_has_no_room_for_fails_and_the_table_is_shown(
     wrote = latency_log.write
     full = "writing the log stopped: No space left on device"
     monkeypatch.setattr(latency_log, "write", lambda *words: replace(wrote(*words), error=full))
-    found = dxlrun("latency", "--iterations", 20, "--blocks", 1, "--log", "here.mcap", *more)
+    found = dxlrun("latency", "--count", 20, "--blocks", 1, "--log", "here.mcap", *more)
     assert found.code == 1
     assert found.errors == [f"dxlrun: the log here.mcap is incomplete: {full}"]
     assert "wake_ups" in found.out or "wake-ups" in found.out
 
 
 def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:
-    found = dxlrun("latency", "--iterations", 20, "--blocks", 1, "--log", "here.mcap")
+    found = dxlrun("latency", "--count", 20, "--blocks", 1, "--log", "here.mcap")
     assert found.code == 0
     first, *lines = found.out.splitlines()
     assert first == "measuring other: 20 wake-ups in 1 block, 0.0 s"
     assert [line.split()[0] for line in lines if line.startswith(("wake-ups", "maximum", "mode"))]
     assert lines[-1] == "log: here.mcap"
-    again = dxlrun("latency", "--iterations", 20, "--log", "here.mcap")
+    again = dxlrun("latency", "--count", 20, "--log", "here.mcap")
     assert (again.code, again.errors) == (
         2,
         ["dxlrun: --log here.mcap: there is such a file already; choose another name"],
@@ -122,7 +122,7 @@ def without_rights() -> None:
 
 
 def test_without_the_right_to_real_time_nothing_is_measured(tmp_path: Path) -> None:
-    words = ("latency", "--iterations", "50", "--compare", "other,round_robin", "--priority", "40")
+    words = ("latency", "--count", "50", "--compare", "other,round_robin", "--priority", "40")
     found = subprocess.run(
         [sys.executable, "-c", COMMAND, *words],
         capture_output=True,
@@ -175,7 +175,7 @@ def test_the_commands_of_a_page_are_understood(
 
 @pytest.mark.parametrize("kill", [False, True])
 def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
-    words = ("latency", "--iterations", "600000", "--log", str(tmp_path / "kept.mcap"), "--json")
+    words = ("latency", "--count", "600000", "--log", str(tmp_path / "kept.mcap"), "--json")
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as running:
@@ -207,6 +207,6 @@ def test_an_interrupted_measurement_says_so_below_its_table(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(measurement._Process, "_ended", interrupted)
-    found = dxlrun("latency", "--iterations", 600_000, "--no-record")
+    found = dxlrun("latency", "--count", 600_000, "--no-record")
     assert found.code == 130
     assert found.errors[-1].startswith("interrupted")

@@ -21,7 +21,7 @@ NARROW = ("--baud", "1000000", "--ids", "1-4")
 def test_the_servos_are_a_table_and_a_robot_file_that_check_accepts(dxlrun, simulated_line, tmp_path):
     path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350", "XL430-W250"), 2.0))
     robot = tmp_path / "arm.yaml"
-    said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--write", robot)
+    said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--output", robot)
     assert (said.code, said.err) == (0, "")
     head, _, first, second, written = said.out.splitlines()
     assert head.split()[:2] == ["ID", "model"]

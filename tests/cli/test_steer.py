@@ -19,7 +19,7 @@ import pytest
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
-from dxlrun.cli.verbs import PLACES_WHILE_IT_RUNS
+from dxlrun.cli.verbs import GROUPS
 from dxlrun.remote.sockets import SocketLink
 
 ROOT = Path(__file__).parents[2]
@@ -540,7 +540,8 @@ def test_the_commands_of_the_page_work_in_their_order(
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     started, *lines = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
     assert started == "robots/bioloid_torso.yaml"
-    assert {line.split()[0] for line in lines} == set(PLACES_WHILE_IT_RUNS) - {"reboot"}  # Protocol 2.0
+    verbs = {"list", "watch", "play", "stop", *GROUPS["Robots that run"]}
+    assert {line.split()[0] for line in lines} == verbs - {"reboot"}  # Protocol 2.0
     for line in lines:
         said = dxlrun(*shlex.split(line))
         assert (said.code, said.err) == (0, ""), line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,11 +57,49 @@ def test_a_verb_of_a_package_says_one_thing_of_itself(name: str) -> None:
     assert verbs.package_of(name) == verbs.packaged()[name].place.partition(".")[0]
 
 
+@pytest.mark.parametrize("name", verbs.names())
+def test_the_help_of_a_verb_has_examples_that_can_be_typed(name: str, dxlrun: Dxlrun) -> None:
+    said = dxlrun("help", name)
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith(dxlrun(name, "--help").out)
+    lines = said.out.partition("\nExamples\n")[2].splitlines()
+    assert lines
+    for line in lines:
+        program, *words = shlex.split(line)
+        assert (program, words[0]) == ("dxlrun", name)
+        app.build(name).parse_args(words, print_error=False, exit_on_error=False)
+
+
+def test_help_without_a_verb_lists_them_and_an_unknown_one_is_refused(dxlrun: Dxlrun) -> None:
+    assert dxlrun("help").out == dxlrun("--help").out
+    assert "did you mean check?" in dxlrun("help", "chek").err
+    assert dxlrun("help", "check", "more").errors == [
+        "dxlrun: there is no command check more; `dxlrun help` lists all of them"
+    ]
+
+
+def test_a_verb_of_each_package_has_a_heading_of_the_help() -> None:
+    assert {one.group for one in verbs.packaged().values()} <= set(verbs.GROUPS)
+    assert len(verbs.GROUPS[verbs.EVERY_DAY]) == 9  # and `analyze`
+
+
+def test_a_foreign_verb_stands_in_the_group_that_it_names_or_behind_all(
+    install: Install, dxlrun: Dxlrun
+) -> None:
+    install("in-a-group", "grouped", GREETING.replace('"Manners"', '"Servos"'))
+    install("without-one", "lonely", GREETING.replace(', "Manners"', "").replace('"greet"', '"wave"'))
+    parts = dxlrun("--help").out.split("\n\n")
+    assert next(part for part in parts if part.startswith("Servos\n")).endswith(
+        "\ngreet         Greet a robot."
+    )
+    assert "Other commands\nwave  Greet a robot." in parts
+
+
 def test_a_foreign_package_adds_a_verb(install: Install, dxlrun: Dxlrun) -> None:
     install("good-manners", "greeting", GREETING)
     said = dxlrun("greet", "op3")
     assert (said.code, said.out) == (3, "hello op3\n")
-    assert dxlrun("--help").out.endswith(f"\nManners of other packages\n{'greet':<22}Greet a robot.\n")
+    assert "\n\nManners\ngreet  Greet a robot.\n\nArguments\n" in dxlrun("--help").out
     assert "command greet" in dxlrun("plugins").out
     assert "did you mean get or greet?" in dxlrun("gret").err
 

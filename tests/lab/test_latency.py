@@ -167,9 +167,9 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sente
     [
         ({"period_ns": 0}, "--period of 0 s: give from 10 us to 1 s"),
         ({"period_ns": 2 * 10**9}, "--period of 2 s: give from 10 us to 1 s"),
-        ({"iterations": 0}, "--iterations 0: give from 1 to 10,000,000"),
-        ({"iterations": -1}, "--iterations -1: give from 1 to 10,000,000"),
-        ({"iterations": 10**8}, "--iterations 100000000: give from 1 to 10,000,000"),
+        ({"iterations": 0}, "--count 0: give from 1 to 10,000,000"),
+        ({"iterations": -1}, "--count -1: give from 1 to 10,000,000"),
+        ({"iterations": 10**8}, "--count 100000000: give from 1 to 10,000,000"),
         ({"iterations": 3, "blocks": 4}, "3 iterations cannot be divided into 4 blocks"),
         ({"blocks": 0}, "--blocks 0: give from 1 to 1000"),
         ({"priority": 0}, "--priority 0: real-time priorities are 1 to 99"),

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.timeout(400)
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """A directory with the package that the page begins with."""
-    assert main(["new-plugin", "my_robotics", "--directory", str(tmp_path / "my_robotics")]) == 0
+    assert main(["new-plugin", "my_robotics", str(tmp_path / "my_robotics")]) == 0
     return tmp_path / "my_robotics"
 
 

@@ -89,7 +89,7 @@ def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: P
 
 
 def test_each_file_of_the_template_is_made_but_the_licence(said: Said, tmp_path: Path) -> None:
-    code, out, _ = said("new-plugin", "arm_waves", "--directory", "here/there", "--json")
+    code, out, _ = said("new-plugin", "arm_waves", "here/there", "--json")
     assert (code, json.loads(out)["directory"], len(json.loads(out)["files"])) == (0, "here/there", 9)
     made = [path for path in (tmp_path / "here/there").rglob("*") if path.is_file()]
     ours = [path for path in TEMPLATE.rglob("*") if path.is_file() and not set(path.parts) & set(_NOT_COPIED)]
@@ -126,16 +126,16 @@ def test_what_is_there_already_stays(said: Said, tmp_path: Path) -> None:
     (tmp_path / "arms").mkdir()
     (tmp_path / "file").write_text("mine")
     (tmp_path / "dangling").symlink_to("nowhere")
-    for words in (["arms"], ["arms", "--directory", "file"], ["arms", "--directory", "dangling"]):
+    for words in (["arms"], ["arms", "file"], ["arms", "dangling"]):
         code, _, err = said("new-plugin", *words)
         assert code == 2
-        assert err == f"dxlrun: {words[-1]} is there already, and stays; choose another --directory\n"
+        assert err == f"dxlrun: {words[-1]} is there already, and stays; choose another directory\n"
     assert (list((tmp_path / "arms").iterdir()), (tmp_path / "file").read_text()) == ([], "mine")
 
 
 def test_a_place_that_cannot_be_written_is_one_sentence(said: Said, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    code, _, err = said("new-plugin", "arms", "--directory", "file/arms")
+    code, _, err = said("new-plugin", "arms", "file/arms")
     assert (code, err.count("\n")) == (2, 1)
     assert "cannot be written: Not a directory" in err
 

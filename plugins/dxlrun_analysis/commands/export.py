@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.errors import InputError, counted
+from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.terminal import err, show, show_json
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ def export(
     output: Annotated[Path, Parameter(name="output")],
     /,
     *,
-    to: Format,
+    file_format: Annotated[Format, Parameter(name="--format")],
     topic: Annotated[str | None, Parameter(show_default=False)] = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
@@ -39,7 +38,7 @@ def export(
         The log of a run: an .mcap file, or the directory of a log in parts.
     output
         A new file for csv, a new directory for the other formats.
-    to
+    file_format
         csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
         commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set in the
         layout of LeRobotDataset v3.0.
@@ -49,22 +48,27 @@ def export(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun export logs/arm.mcap arm.csv --format csv
+    dxlrun export logs/arm.mcap arm_bag --format ros2bag
     """
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
-    if topic is not None and to != "csv":
-        raise InputError(f"--topic is for csv, and {to} has all topics; leave it out")
-    if to != "ros2bag" and find_spec("pyarrow") is None:
-        raise InputError(f"{to} needs pyarrow, which is not installed: pip install 'dxlrun[logs]'")
+    if topic is not None and file_format != "csv":
+        raise InputError(f"--topic is for csv, and {file_format} has all topics; leave it out")
+    if file_format != "ros2bag" and (missing := missing_extra(file_format, "logs", "pyarrow")):
+        raise InputError(missing)
     from dxlrun.log.reader import open_log
     from dxlrun.log.target import new_target
 
     with err().status(f"exporting {log}"), new_target(output) as beside:
-        count = _write(open_log(log), beside, to, topic)
+        count = _write(open_log(log), beside, file_format, topic)
     if as_json:
-        show_json({"output": str(output), "format": to, f"{_OF[to]}s": count})
+        show_json({"output": str(output), "format": file_format, f"{_OF[file_format]}s": count})
     else:
-        show(f"{output}: {counted(count, _OF[to], f'{_OF[to]}s')}")
+        show(f"{output}: {counted(count, _OF[file_format], f'{_OF[file_format]}s')}")
     return 0
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.errors import InputError, counted
+from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
 from dxlrun.output.terminal import print_warning, progress_bar, show, show_json
 
@@ -55,6 +54,11 @@ def logs(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun logs logs
+    dxlrun logs logs --where 'not good and lost > 10' --sort 'worst_wake_up_us DESC'
     """
     _check(directory, where, sort, sql)
     from dxlrun_analysis.season import query, runs
@@ -89,9 +93,8 @@ def _check(directory: Path, where: str | None, sort: str | None, sql: str | None
         wrong.append(f"there is no directory {directory}; {fix}")
     if sql is not None and (where is not None or sort is not None):
         wrong.append("--sql is a whole statement; write WHERE and ORDER BY in it, or leave it out")
-    missing = [name for name in ("duckdb", "pyarrow") if find_spec(name) is None]
-    if missing:
-        wrong.append(f"logs needs {' and '.join(missing)}, not installed: pip install 'dxlrun[logs]'")
+    if missing := missing_extra("logs", "logs", "duckdb", "pyarrow"):
+        wrong.append(missing)
     if wrong:
         raise InputError("\n".join(wrong))
 

@@ -82,7 +82,7 @@ class Settings:
         if not SHORTEST_NS <= self.period_ns <= LONGEST_NS:
             problems.append(f"--period of {self.period_ns * 1e-9:g} s: give from 10 us to 1 s")
         if not 1 <= self.iterations <= MOST_ITERATIONS:
-            problems.append(f"--iterations {self.iterations}: give from 1 to {MOST_ITERATIONS:,}")
+            problems.append(f"--count {self.iterations}: give from 1 to {MOST_ITERATIONS:,}")
         if not 1 <= self.priority <= 99:
             problems.append(f"--priority {self.priority}: real-time priorities are 1 to 99")
         if not 1 <= self.blocks <= MOST_BLOCKS:

@@ -23,7 +23,7 @@ Joints = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, c
 
 
 def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debug: Flag = False) -> int:
-    """Measure reference, direction and limits of joints by hand, and write them into the robot file.
+    """Measure reference, direction and limits of joints by hand: for the robot file.
 
     A dialogue: the joints become limp, are brought to their zero pose, and each to both of its ends. What
     changes in the file is shown first; all else in it stays as it is, comments too.
@@ -38,6 +38,11 @@ def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debu
         Only these joints, or the joints of these groups.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun calibrate arm.yaml port:=/dev/ttyUSB0
+    dxlrun calibrate arm.yaml --joint elbow
     """
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Terminal

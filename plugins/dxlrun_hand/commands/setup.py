@@ -26,7 +26,7 @@ def setup(
     find_port: Flag = False,
     debug: Flag = False,
 ) -> int:
-    """Give new servos, one after the other, the ID, rate and registers of a robot file.
+    """Give new servos the ID, rate and registers of a robot file: one after the other.
 
     A dialogue: each servo is connected alone, and written to as the file has it; at the end all are
     connected, read back and compared. A port that is not there is found by its adapter that is unplugged and
@@ -44,6 +44,11 @@ def setup(
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun setup arm.yaml port:=/dev/ttyUSB0
+    dxlrun setup arm.yaml --joint elbow
     """
     from dxlrun.description.reading import read_robot
     from dxlrun.dynamixel.port.serial_open import serial_devices

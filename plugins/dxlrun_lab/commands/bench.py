@@ -23,7 +23,7 @@ def bench_rate(
     robot: Path,
     /,
     *assignments: Assignment,
-    seconds: Seconds = 3.0,
+    duration: Seconds = 3.0,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -38,17 +38,22 @@ def bench_rate(
         The robot file.
     assignments
         Arguments of the robot file, for example port:=/dev/ttyUSB0.
-    seconds
+    duration
         How long each run lasts, s.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun bench rate robots/bioloid_torso.yaml
+    dxlrun bench rate arm.yaml --duration 10
     """
     if not robot.is_file():
         raise InputError(f"there is no robot file {robot}; check the path")
-    if not 0.1 <= seconds <= 3600:
-        raise InputError(f"--seconds {seconds:g}: give from 0.1 to 3600")
+    if not 0.1 <= duration <= 3600:
+        raise InputError(f"--duration {duration:g}: give from 0.1 to 3600")
     from dxlrun.description.reading import read_robot
     from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
 
@@ -56,7 +61,7 @@ def bench_rate(
     with runs_to_discard() as run:
         result = highest_rate(
             description,
-            seconds,
+            duration,
             run,
             lambda rate: None if as_json else show(f"running at {rate:g} Hz"),
         )

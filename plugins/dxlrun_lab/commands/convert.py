@@ -27,7 +27,7 @@ def convert(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Write the motion of a log, a foreign MCAP file or a ROS 2 bag to a new motion file.
+    """Write a recorded motion to a new motion file: of a log, a foreign MCAP file or a ROS 2 bag.
 
     `dxlrun ROBOT.yaml --play MOTION.yaml` and `dxlrun play MOTION.yaml` play it.
 
@@ -44,6 +44,11 @@ def convert(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun convert logs/arm.mcap wave.yaml
+    dxlrun convert logs/arm.mcap wave.yaml --from 2 --to 6 --joint elbow
     """
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")

@@ -1,19 +1,18 @@
 """`dxlrun identify`: a servo's motor, gear and control, from a run that excites it or from an earlier log.
 
-dxlrun identify robots/single_joint.yaml joint --write joint.motor.yaml
-dxlrun identify joint --log logs/single_joint.mcap
+dxlrun identify robots/single_joint.yaml joint --output joint.motor.yaml
+dxlrun identify joint --recorded logs/single_joint.mcap
 """
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Seconds, check_report, write_report
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, missing_extra
 from dxlrun.output.terminal import err, print_error, show, show_json
 from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words
 
@@ -27,12 +26,12 @@ _LONGEST_S = 3600.0
 
 def identify(
     *words: Words,
-    log: Path | None = None,
-    seconds: Seconds = 60.0,
+    recorded: Path | None = None,
+    duration: Seconds = 60.0,
     load_inertia: Number = None,
     load_gravity: Number = None,
     voltage: Number = None,
-    write: Path | None = None,
+    output: Path | None = None,
     options: OnRobot = DEFAULTS,
 ) -> int:
     """Identify servos: torque constant, resistance, inertia, friction, gain, delay; 95 % intervals.
@@ -44,9 +43,9 @@ def identify(
     ----------
     words
         A robot file with its arguments, or none: the robot that runs; and the joints.
-    log
+    recorded
         Take an earlier run instead of moving anything; without joints all of the log.
-    seconds
+    duration
         How long each joint is moved.
     load_inertia
         Inertia of what the joint moves, kg m^2; what is left is the motor's own.
@@ -55,42 +54,47 @@ def identify(
         otherwise that of the measured current, or of the manual's stall torque.
     voltage
         Voltage of the supply, V, instead of what the servo reports.
-    write
+    output
         Write the motor file of the joint, which its key `motor` in the robot file names.
+
+    Examples
+    --------
+    dxlrun identify arm.yaml elbow --output elbow.motor.yaml
+    dxlrun identify elbow --recorded logs/arm.mcap
     """
     from dxlrun_lab.commands.on_robot import Chosen, run_on_robot
 
-    _check(seconds, load_inertia, load_gravity, voltage)
+    _check(duration, load_inertia, load_gravity, voltage)
     joints = Chosen.of(words).joints
-    if write is not None:
-        _check_write(write, joints)
+    if output is not None:
+        _check_output(output, joints)
     if options.report is not None:
         check_report(options.report)
-    if find_spec("scipy") is None:
-        raise InputError("identify needs scipy; `pip install 'dxlrun[identify]'` installs it")
+    if missing := missing_extra("identify", "identify", "scipy"):
+        raise InputError(missing)
     from dxlrun_lab.identify.experiment import Identification, Options
     from dxlrun_lab.identify.result import KnownLoad
 
-    chosen = Options(seconds, load=KnownLoad(load_inertia, load_gravity), voltage=voltage)
-    if log is not None:
-        results, robot, code, recorded = _of_log(log, words, chosen, options), log.name, 0, None
+    chosen = Options(duration, load=KnownLoad(load_inertia, load_gravity), voltage=voltage)
+    if recorded is not None:
+        results, robot, code, log = _of_log(recorded, words, chosen, options), recorded.name, 0, None
     else:
         ran = run_on_robot(Identification(chosen), words, options)
-        results, robot, code, recorded = ran.result or (), ran.robot, ran.exit_code, ran.log
+        results, robot, code, log = ran.result or (), ran.robot, ran.exit_code, ran.log
     found = [each for each in results if each.identified is not None]
     for each in results:
         if each.identified is None:
             print_error(f"dxlrun: {each.refusal}")
-    if write is not None:
-        for each in results:  # of one joint: _check_write
+    if output is not None:
+        for each in results:  # of one joint: _check_output
             if each.identified is not None:
-                _write(write, each.joint, each.identified)
+                _write(output, each.joint, each.identified)
     if options.report is not None and found:
         from dxlrun_lab.identify.page import page
 
         write_report(options.report, page(robot, found))
-    _show(found, options, recorded, write)
-    if log is not None and results and not found:
+    _show(found, options, log, output)
+    if recorded is not None and results and not found:
         return 2
     return code or (1 if len(found) < len(results) else 0)
 
@@ -107,14 +111,14 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
         or options.range
         or any(":=" in word or "." in word for word in words)
     ):
-        raise InputError("--log takes an earlier run, in which nothing moves any more; name joints only")
+        raise InputError("--recorded takes an earlier run, in which nothing moves any more; name joints only")
     with err().status("computing the result"):
         return from_log(read_log(log), words, chosen)
 
 
-def _check(seconds: float, inertia: float | None, gravity: float | None, voltage: float | None) -> None:
-    if not 0.0 < seconds <= _LONGEST_S:
-        raise InputError(f"--seconds {seconds:g}: give how long each joint moves, at most {_LONGEST_S:g} s")
+def _check(duration: float, inertia: float | None, gravity: float | None, voltage: float | None) -> None:
+    if not 0.0 < duration <= _LONGEST_S:
+        raise InputError(f"--duration {duration:g}: give how long each joint moves, at most {_LONGEST_S:g} s")
     if inertia is not None and not 0.0 <= inertia < 1e3:
         raise InputError(f"--load-inertia {inertia:g}: give the inertia of the load in kg m^2, 0 or more")
     if gravity is not None and not 0.0 < gravity < 1e4:
@@ -123,10 +127,10 @@ def _check(seconds: float, inertia: float | None, gravity: float | None, voltage
         raise InputError(f"--voltage {voltage:g}: give the voltage of the supply, 1 to 60 V")
 
 
-def _check_write(target: Path, joints: tuple[str, ...]) -> None:
+def _check_output(target: Path, joints: tuple[str, ...]) -> None:
     """Raise InputError where a motor file cannot be written, before anything moves."""
     if len(joints) != 1:
-        raise InputError("--write takes the motor file of one joint; name that joint only")
+        raise InputError("--output takes the motor file of one joint; name that joint only")
     if target.exists():
         raise InputError(f"{target} exists, and is not overwritten; move it away, or write another file")
     if not target.parent.is_dir():
@@ -144,7 +148,7 @@ def _write(target: Path, joint: str, found: Identified) -> None:
         raise InputError(f"{target} cannot be written: {error.strerror or error}") from error
 
 
-def _show(found: list[JointResult], options: OnRobot, log: Path | None, write: Path | None) -> None:
+def _show(found: list[JointResult], options: OnRobot, log: Path | None, output: Path | None) -> None:
     from dxlrun_lab.identify.tables import parts
 
     results = [each.identified for each in found if each.identified is not None]
@@ -157,5 +161,5 @@ def _show(found: list[JointResult], options: OnRobot, log: Path | None, write: P
         show(f"\nlog: {log}")
     if options.report is not None and found:
         show(f"report: {options.report}")
-    if write is not None and found:
-        show(f"motor file: {write}")
+    if output is not None and found:
+        show(f"motor file: {output}")

@@ -19,7 +19,7 @@ _INTERRUPTED = 130
 
 def latency(
     *,
-    iterations: int = 10_000,
+    count: int = 10_000,
     period: str = "1ms",
     policy: Literal["other", "round_robin", "fifo"] | None = None,
     priority: int = 31,
@@ -35,13 +35,13 @@ def latency(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Measure how late this machine wakes a loop up, which waits as that of a run; no robot is used.
+    """Measure how late this machine wakes a loop up: one that waits as a run's; no robot is used.
 
     Ctrl-C ends the measurement and shows what was measured until then.
 
     Parameters
     ----------
-    iterations
+    count
         Wake-ups of each condition, in all blocks together.
     period
         Time between two deadlines, 10 us to 1 s.
@@ -74,13 +74,19 @@ def latency(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun latency
+    dxlrun latency --policy fifo --period 2ms --stress
+    dxlrun latency --compare other,round_robin,c --count 100000
     """
     import os
 
     from dxlrun_analysis.latency.conditions import Settings, conditions
 
     settings = Settings(
-        iterations=iterations,
+        iterations=count,
         period_ns=_duration("--period", period),
         priority=priority,
         conditions=conditions(compare, policy),

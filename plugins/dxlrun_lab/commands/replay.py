@@ -33,7 +33,7 @@ def replay(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Run the controllers of a log again on its inputs, and compare commands and goals bit for bit.
+    """Run the controllers of a log again: on its inputs; commands and goals are compared bit for bit.
 
     With --on: play the motion of a log, a foreign MCAP file or a ROS 2 bag on a robot. Ctrl-C brings the
     joints to rest and ends it.
@@ -50,6 +50,12 @@ def replay(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun replay logs/arm.mcap
+    dxlrun replay logs/arm.mcap --set arm.gains.p=5.0
+    dxlrun replay logs/arm.mcap --on arm.yaml --virtual --speed 0.5
     """
     if played_on.on is not None:
         if settings:

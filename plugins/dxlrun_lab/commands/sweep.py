@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +20,7 @@ from dxlrun.cli.inputs import (
     parse_assignments,
     terminated_as_interrupted,
 )
-from dxlrun.errors import InputError, Mark, Problem, counted
+from dxlrun.errors import InputError, Mark, Problem, counted, missing_extra
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
 from dxlrun_lab.sweep import By
 
@@ -46,7 +45,7 @@ def sweep(
     *assignments: Assignment,
     play: Motions = (),
     over: Ranges = (),
-    by: By = "rms",
+    sort: By = "rms",
     output: Path | None = None,
     picture: Path | None = None,
     workers: int | None = None,
@@ -54,7 +53,7 @@ def sweep(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Run a motion at many values of the robot file, on virtual time, and score each run.
+    """Run a motion at many values of the robot file: on virtual time; each run is scored.
 
     All cores are used. Rows are kept in a Parquet file as they come; the same command continues a sweep that
     was ended. Needs pyarrow: `pip install 'dxlrun[sweep]'`.
@@ -71,7 +70,7 @@ def sweep(
         Values of one place in the robot file, such as gains.p=0.5..3x8 (8 values), gains.p=0.1..10x5log
         (evenly spaced in their logarithm), gains.p=1,2,5, 'limits.acceleration=5 rad/s^2..20 rad/s^2x4'. May
         be given several times: every combination is run.
-    by
+    sort
         The score by which runs are ordered, the lowest first.
     output
         The Parquet file, or the directory for it; without it the directory sweeps.
@@ -85,9 +84,14 @@ def sweep(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun sweep arm.yaml --play wave.yaml --over gains.p=0.5..3x8
+    dxlrun sweep arm.yaml --play wave.yaml --over gains.p=1,2,5 --over gains.d=0,0.05 --picture map.svg
     """
-    if find_spec("pyarrow") is None:
-        raise InputError("a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'")
+    if missing := missing_extra("a sweep", "sweep", "pyarrow"):
+        raise InputError(missing)
     wrong = tuple(_mistakes(play, over, picture, workers, time_limit))
     known_file(robot)
     arguments = parse_assignments(assignments)
@@ -112,11 +116,11 @@ def sweep(
     except KeyboardInterrupt:
         interrupted = True
     if as_json:
-        show_json(_result(found, by, "interrupted" if interrupted else ""))
+        show_json(_result(found, sort, "interrupted" if interrupted else ""))
     else:
-        _show(found, by)
+        _show(found, sort)
     if picture is not None and found.rows:
-        _draw(picture, found, by)
+        _draw(picture, found, sort)
     if interrupted:
         print_error("interrupted")
         return _INTERRUPTED
@@ -161,8 +165,8 @@ def _mistakes(
         yield "nothing is swept; give --over PATH=LO..HIxN, as in --over gains.p=0.5..3x8"
     if picture is not None and picture.suffix.lower() not in (".svg", ".png", ".pdf"):
         yield f"--picture {picture} has no format; end it in .svg, .png or .pdf"
-    elif picture is not None and find_spec("matplotlib") is None:
-        yield "--picture needs matplotlib, which is not installed; pip install 'dxlrun[sweep]'"
+    elif picture is not None and (missing := missing_extra("--picture", "sweep", "matplotlib")):
+        yield missing
     elif picture is not None and not picture.parent.is_dir():
         yield f"--picture {picture}: there is no directory {picture.parent}; make it"
     elif picture is not None and len(over) > _MOST_DRAWN:

@@ -64,7 +64,7 @@ def excitation(
     """
     if seconds < LEAST_S:
         raise InputError(
-            f"{seconds:g} s are too short to identify a servo; give --seconds {LEAST_S:g} or more"
+            f"{seconds:g} s are too short to identify a servo; give --duration {LEAST_S:g} or more"
         )
     if room.upper - room.lower < 2 * LEAST_RANGE:
         raise InputError(

@@ -47,7 +47,7 @@ def parts(
         yield _best(columns, names, best, by)
     elif any(row.measured.scores is not None for row in rows):
         yield Sentence(
-            f"no run has a score for --by {by}: the motion gives nothing that it is counted from", "warning"
+            f"no run has a score for --sort {by}: the motion gives nothing that it is counted from", "warning"
         )
     results = (row.measured for row in rows if row.measured.scores is None)
     reasons = Counter((result.status, result.reason) for result in results).most_common(_SHOWN)

@@ -33,7 +33,7 @@ def _run(tokens: tuple[str, ...]) -> int:
 
             sys.stdout.write(f"{metadata.version('dxlrun')}\n")
             return 0
-        if not tokens or tokens in (("--help",), ("-h",)):
+        if not tokens or tokens in (("--help",), ("-h",), ("help",)):
             from dxlrun.cli.help import print_help
 
             print_help()

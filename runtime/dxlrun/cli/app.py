@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Group
 
 from dxlrun.cli import verbs
 from dxlrun.cli.run import run
@@ -27,14 +27,13 @@ INTERRUPTED = 130
 
 _PIPED_HELP = 80
 """Columns."""
-RUNNING = "Commands for a robot that runs"
-
+_BEHIND = 100
+"""Sort key of what comes behind the groups of verbs."""
+_PARAMETERS = Group("Parameters", sort_key=_BEHIND + 1)
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
-`dxlrun sim ROBOT.yaml` simulates its servos for other programs,
-`dxlrun analyze` reports what happened in a run, `dxlrun list` shows the robots that run,
-`dxlrun examples` has robots to start with."""
+`dxlrun examples` has robots to start with, `dxlrun help COMMAND` shows a command with examples."""
 
 USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
        dxlrun COMMAND ...
@@ -55,20 +54,30 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         usage=USAGE,
         version=_version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
+        group_arguments=Group("Arguments", sort_key=_BEHIND),
+        group_parameters=_PARAMETERS,
     )
     app.default(run)
-    for name, place in verbs.PLACES.items():
-        app.command(place, name=name)
-    for name, place in verbs.PLACES_WHILE_IT_RUNS.items():
-        app.command(place, name=name, group=RUNNING)
-    if listed or (verbs.is_verb(verb) and verb not in app):
+    found = {name: (place, group) for group, places in verbs.GROUPS.items() for name, place in places.items()}
+    if listed or (verbs.is_verb(verb) and verb not in found):
         for added in verbs.packaged().values():
             if not listed or verbs.is_importable(added):
-                app.command(added.place, name=added.name, group=added.group)
+                found[added.name] = added.place, added.group
+    headings = {group: Group(group, sort_key=order) for order, group in enumerate(verbs.GROUPS)}
+    first = [*verbs.GROUPS[verbs.EVERY_DAY], *found]
+    for name, (place, group) in found.items():
+        heading = headings.setdefault(group, Group(group, sort_key=len(headings)))
+        # those of every day stand in their order, all others by the alphabet
+        order = first.index(name) if group == verbs.EVERY_DAY else 0
+        app.command(place, name=name, group=heading, sort_key=order)
     if listed:
+        from dxlrun.cli.help import in_list  # not above: only a list of all needs it
+
         for command in app.resolved_commands().values():
-            command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time
+            command.help = in_list(command.help.partition("\n\n")[0])  # the rest takes time, too
     app.command(install_completion, name="--install-completion", version_flags=[])
+    for flag in ("--help", "--version", "--install-completion"):
+        app[flag].group = _PARAMETERS
     return app
 
 

@@ -42,7 +42,7 @@ class Example:
 def examples(
     name: str | None = None, directory: Path = _HERE, /, *, as_json: JsonFlag = False, debug: Flag = False
 ) -> int:
-    """List the robots that come along with dxlrun, or copy one and its motions, to be run and changed.
+    """List the robots that come with dxlrun, or copy one with its motions: to be run and changed.
 
     Parameters
     ----------
@@ -54,6 +54,11 @@ def examples(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun examples
+    dxlrun examples bioloid_torso my_robots
     """
     source = examples_directory()
     known = {path.stem: path for path in sorted(source.glob("*.yaml"))}
@@ -187,7 +192,7 @@ def schema(
     output: Path | None = None,
     debug: Flag = False,
 ) -> int:
-    """Print the JSON Schema of robot files, with the parameters of all installed controllers.
+    """Print the JSON Schema of robot files: with the parameters of all installed controllers.
 
     Editors with a YAML language server use it when the file's first line is
     `# yaml-language-server: $schema=robot.schema.json`.
@@ -200,6 +205,11 @@ def schema(
         Write it into this file instead.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun schema --output robot.schema.json
+    dxlrun schema motion --output motion.schema.json
     """
     text = schema_text(kind)
     if output is None:

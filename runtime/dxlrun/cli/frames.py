@@ -36,7 +36,7 @@ def frames(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Draw the frames of a robot after its URDF, or print where one of them lies in another one.
+    """Draw a robot's frames after its URDF, or print where one of them lies: in another one.
 
     Dashed: a frame that does not move in the one above it.
 
@@ -58,6 +58,12 @@ def frames(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun frames robots/bioloid_torso.yaml
+    dxlrun frames arm.yaml --of hand_link --in base_link --at elbow=30deg
+    dxlrun frames arm.yaml --graph arm.svg
     """
     if of is None and (at or relative_to):
         raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")

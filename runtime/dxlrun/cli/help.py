@@ -2,28 +2,50 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import textwrap
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dxlrun.contract.hookspecs import Command
 
 TEXT = Path(__file__).with_name("help.txt")
 _COLUMNS = 80
+_BEHIND = "Arguments"
+"""The heading behind those of verbs."""
 
 
 def print_help() -> None:
-    """Print the help; verbs of packages that did not come with dxlrun stand at its end."""
-    sys.stdout.write(TEXT.read_text("utf-8"))
+    """Print the help, with the verbs of packages that did not come with dxlrun."""
+    text = TEXT.read_text("utf-8")
     foreign = {one.name for one in entry_points(group="dxlrun") if one.dist and one.dist.name != "dxlrun"}
     if foreign:  # only then is the code of packages imported
-        from dxlrun.cli.verbs import package_of, packaged
+        from dxlrun.cli.verbs import packaged
 
-        added = [command for command in packaged().values() if not package_of(command.name)]
-        for group in dict.fromkeys(command.group for command in added):
-            rows = [(command.name, command.help) for command in added if command.group == group]
-            sys.stdout.write(f"\n{group} of other packages\n" + "".join(map(_row, rows)))
+        for command in packaged().values():
+            if not re.search(rf"^{command.name} ", text, re.MULTILINE):
+                text = _with_verb(text, command)
+    sys.stdout.write(text)
 
 
-def _row(row: tuple[str, str]) -> str:
-    name, about = row
-    return textwrap.fill(about, _COLUMNS, initial_indent=f"{name:<22}", subsequent_indent=" " * 22) + "\n"
+def _with_verb(text: str, command: Command) -> str:
+    """Return the help with one verb more, at the end of its group, or in a group of its own."""
+    parts = text.split("\n\n")
+    headings = [part.partition("\n")[0] for part in parts]
+    if command.group not in headings:
+        headings.insert(headings.index(_BEHIND), command.group)
+        parts.insert(headings.index(command.group), command.group)
+    place = headings.index(command.group)
+    first = re.search(r"\n(\S+ +)", parts[place])
+    width = max(len(first[1]) if first else 0, len(command.name) + 2)
+    about = textwrap.indent(textwrap.fill(in_list(command.help), _COLUMNS - width), " " * width)
+    parts[place] += f"\n{command.name.ljust(width)}{about[width:]}"
+    return "\n\n".join(parts)
+
+
+def in_list(about: str) -> str:
+    """Return what a list of verbs shows of the line about one: the part before a colon or a semicolon."""
+    return " ".join(re.split("[:;]", about)[0].split()).removesuffix(".") + "."

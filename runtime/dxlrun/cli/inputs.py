@@ -6,14 +6,13 @@ import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from dxlrun.cli import verbs
-from dxlrun.errors import InputError, suggestion
+from dxlrun.errors import InputError, missing_extra, suggestion
 
 if TYPE_CHECKING:
     from cyclopts import Token
@@ -143,10 +142,8 @@ def check_report(target: Path, library: str = "matplotlib") -> None:
         raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
     if not target.parent.is_dir():
         raise InputError(f"there is no directory {target.parent} for the report; make it first")
-    if find_spec(library) is None:
-        raise InputError(
-            f"a report needs {library} for its plots; `pip install 'dxlrun[report]'` installs it"
-        )
+    if missing := missing_extra("a report", "report", library):
+        raise InputError(missing)
 
 
 def write_report(target: Path, page: str) -> None:
@@ -172,8 +169,6 @@ def known_file(robot: Path) -> None:
             f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` "
             "where dxlrun came from installs it"
         )
-    known = verbs.names()
-    hint = suggestion(
-        word, known, f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(known)}"
-    )
+    otherwise = "a robot is run by `dxlrun ROBOT.yaml`, `dxlrun help` lists the commands"
+    hint = suggestion(word, verbs.names(), otherwise)
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")

@@ -41,6 +41,10 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun plugins
     """
     from dxlrun.control.controllers.plugins import load_plugins
 
@@ -137,9 +141,9 @@ def _table(row: Row) -> Table:
 
 
 def new_plugin(
-    name: str, /, *, directory: Path | None = None, as_json: JsonFlag = False, debug: Flag = False
+    name: str, directory: Path | None = None, /, *, as_json: JsonFlag = False, debug: Flag = False
 ) -> int:
-    """Make a package with a controller of your own, a robot file that uses it, and a test.
+    """Make a package with a controller of your own: a robot file that uses it, and a test.
 
     Parameters
     ----------
@@ -151,11 +155,15 @@ def new_plugin(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun new-plugin my_robotics
     """
     module = _module(name)
     place = Path(name) if directory is None else directory
     if place.exists() or place.is_symlink():
-        raise InputError(f"{place} is there already, and stays; choose another --directory")
+        raise InputError(f"{place} is there already, and stays; choose another directory")
     files = dict(_files(_template(), module))
     try:
         for path, text in files.items():

@@ -8,50 +8,55 @@ from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from itertools import chain
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dxlrun.contract.hookspecs import Command
 
-PLACES = {
-    "examples": "dxlrun.cli.examples:examples",
-    "check": "dxlrun.cli.check:check",
-    "frames": "dxlrun.cli.frames:frames",
-    "sim": "dxlrun.cli.sim.sim:sim",
-    "schema": "dxlrun.cli.examples:schema",
-    "models": "dxlrun.cli.tools.models:models",
-    "plugins": "dxlrun.cli.plugins:plugins",
-    "new-plugin": "dxlrun.cli.plugins:new_plugin",
-    "scan": "dxlrun.cli.tools.scan:scan",
-    "servo": "dxlrun.cli.tools.servo:servo",
-    "doctor": "dxlrun.cli.doctor:doctor",
+EVERY_DAY = "Every day"
+_CLI, _STEERING, _TOOLS = "dxlrun.cli", "dxlrun.cli.steering", "dxlrun.cli.tools"
+GROUPS: Mapping[str, Mapping[str, str]] = {
+    EVERY_DAY: {  # in the order in which they are needed
+        "help": f"{_CLI}.verb_help:show_help",
+        "examples": f"{_CLI}.examples:examples",
+        "doctor": f"{_CLI}.doctor:doctor",
+        "scan": f"{_TOOLS}.scan:scan",
+        "check": f"{_CLI}.check:check",
+        "list": f"{_STEERING}.steer:list_robots",
+        "watch": f"{_STEERING}.watch:watch",
+        "play": f"{_STEERING}.play:play",
+        "stop": f"{_STEERING}.steer:stop",
+    },
+    "Robots that run": {
+        "get": f"{_STEERING}.joints:get",
+        "set": f"{_STEERING}.joints:set_register",
+        "torque": f"{_STEERING}.joints:torque",
+        "reboot": f"{_STEERING}.joints:reboot",
+        "switch": f"{_STEERING}.steer:switch",
+        "send": f"{_STEERING}.goals:send",
+        "cancel": f"{_STEERING}.goals:cancel",
+        "parameters": f"{_STEERING}.parameters:parameters",
+        "echo": f"{_STEERING}.echo:echo",
+        "rate": f"{_STEERING}.steer:rate",
+        "halt": f"{_STEERING}.steer:halt",
+        "pause": f"{_STEERING}.steer:pause",
+        "resume": f"{_STEERING}.steer:resume",
+        "load": f"{_STEERING}.steer:load",
+        "unload": f"{_STEERING}.steer:unload",
+    },
+    "Robot files": {"frames": f"{_CLI}.frames:frames", "models": f"{_TOOLS}.models:models"},
+    "Servos": {"servo": f"{_TOOLS}.servo:servo", "sim": f"{_CLI}.sim.sim:sim"},
+    "Logs": {},
+    "Experiments": {},
+    "Developing": {
+        "schema": f"{_CLI}.examples:schema",
+        "plugins": f"{_CLI}.plugins:plugins",
+        "new-plugin": f"{_CLI}.plugins:new_plugin",
+    },
 }
-"""`module:function` of each verb of the core; it is imported when it is used."""
-PLACES_WHILE_IT_RUNS = {
-    verb: f"dxlrun.cli.steering.{place}"
-    for verb, place in {
-        "list": "steer:list_robots",
-        "watch": "watch:watch",
-        "get": "joints:get",
-        "set": "joints:set_register",
-        "torque": "joints:torque",
-        "reboot": "joints:reboot",
-        "switch": "steer:switch",
-        "send": "goals:send",
-        "play": "play:play",
-        "cancel": "goals:cancel",
-        "parameters": "parameters:parameters",
-        "echo": "echo:echo",
-        "rate": "steer:rate",
-        "halt": "steer:halt",
-        "pause": "steer:pause",
-        "resume": "steer:resume",
-        "load": "steer:load",
-        "unload": "steer:unload",
-        "stop": "steer:stop",
-    }.items()
-}
-"""Verbs for a robot that runs, in the same way."""
+"""The headings of the help in their order, and `module:function` of each verb of the core, which is imported
+when it is used. Verbs of packages name their heading, see `Command.group`."""
 _PACKAGES = {
     "dxlrun_analysis": ("analyze", "export", "logs"),
     "dxlrun_foxglove": ("foxglove",),
@@ -83,7 +88,7 @@ def packaged() -> Mapping[str, Command]:
             hook = getattr(point.load(), "dxlrun_commands", None)
             for command in hook() if hook is not None else ():
                 found.setdefault(command.name, command)
-    return {name: one for name, one in found.items() if name not in {**PLACES, **PLACES_WHILE_IT_RUNS}}
+    return {name: one for name, one in found.items() if not any(name in verbs for verbs in GROUPS.values())}
 
 
 def is_importable(command: Command) -> bool:
@@ -96,8 +101,8 @@ def is_importable(command: Command) -> bool:
 
 
 def names() -> list[str]:
-    """Return all verbs, those for a robot that runs last."""
-    return sorted({*PLACES, *packaged()}) + list(PLACES_WHILE_IT_RUNS)
+    """Return all verbs, by the alphabet."""
+    return sorted({*chain(*GROUPS.values()), *packaged()})
 
 
 def package_of(verb: str) -> str:

@@ -45,8 +45,9 @@ class Command(NamedTuple):
     """`module:function`, or `module:app` of a cyclopts App; imported when the verb is used."""
     help: str
     """One line, for `dxlrun --help`."""
-    group: str = "Commands"
-    """The heading under which the help shows it."""
+    group: str = "Other commands"
+    """The heading under which the help shows it: `Robots that run`, `Robot files`, `Servos`, `Logs`,
+    `Experiments`, `Developing`, or one of its own."""
 
 
 class HookSpecs:

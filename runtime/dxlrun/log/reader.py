@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.errors import InputError, LogError, suggestion
+from dxlrun.errors import InputError, LogError, missing_extra, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.reading.chunks import McapFile, gathered
 from dxlrun.log.reading.slices import Log, Slicer, joined
@@ -165,7 +165,7 @@ class LogReader:
         try:
             import pyarrow as pa
         except ImportError as error:
-            raise InputError("Arrow needs the extra logs: pip install 'dxlrun[logs]'") from error
+            raise InputError(missing_extra("Arrow", "logs", "pyarrow") or str(error)) from error
         from dxlrun.log.reading.arrow import batch_of, schema_of
 
         reader = self._column_reader(topic)

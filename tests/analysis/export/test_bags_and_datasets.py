@@ -37,7 +37,7 @@ def test_a_bag_has_the_messages_types_and_quality_of_the_log(
     run: Path, tmp_path: Path, export: Export
 ) -> None:
     bag = tmp_path / "bag"
-    assert export(run, bag, "--to", "ros2bag")[0] == 0
+    assert export(run, bag, "--format", "ros2bag")[0] == 0
 
     assert (bag / run.name).read_bytes() == run.read_bytes()
     with Reader(bag) as reader:
@@ -56,7 +56,7 @@ def test_a_bag_has_the_messages_types_and_quality_of_the_log(
 
 
 def test_the_files_of_a_split_log_are_one_bag(split: Path, tmp_path: Path, export: Export) -> None:
-    code, said, _ = export(split, tmp_path / "bag", "--to", "ros2bag", "--json")
+    code, said, _ = export(split, tmp_path / "bag", "--format", "ros2bag", "--json")
     parts = sorted(split.iterdir())
     assert (code, len(parts)) == (0, 2)
     count = json.loads(said)["messages"]
@@ -71,7 +71,7 @@ def test_a_split_log_is_exported_as_a_whole_one(
     split: Path, run: Path, tmp_path: Path, export: Export, to: str
 ) -> None:
     said = [
-        json.loads(export(log, tmp_path / name, "--to", to, "--json")[1])
+        json.loads(export(log, tmp_path / name, "--format", to, "--json")[1])
         for log, name in ((split, "split"), (run, "run"))
     ]
     counts = [one.get("rows") or one["frames"] for one in said]
@@ -81,14 +81,14 @@ def test_a_split_log_is_exported_as_a_whole_one(
 def test_a_log_without_an_end_is_refused(run: Path, tmp_path: Path, export: Export) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(run.read_bytes()[:-100])
-    code, _, (error,) = export(broken, tmp_path / "bag", "--to", "ros2bag")
+    code, _, (error,) = export(broken, tmp_path / "bag", "--format", "ros2bag")
     assert (code, list(tmp_path.iterdir())) == (2, [broken])
     assert "`mcap recover" in error
 
 
 def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export: Export) -> None:
     root = tmp_path / "set"
-    assert export(run, root, "--to", "lerobot")[0] == 0
+    assert export(run, root, "--format", "lerobot")[0] == 0
 
     log = read_log(run)
     info = json.loads((root / "meta/info.json").read_text())
@@ -133,7 +133,7 @@ def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(
     made: Callable[..., Path], tmp_path: Path, export: Export
 ) -> None:
     log = made(*ROWS, skipped={4: 2})
-    assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
+    assert export(log, tmp_path / "set", "--format", "lerobot")[0] == 0
 
     data = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     first, last = [0.1, 1.0], [0.3, 1.2]
@@ -150,7 +150,7 @@ def test_cycles_that_are_missing_end_an_episode(
 ) -> None:
     """No frames are made up for them."""
     log = made(*ROWS)
-    assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
+    assert export(log, tmp_path / "set", "--format", "lerobot")[0] == 0
 
     data = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     states = np.array(data["observation.state"].to_pylist())
@@ -195,14 +195,14 @@ def test_a_rate_that_a_data_set_cannot_have_is_refused(
     made: Callable[..., Path], tmp_path: Path, export: Export, options: dict[str, int], sentence: str
 ) -> None:
     log = made(*((n, (0.1, 1.0), (0.1, 0.5), (NAN, NAN)) for n in range(3)), **options)
-    code, _, (error,) = export(log, tmp_path / "set", "--to", "lerobot")
+    code, _, (error,) = export(log, tmp_path / "set", "--format", "lerobot")
     assert (code, list(tmp_path.iterdir())) == (2, [log])
     assert sentence in error
 
 
 def test_a_log_without_goals_has_no_frames(made: Callable[..., Path], tmp_path: Path, export: Export) -> None:
     log = made((0, (0.1, 1.0), (NAN, NAN), (NAN, NAN)))
-    code, _, (error,) = export(log, tmp_path / "set", "--to", "lerobot")
+    code, _, (error,) = export(log, tmp_path / "set", "--format", "lerobot")
     assert (code, list(tmp_path.iterdir())) == (2, [log])
     assert "so no frames" in error
 
@@ -245,7 +245,7 @@ def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
 ) -> None:
     log = foreign(run, tmp_path / "odd.mcap", topic)
     (tmp_path / "out").mkdir()
-    code, _, errors = export(log, tmp_path / "out" / "out", "--to", to)
+    code, _, errors = export(log, tmp_path / "out" / "out", "--format", to)
     assert not any("internal error" in line for line in errors)
     assert code in (0, 1, 2)
     assert {path.name for path in tmp_path.iterdir()} <= {"odd.mcap", "out"}
@@ -255,7 +255,7 @@ def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
 
 def test_a_topic_without_a_type_is_no_topic_of_a_bag(run: Path, tmp_path: Path, export: Export) -> None:
     log = foreign(run, tmp_path / "odd.mcap", "/goals", typed=False)
-    code, _, errors = export(log, tmp_path / "bag", "--to", "ros2bag")
+    code, _, errors = export(log, tmp_path / "bag", "--format", "ros2bag")
     assert (code, len(errors)) == (2, 1)
     assert "its topic '/foreign' has no type, and a bag needs one" in errors[0]
     assert not (tmp_path / "bag").exists()

@@ -32,7 +32,7 @@ def lines(path: Path) -> list[dict[str, str]]:
 
 
 def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: Export) -> None:
-    code, said, _ = export(run, tmp_path / "out", "--to", "parquet", "--json")
+    code, said, _ = export(run, tmp_path / "out", "--format", "parquet", "--json")
 
     log = read_log(run)
     tables = {path.stem: pq.read_table(path) for path in (tmp_path / "out").iterdir()}
@@ -76,7 +76,7 @@ def test_states_of_sources_and_commands_of_devices_have_columns(
 ) -> None:
     run = tmp_path / "run.mcap"
     simulated_robot(ROBOTS / f"{robot}.yaml", duration_s=0.1, log=run).run()
-    assert export(run, tmp_path / "out", "--to", "parquet")[0] == 0
+    assert export(run, tmp_path / "out", "--format", "parquet")[0] == 0
 
     log, cycles = read_log(run), pq.read_table(tmp_path / "out" / "cycles.parquet")
     layout = log.header.layout
@@ -97,7 +97,7 @@ def test_csv_has_a_line_a_cycle_and_nothing_where_nothing_is_known(
 ) -> None:
     log = made((0, (0.5, NAN), (NAN, 0.25), (2.0, NAN)), (3, (0.6, 1.0), (NAN, 0.5), (2.0, NAN)))
 
-    assert export(log, tmp_path / "out.csv", "--to", "csv")[0] == 0
+    assert export(log, tmp_path / "out.csv", "--format", "csv")[0] == 0
 
     first, second = lines(tmp_path / "out.csv")
     assert (first["cycle"], second["cycle"], second["time_s"]) == ("0", "3", "0.06")
@@ -107,7 +107,7 @@ def test_csv_has_a_line_a_cycle_and_nothing_where_nothing_is_known(
 
 def test_csv_of_another_topic(run: Path, tmp_path: Path, export: Export) -> None:
     for topic, name in (("/bus/main", "bus.csv"), ("/events", "events.csv")):
-        assert export(run, tmp_path / name, "--to", "csv", "--topic", topic)[0] == 0
+        assert export(run, tmp_path / name, "--format", "csv", "--topic", topic)[0] == 0
     log = read_log(run)
     packets = lines(tmp_path / "bus.csv")
     assert [packet["data"] for packet in packets] == [packet.data.hex() for packet in log.packets]
@@ -118,8 +118,8 @@ def test_csv_of_another_topic(run: Path, tmp_path: Path, export: Export) -> None
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--to", "csv", "--topic", "/goal"), "it has no records of /goal; did you mean /goals?"),
-        (("--to", "parquet", "--topic", "/goals"), "--topic is for csv, and parquet has all topics"),
+        (("--format", "csv", "--topic", "/goal"), "it has no records of /goal; did you mean /goals?"),
+        (("--format", "parquet", "--topic", "/goals"), "--topic is for csv, and parquet has all topics"),
     ],
 )
 def test_a_wrong_topic_is_one_sentence_and_leaves_nothing(
@@ -136,17 +136,17 @@ def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
 ) -> None:
     there = tmp_path / "there"
     there.write_text("precious")
-    code, _, (error,) = export(run, there, "--to", to)
+    code, _, (error,) = export(run, there, "--format", to)
     assert (code, there.read_text()) == (2, "precious")
     assert "there exists, and nothing is written over" in error
 
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"not a log")
-    code, _, (error,) = export(broken, tmp_path / "out", "--to", to)
+    code, _, (error,) = export(broken, tmp_path / "out", "--format", to)
     assert (code, sorted(tmp_path.iterdir())) == (2, [broken, there])
     assert f"{broken}: this is no MCAP file" in error
 
-    code, _, (error,) = export(run, tmp_path / "nowhere" / "out", "--to", to)
+    code, _, (error,) = export(run, tmp_path / "nowhere" / "out", "--format", to)
     assert code == 2
     assert "there is no directory" in error
 
@@ -169,7 +169,7 @@ def test_a_full_disk_leaves_nothing(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
-    code, _, (error,) = export(run, tmp_path / "out", "--to", "parquet")
+    code, _, (error,) = export(run, tmp_path / "out", "--format", "parquet")
     assert (code, list(tmp_path.iterdir())) == (2, [])
     assert error.endswith("out cannot be written: No space left on device")
 
@@ -190,8 +190,10 @@ def test_logs_md_its_exports_are_made(
 def test_without_pyarrow_one_sentence_has_the_command(
     run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun_analysis.commands.export.find_spec", lambda name: None)
-    code, _, errors = export(run, tmp_path / "out", "--to", "parquet")
+    monkeypatch.setattr("dxlrun.errors.find_spec", lambda name: None)
+    code, _, errors = export(run, tmp_path / "out", "--format", "parquet")
     assert code == 2
-    assert errors == ["dxlrun: parquet needs pyarrow, which is not installed: pip install 'dxlrun[logs]'"]
-    assert export(run, tmp_path / "bag", "--to", "ros2bag")[0] == 0
+    assert errors == [
+        "dxlrun: parquet needs pyarrow, which is not installed; `pip install 'dxlrun[logs]'` installs it"
+    ]
+    assert export(run, tmp_path / "bag", "--format", "ros2bag")[0] == 0

@@ -211,7 +211,7 @@ def test_a_log_in_parts_and_the_bag_that_dxlrun_writes(swing: Path, tmp_path: Pa
     (parts / "notes.txt").write_text("not of the log")
     whole = read_motion(swing)
     assert np.array_equal(read_motion(parts).position, whole.position)
-    assert dxlrun("export", swing, tmp_path / "bag", "--to", "ros2bag").code == 0
+    assert dxlrun("export", swing, tmp_path / "bag", "--format", "ros2bag").code == 0
     motion = read_motion(tmp_path / "bag", topic="/joint_states")
     assert motion.joints == whole.joints
     assert motion.what == ("states", "states")

@@ -268,7 +268,10 @@ def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
         ("missing", "there is no directory"),
         ("file", "`dxlrun analyze`"),
         ("empty", "there are no logs"),
-        ("no duckdb", "logs needs duckdb and pyarrow, not installed: pip install 'dxlrun[logs]'"),
+        (
+            "no duckdb",
+            "duckdb and pyarrow, which are not installed; `pip install 'dxlrun[logs]'` installs them",
+        ),
         ("no cache", "XDG_CACHE_HOME names another place"),
     ],
 )
@@ -279,7 +282,7 @@ def test_what_cannot_be_is_one_sentence(  # noqa: PLR0917  fixtures
     (season / "empty").mkdir()
     place = {"missing": season / "june", "file": notes, "empty": season / "empty"}.get(kind, season)
     if kind == "no duckdb":
-        monkeypatch.setattr("dxlrun_analysis.commands.logs.find_spec", lambda name: None)
+        monkeypatch.setattr("dxlrun.errors.find_spec", lambda name: None)
     if kind == "no cache":
         monkeypatch.setenv("XDG_CACHE_HOME", str(notes))
     said = dxlrun("logs", place)

@@ -20,7 +20,7 @@ OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")
 @pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])
 def test_the_other_commands_of_the_page(number, sentence, dxlrun, here):
     words = [word.replace("/dev/ttyUSB0", "sim") for word in OF_THE_PAGE[number]]
-    said = dxlrun(*words, *(["--virtual", "--seconds", "0.5"] if number == 1 else []))
+    said = dxlrun(*words, *(["--virtual", "--duration", "0.5"] if number == 1 else []))
     assert said.code == 2
     assert sentence in said.err
 
@@ -28,7 +28,7 @@ def test_the_other_commands_of_the_page(number, sentence, dxlrun, here):
 def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     """The first command of the page, for 10 s."""
     motor, report = here / "joint.motor.yaml", here / "report.html"
-    said = dxlrun(*OF_THE_PAGE[0], "--seconds", 10, "--report", report)
+    said = dxlrun(*OF_THE_PAGE[0], "--duration", 10, "--report", report)
     assert said.code == 0, said.err
     assert "joint (MX-64)" in said.out
     assert "* torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
@@ -40,7 +40,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     assert read_motor(motor).motor.torque_constant == pytest.approx(1.6315, rel=0.03)
     assert "fit and residual" in report.read_text()
     text = motor.read_text()
-    again = dxlrun("identify", ROBOT, "joint", "--virtual", "--write", motor)
+    again = dxlrun("identify", ROBOT, "joint", "--virtual", "--output", motor)
     assert again.code == 2
     assert "exists, and is not overwritten" in again.err
     assert motor.read_text() == text
@@ -49,7 +49,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
 @pytest.mark.campaign
 @pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
 def test_a_log_as_json(xl330, dxlrun):
-    said = dxlrun("identify", "--log", xl330.log.path, "--load-inertia", 0.005, "--json")
+    said = dxlrun("identify", "--recorded", xl330.log.path, "--load-inertia", 0.005, "--json")
     assert said.code == 0, said.err
     (found,) = json.loads(said.out)
     assert (found["joint"], found["scale"]) == ("elbow", "current")
@@ -59,7 +59,7 @@ def test_a_log_as_json(xl330, dxlrun):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((ROBOT, "joint", "--virtual", "--seconds", "2"), "2 s are too short"),
+        ((ROBOT, "joint", "--virtual", "--duration", "2"), "2 s are too short"),
         ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
     ],
 )
@@ -70,7 +70,7 @@ def test_refusals(words, sentence, dxlrun, here):
 
 
 def test_a_log_takes_joints_only(xl330, dxlrun):
-    said = dxlrun("identify", ROBOT, "elbow", "--log", xl330.log.path)
+    said = dxlrun("identify", ROBOT, "elbow", "--recorded", xl330.log.path)
     assert said.code == 2
-    assert "--log takes an earlier run" in said.err
-    assert "no joint elbw" in dxlrun("identify", "elbw", "--log", xl330.log.path).err
+    assert "--recorded takes an earlier run" in said.err
+    assert "no joint elbw" in dxlrun("identify", "elbw", "--recorded", xl330.log.path).err

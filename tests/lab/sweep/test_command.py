@@ -106,13 +106,13 @@ def test_the_best_runs_come_first(sweep, no_workers):
     assert ["2", "crashed", "its", "process", "ended", "2", "times"] in lines
     again = sweep(*words)
     assert "8 of 8 runs, 6 of them before" in again.out  # the crashed ones were tried again
-    by_energy = json.loads(sweep(*words, "--by", "energy", "--json").out)
+    by_energy = json.loads(sweep(*words, "--sort", "energy", "--json").out)
     assert [row["values"]["controllers.arm_pid.gains.p"] for row in by_energy["rows"]][:3] == [4.0, 4.0, 7.0]
     assert by_energy["rows"][-1]["status"] == "crashed"
     assert by_energy["rows"][-1]["scores"] is None
     assert by_energy["counts"] == {"points": 8, "there": 6, "measured": 2}
-    by_settling = sweep(*words, "--by", "settling")
-    assert "no run has a score for --by settling" in by_settling.out
+    by_settling = sweep(*words, "--sort", "settling")
+    assert "no run has a score for --sort settling" in by_settling.out
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,9 @@ def test_the_commands_of_the_page_are_understood(no_workers, here, dxlrun):
 
 
 def test_without_its_library_one_sentence_has_the_command(sweep, monkeypatch):
-    monkeypatch.setattr("dxlrun_lab.commands.sweep.find_spec", lambda name: None)
+    monkeypatch.setattr("dxlrun.errors.find_spec", lambda name: None)
     said = sweep("--over", "gains.p=1,2")
-    sentence = "dxlrun: a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"
+    sentence = (
+        "dxlrun: a sweep needs pyarrow, which is not installed; `pip install 'dxlrun[sweep]'` installs it"
+    )
     assert (said.code, said.errors) == (2, [sentence])

@@ -61,7 +61,7 @@ def sim(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Serve simulated servos on pseudo-terminals until Ctrl-C, for any program that speaks Dynamixel.
+    """Serve simulated servos on pseudo-terminals: for any program that speaks Dynamixel, until Ctrl-C.
 
     Give a robot file, servos by `--servo`, or a log by `--recorded`. Faults can be typed while it runs;
     `help` lists them.
@@ -105,6 +105,12 @@ def sim(
         Print the ports as JSON, then a line of JSON for each fault.
     debug
         Print the traceback of an error, and the output of the servos' process.
+
+    Examples
+    --------
+    dxlrun sim robots/bioloid_torso.yaml
+    dxlrun sim --servo XL430-W250:1-3 --link /tmp/arm
+    dxlrun sim arm.yaml --fault 'lose servo=3 at=2s'
     """
     leave_real_time()
     mistakes = Mistakes()

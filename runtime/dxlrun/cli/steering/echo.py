@@ -27,7 +27,7 @@ def echo(
     rate: Hertz | None = None,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
-    """Print the messages of a topic of a running robot as they come: `dxlrun echo /arm/state`.
+    """Print the messages of a topic as they come: `dxlrun echo /arm/state`.
 
     Without a topic, list those that there are. Ctrl-C ends it, and so does the end of the run.
 
@@ -39,6 +39,12 @@ def echo(
         End after so many messages.
     rate
         Print at most so many messages a second, the newest each time, Hz.
+
+    Examples
+    --------
+    dxlrun echo
+    dxlrun echo /arm/state --count 10
+    dxlrun echo joint_states --rate 5 --json
     """
     if count is not None and count < 1:
         raise InputError(f"--count {count} is no number of messages; give 1 or more")

@@ -56,7 +56,7 @@ ONLY_ONE = Chosen()
 def list_robots(
     *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: Flag = False
 ) -> int:
-    """List the robots that run, with their controllers, devices and sensors, and the commands these take.
+    """List the robots that run: their controllers, devices and sensors, and the commands these take.
 
     Parameters
     ----------
@@ -68,6 +68,11 @@ def list_robots(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun list
+    dxlrun list --graph
     """
     from dxlrun.remote.client import connect, running
 
@@ -95,7 +100,7 @@ def list_robots(
 
 
 def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
-    """Activate and deactivate controllers of a running robot in one cycle, or not at all.
+    """Activate and deactivate controllers of a running robot: in one cycle, or not at all.
 
     Parameters
     ----------
@@ -103,6 +108,11 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
         Controllers to activate.
     deactivate
         Controllers to deactivate.
+
+    Examples
+    --------
+    dxlrun switch --activate arm
+    dxlrun switch --activate arm --deactivate whole_body
     """
     if not activate and not deactivate:
         raise InputError("nothing to switch; write --activate NAME, --deactivate NAME, or both")
@@ -124,6 +134,11 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     hz
         Cycles per second, Hz.
+
+    Examples
+    --------
+    dxlrun rate 100
+    dxlrun rate 50Hz
     """
     if not 0 < hz < float("inf"):  # false for nan too
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
@@ -133,7 +148,12 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def halt(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Let every joint of a running robot come to a stop within its limits and hold; the run goes on."""
+    """Let every joint come to a stop within its limits, and hold: the run goes on.
+
+    Examples
+    --------
+    dxlrun halt
+    """
     with robot_of(chosen, "halt") as robot:
         done = robot.halt()
         text = f"{robot.name} stands still"
@@ -143,7 +163,12 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Pause a running robot: its joints are held, its controllers' time stops."""
+    """Pause a running robot: its joints are held, its controllers' time stops.
+
+    Examples
+    --------
+    dxlrun pause
+    """
     with robot_of(chosen, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
@@ -151,7 +176,12 @@ def pause(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def resume(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Resume the controllers of a paused robot where they were."""
+    """Resume the controllers of a paused robot where they were.
+
+    Examples
+    --------
+    dxlrun resume
+    """
     with robot_of(chosen, "resume") as robot:
         done = robot.resume()
         return report_done(robot, chosen, done, f"{robot.name} runs again")
@@ -168,6 +198,11 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
         Its keys as in the robot file, such as type=joint_group_position_controller 'joints=[head_yaw_joint]'.
     file
         A YAML file with its keys, instead of the words.
+
+    Examples
+    --------
+    dxlrun load head type=joint_group_position_controller 'joints=[head_yaw_joint]'
+    dxlrun load head --file head.yaml
     """
     from dxlrun.cli.steering.written import Written
 
@@ -187,6 +222,10 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     name
         Name of the controller.
+
+    Examples
+    --------
+    dxlrun unload head
     """
     with robot_of(chosen, "unload") as robot:
         done = robot.unload(name)
@@ -200,6 +239,11 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     no_wait
         Return as soon as the loop has accepted it.
+
+    Examples
+    --------
+    dxlrun stop
+    dxlrun stop --robot bioloid_torso --no-wait
     """
     with robot_of(chosen, "stop") as robot:
         robot.stop(wait=not no_wait)

@@ -39,7 +39,7 @@ def models(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """List the models of servos and devices that a robot file can name, or print one's control table.
+    """List the models of servos and devices, or print one's control table: those that a robot file can name.
 
     Parameters
     ----------
@@ -51,6 +51,12 @@ def models(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun models
+    dxlrun models AX-12A
+    dxlrun models --protocol 2.0
     """
     from dxlrun.control.controllers.plugins import load_plugins
 

@@ -43,7 +43,7 @@ def scan(
     protocol: float | None = None,
     baud: Rates = (),
     ids: str | None = None,
-    write: Path | None = None,
+    output: Path | None = None,
     log: Path | None = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
@@ -63,7 +63,7 @@ def scan(
         Only this rate, bit/s; may be given several times.
     ids
         Only these IDs, for example 1-20 or 1,4,7.
-    write
+    output
         Write a robot file for the servos that were found, to be completed by hand.
     log
         Write every packet into this new file, a log.
@@ -71,13 +71,19 @@ def scan(
         Print the result as JSON.
     debug
         Print the traceback of an error.
+
+    Examples
+    --------
+    dxlrun scan /dev/ttyUSB0
+    dxlrun scan /dev/ttyUSB0 --ids 1-20 --baud 1000000
+    dxlrun scan /dev/ttyUSB0 --output arm.yaml
     """
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
     search = read_search(protocol, baud, ids)
-    if write is not None:
-        check_target(write)
+    if output is not None:
+        check_target(output)
     load_models()
     with (
         TunablePort(port) as line,
@@ -90,10 +96,10 @@ def scan(
         print_warning(f"{port} cannot run at {rate} bit/s, so this rate was left out")
     narrowed = protocol is not None or bool(baud) or ids is not None
     _show(port, scanned, narrowed=narrowed, as_json=as_json)
-    if write is not None and scanned.servos:
-        draft_file(write, port, scanned.servos, latency_ns)
+    if output is not None and scanned.servos:
+        draft_file(output, port, scanned.servos, latency_ns)
         if not as_json:
-            show(f"robot file: {write}; complete it, then `dxlrun check {write}`")
+            show(f"robot file: {output}; complete it, then `dxlrun check {output}`")
     return 0 if scanned.servos else 1
 
 
