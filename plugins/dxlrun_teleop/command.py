@@ -44,11 +44,6 @@ def teleop(
         Name of the robot, where several run.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun teleop
-    dxlrun teleop base --gamepad --speed 0.5
     """
     from dxlrun.output.terminal import show
     from dxlrun_teleop.bank import banks_of

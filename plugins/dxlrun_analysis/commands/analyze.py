@@ -45,11 +45,6 @@ def analyze(
         Print the result as JSON; with several logs {"logs": [...]}.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun analyze
-    dxlrun analyze logs/arm.mcap --report arm.html --worst 3
     """
     _check(logs, report=report, worst=worst)
     if report is not None:

@@ -48,11 +48,6 @@ def export(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun export logs/arm.mcap arm.csv --format csv
-    dxlrun export logs/arm.mcap arm_bag --format ros2bag
     """
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")

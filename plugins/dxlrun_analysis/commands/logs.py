@@ -54,11 +54,6 @@ def logs(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun logs logs
-    dxlrun logs logs --where 'not good and lost > 10' --sort 'worst_wake_up_us DESC'
     """
     _check(directory, where, sort, sql)
     from dxlrun_analysis.season import query, runs

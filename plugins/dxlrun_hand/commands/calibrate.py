@@ -38,11 +38,6 @@ def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debu
         Only these joints, or the joints of these groups.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun calibrate arm.yaml port:=/dev/ttyUSB0
-    dxlrun calibrate arm.yaml --joint elbow
     """
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Terminal

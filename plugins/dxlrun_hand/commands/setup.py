@@ -44,11 +44,6 @@ def setup(
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun setup arm.yaml port:=/dev/ttyUSB0
-    dxlrun setup arm.yaml --joint elbow
     """
     from dxlrun.description.reading import read_robot
     from dxlrun.dynamixel.port.serial_open import serial_devices

@@ -42,11 +42,6 @@ def teach(
         Name of the robot, where several run.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun teach wave.yaml
-    dxlrun teach wave.yaml arm --speed '20 deg/s'
     """
     from dxlrun.description.units import angular_velocity
     from dxlrun.log.target import check_new

@@ -44,11 +44,6 @@ def bench_rate(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun bench rate robots/bioloid_torso.yaml
-    dxlrun bench rate arm.yaml --duration 10
     """
     if not robot.is_file():
         raise InputError(f"there is no robot file {robot}; check the path")

@@ -36,11 +36,6 @@ def characterize(
         Only this; may be given several times. Without it: all five.
     tolerance
         How far a joint may leave its path when commands lie apart.
-
-    Examples
-    --------
-    dxlrun characterize elbow
-    dxlrun characterize arm.yaml elbow --virtual --report elbow.html
     """
     from dxlrun.description.units import angle
     from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize

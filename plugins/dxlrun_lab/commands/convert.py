@@ -44,11 +44,6 @@ def convert(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun convert logs/arm.mcap wave.yaml
-    dxlrun convert logs/arm.mcap wave.yaml --from 2 --to 6 --joint elbow
     """
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")

@@ -56,11 +56,6 @@ def identify(
         Voltage of the supply, V, instead of what the servo reports.
     output
         Write the motor file of the joint, which its key `motor` in the robot file names.
-
-    Examples
-    --------
-    dxlrun identify arm.yaml elbow --output elbow.motor.yaml
-    dxlrun identify elbow --recorded logs/arm.mcap
     """
     from dxlrun_lab.commands.on_robot import Chosen, run_on_robot
 

@@ -74,12 +74,6 @@ def latency(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun latency
-    dxlrun latency --policy fifo --period 2ms --stress
-    dxlrun latency --compare other,round_robin,c --count 100000
     """
     import os
 

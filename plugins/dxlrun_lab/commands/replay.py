@@ -50,12 +50,6 @@ def replay(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun replay logs/arm.mcap
-    dxlrun replay logs/arm.mcap --set arm.gains.p=5.0
-    dxlrun replay logs/arm.mcap --on arm.yaml --virtual --speed 0.5
     """
     if played_on.on is not None:
         if settings:

@@ -84,11 +84,6 @@ def sweep(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun sweep arm.yaml --play wave.yaml --over gains.p=0.5..3x8
-    dxlrun sweep arm.yaml --play wave.yaml --over gains.p=1,2,5 --over gains.d=0,0.05 --picture map.svg
     """
     if missing := missing_extra("a sweep", "sweep", "pyarrow"):
         raise InputError(missing)

@@ -69,11 +69,6 @@ def tracking(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun experiment tracking
-    dxlrun experiment tracking --setups loop-realtime --report tracking.html
     """
     words = list(assignments)
     if robot is not None and ":=" in robot:

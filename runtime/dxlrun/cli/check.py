@@ -64,12 +64,6 @@ def check(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun check robots/bioloid_torso.yaml
-    dxlrun check arm.yaml port:=/dev/ttyUSB0 --online
-    dxlrun check arm.yaml --play wave.yaml --graph arm.svg
     """
     if log is not None and not online:
         raise InputError("--log keeps what --online sends and receives; give --online too")

@@ -28,10 +28,6 @@ def doctor(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun doctor
     """
     from dxlrun.run.doctor import Machine, diagnose
 

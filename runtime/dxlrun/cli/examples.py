@@ -54,11 +54,6 @@ def examples(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun examples
-    dxlrun examples bioloid_torso my_robots
     """
     source = examples_directory()
     known = {path.stem: path for path in sorted(source.glob("*.yaml"))}
@@ -205,11 +200,6 @@ def schema(
         Write it into this file instead.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun schema --output robot.schema.json
-    dxlrun schema motion --output motion.schema.json
     """
     text = schema_text(kind)
     if output is None:

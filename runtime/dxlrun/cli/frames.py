@@ -58,12 +58,6 @@ def frames(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun frames robots/bioloid_torso.yaml
-    dxlrun frames arm.yaml --of hand_link --in base_link --at elbow=30deg
-    dxlrun frames arm.yaml --graph arm.svg
     """
     if of is None and (at or relative_to):
         raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")

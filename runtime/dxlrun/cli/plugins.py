@@ -41,10 +41,6 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun plugins
     """
     from dxlrun.control.controllers.plugins import load_plugins
 
@@ -155,10 +151,6 @@ def new_plugin(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun new-plugin my_robotics
     """
     module = _module(name)
     place = Path(name) if directory is None else directory

@@ -47,10 +47,6 @@ def view(
     listen
         Serve it on this address. On another one than 127.0.0.1 the page is open to every machine of the
         network that is given its address with the token.
-
-    Examples
-    --------
-    dxlrun view
     """
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")

@@ -105,12 +105,6 @@ def sim(
         Print the ports as JSON, then a line of JSON for each fault.
     debug
         Print the traceback of an error, and the output of the servos' process.
-
-    Examples
-    --------
-    dxlrun sim robots/bioloid_torso.yaml
-    dxlrun sim --servo XL430-W250:1-3 --link /tmp/arm
-    dxlrun sim arm.yaml --fault 'lose servo=3 at=2s'
     """
     leave_real_time()
     mistakes = Mistakes()

@@ -39,12 +39,6 @@ def echo(
         End after so many messages.
     rate
         Print at most so many messages a second, the newest each time, Hz.
-
-    Examples
-    --------
-    dxlrun echo
-    dxlrun echo /arm/state --count 10
-    dxlrun echo joint_states --rate 5 --json
     """
     if count is not None and count < 1:
         raise InputError(f"--count {count} is no number of messages; give 1 or more")

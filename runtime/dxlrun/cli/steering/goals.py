@@ -58,13 +58,6 @@ def send(
         Time for joints by name to get there, such as 2s; of controllers that take trajectories.
     wait
         Show the progress of a goal, and return with its result. Ctrl-C cancels it.
-
-    Examples
-    --------
-    dxlrun send neck positions 'positions=[30 deg]'
-    dxlrun send arm position elbow=20deg --in 2s --wait
-    dxlrun send board led=1
-    dxlrun send arm trajectory --file wave.yaml
     """
     from dxlrun.channels.answers import Code
     from dxlrun.cli.steering.written import Written
@@ -108,11 +101,6 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
         Number of a goal, or the name of a controller; without it all goals that run.
     wait
         Return when the joints are at rest.
-
-    Examples
-    --------
-    dxlrun cancel
-    dxlrun cancel arm --wait
     """
     from dxlrun.channels.answers import Code
 

@@ -52,12 +52,6 @@ def torque(
         Joints; the name of a group or controller means its joints, `all` every joint.
     release
         Deactivate the controllers that command the joints; without it they are a reason to refuse.
-
-    Examples
-    --------
-    dxlrun torque off elbow_joint
-    dxlrun torque on all
-    dxlrun torque off arm --release
     """
     names = _named(joints)
     with robot_of(chosen, f"torque {state}") as robot:
@@ -78,11 +72,6 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
         Joints; the name of a group or controller means its joints, `all` every joint.
     release
         Deactivate the controllers that command the joints; without it they are a reason to refuse.
-
-    Examples
-    --------
-    dxlrun reboot elbow_joint
-    dxlrun reboot all --release
     """
     names = _named(joints)
     with robot_of(chosen, "reboot") as robot:
@@ -102,12 +91,6 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
         Name of the joint, device or sensor; for an item of one of its servos alone that, such as hip/1.
     item
         Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
-
-    Examples
-    --------
-    dxlrun get elbow_joint
-    dxlrun get elbow_joint position_p_gain
-    dxlrun get imu/orientation.x
     """
     with robot_of(chosen, "get") as robot:
         found = robot.get(joint, item)
@@ -136,11 +119,6 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
         Item of its servo's control table.
     value
         Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
-
-    Examples
-    --------
-    dxlrun set elbow_joint position_p_gain 900
-    dxlrun set elbow_joint profile_acceleration '10 rad/s^2'
     """
     from dxlrun.description.document import plain_value
 

@@ -26,11 +26,6 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
         Name of the controller.
     words
         New values of live parameters, as in the robot file; quantities with their units: 'speed=20 deg/s'.
-
-    Examples
-    --------
-    dxlrun parameters arm
-    dxlrun parameters arm gains.p=4.0 'speed=20 deg/s'
     """
     values = dict(_pair(word) for word in words)
     if len(values) < len(words):

@@ -72,12 +72,6 @@ def play(
         List the motions that the robot has by name, with their joints and lengths.
     no_wait
         Return when the motion has begun.
-
-    Examples
-    --------
-    dxlrun play wave
-    dxlrun play wave bow --speed 0.5 --loop 3
-    dxlrun play --list
     """
     _check(motions, loop, listed=listed, no_wait=no_wait)
     with robot_of(chosen, "play") as robot:

@@ -68,11 +68,6 @@ def list_robots(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun list
-    dxlrun list --graph
     """
     from dxlrun.remote.client import connect, running
 
@@ -108,11 +103,6 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
         Controllers to activate.
     deactivate
         Controllers to deactivate.
-
-    Examples
-    --------
-    dxlrun switch --activate arm
-    dxlrun switch --activate arm --deactivate whole_body
     """
     if not activate and not deactivate:
         raise InputError("nothing to switch; write --activate NAME, --deactivate NAME, or both")
@@ -134,11 +124,6 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     hz
         Cycles per second, Hz.
-
-    Examples
-    --------
-    dxlrun rate 100
-    dxlrun rate 50Hz
     """
     if not 0 < hz < float("inf"):  # false for nan too
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
@@ -148,12 +133,7 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def halt(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Let every joint come to a stop within its limits, and hold: the run goes on.
-
-    Examples
-    --------
-    dxlrun halt
-    """
+    """Let every joint come to a stop within its limits, and hold: the run goes on."""
     with robot_of(chosen, "halt") as robot:
         done = robot.halt()
         text = f"{robot.name} stands still"
@@ -163,12 +143,7 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Pause a running robot: its joints are held, its controllers' time stops.
-
-    Examples
-    --------
-    dxlrun pause
-    """
+    """Pause a running robot: its joints are held, its controllers' time stops."""
     with robot_of(chosen, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
@@ -176,12 +151,7 @@ def pause(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def resume(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Resume the controllers of a paused robot where they were.
-
-    Examples
-    --------
-    dxlrun resume
-    """
+    """Resume the controllers of a paused robot where they were."""
     with robot_of(chosen, "resume") as robot:
         done = robot.resume()
         return report_done(robot, chosen, done, f"{robot.name} runs again")
@@ -198,11 +168,6 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
         Its keys as in the robot file, such as type=joint_group_position_controller 'joints=[head_yaw_joint]'.
     file
         A YAML file with its keys, instead of the words.
-
-    Examples
-    --------
-    dxlrun load head type=joint_group_position_controller 'joints=[head_yaw_joint]'
-    dxlrun load head --file head.yaml
     """
     from dxlrun.cli.steering.written import Written
 
@@ -222,10 +187,6 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     name
         Name of the controller.
-
-    Examples
-    --------
-    dxlrun unload head
     """
     with robot_of(chosen, "unload") as robot:
         done = robot.unload(name)
@@ -239,11 +200,6 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     no_wait
         Return as soon as the loop has accepted it.
-
-    Examples
-    --------
-    dxlrun stop
-    dxlrun stop --robot bioloid_torso --no-wait
     """
     with robot_of(chosen, "stop") as robot:
         robot.stop(wait=not no_wait)

@@ -93,11 +93,6 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     ----------
     once
         Print one snapshot.
-
-    Examples
-    --------
-    dxlrun watch
-    dxlrun watch --once --json
     """
     with robot_of(chosen, "watch") as robot:
         watched = Watched(robot)

@@ -51,12 +51,6 @@ def models(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun models
-    dxlrun models AX-12A
-    dxlrun models --protocol 2.0
     """
     from dxlrun.control.controllers.plugins import load_plugins
 

@@ -71,12 +71,6 @@ def scan(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun scan /dev/ttyUSB0
-    dxlrun scan /dev/ttyUSB0 --ids 1-20 --baud 1000000
-    dxlrun scan /dev/ttyUSB0 --output arm.yaml
     """
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort

@@ -87,13 +87,6 @@ def servo(
         Print the result as JSON.
     debug
         Print the traceback of an error.
-
-    Examples
-    --------
-    dxlrun servo /dev/ttyUSB0 1 get
-    dxlrun servo /dev/ttyUSB0 1 get present_position present_temperature
-    dxlrun servo /dev/ttyUSB0 1 id 7 --yes
-    dxlrun servo /dev/ttyUSB0 7 backup arm_7.toml
     """
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
