@@ -28,8 +28,8 @@ APP = "https://app.foxglove.dev"
 
 
 def foxglove(
-    robot: str | None = None,
     *,
+    robot: str | None = None,
     control: Flag = False,
     port: int | None = None,
     listen: str = LOOPBACK,
@@ -38,7 +38,7 @@ def foxglove(
     origin: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = (),
     debug: Flag = False,
 ) -> int:
-    """Serve a running robot to Foxglove, Lichtblick, and other viewers of their protocol.
+    """Serve a running robot to Foxglove and Lichtblick: and to other viewers of their protocol.
 
     They get the channels of the log, live, and the controllers' parameters. The address that is printed has a
     token, which is another one at each start; a viewer without it gets nothing.
