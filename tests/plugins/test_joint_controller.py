@@ -12,9 +12,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
+from tests.kit.awaited import until
 from tests.kit.stages import Stage
 
-from dxlrun import Floats, InputError, JointController, reading
+from dxlrun import Floats, InputError, JointController, connect, reading, running
 from dxlrun.cli import main
 from dxlrun.contract.joint_controller import _TAKEN
 from dxlrun.control.controllers.plugins import controller_breach
@@ -95,12 +96,21 @@ def test_the_log_has_the_file_and_a_replay_runs_that_one(written: Written) -> No
     assert (replay_log(log).same, replay_log(log).remarks) == (True, ())
 
 
-def test_all_processes_of_a_run_have_it(written: Written) -> None:
-    file = written()
+def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
+    written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     program = "import sys; from dxlrun.cli import main; sys.exit(main())"
-    words = [sys.executable, "-c", program, file, "--duration", "0.3"]
-    ran = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    words = [sys.executable, "-c", program, written(), "--duration", "60"]
+    with Path("said").open("w") as said, subprocess.Popen(words, stdout=said, stderr=said) as ran:
+        until(lambda: bool(running()) or ran.poll() is not None)
+        assert ran.poll() is None, Path("said").read_text()
+        Path("wave.py").unlink()  # it was read once
+        with connect() as robot:
+            changed = robot.set_parameters("head", {"amplitude": "0.2 rad"})
+            assert changed == {"amplitude": ("0.3 rad", "0.2 rad")}
+            robot.stop()
+        assert ran.wait(30) == 0, Path("said").read_text()
     assert replay_log(next(Path("logs").glob("*.mcap"))).same
 
 

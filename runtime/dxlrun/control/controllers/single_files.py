@@ -84,7 +84,6 @@ def _executed(file: str, text: str) -> ModuleType:
     try:
         loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        del sys.modules[module.__name__]
         what = " ".join((error.msg if isinstance(error, SyntaxError) else str(error)).split())
         raise PlugInError(f"{file}:{_line_of(error, file)}: {type(error).__name__}: {what}") from error
     return module
