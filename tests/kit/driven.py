@@ -18,6 +18,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.link import Loaded
 from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.requests.table import Role
 from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import simulated_robot
 
@@ -69,7 +70,7 @@ class _Gateway:
             "query_string": query.encode(),
             "root_path": "",
             "headers": [],
-            "client": ("process 1", 0),
+            "client": ("process 1", Role.ADMIN),
             "server": None,
         }
         said: list[dict[str, Any]] = []

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import time
 from contextlib import suppress
 from types import SimpleNamespace
@@ -28,6 +29,8 @@ from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.server import serve
 
 PERIOD_NS = 20_000_000
 
@@ -227,7 +230,7 @@ class Desk:
         return found
 
     async def request(
-        self, method, path, body=b"", *, headers=(), chunks=None, client=("process 1", 0), heard=None
+        self, method, path, body=b"", *, headers=(), chunks=None, client=("process 1", Role.ADMIN), heard=None
     ):
         """One request by ASGI; `chunks` are the messages that come from the client instead of a body."""
         if not isinstance(body, bytes):
@@ -275,3 +278,67 @@ def desk(no_memory_left):
 def desk_of(no_memory_left):
     """Make a desk of another plan, with its plug-ins."""
     return Desk
+
+
+STOP = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
+
+
+class Door:
+    """The gateway's server on a socket, and the ways in which clients come."""
+
+    network = None
+
+    def __init__(self, desk, path):
+        self.desk, self.path = desk, str(path)
+
+    def open(self, act):
+        """Serve until `act` has ended; return what it returned."""
+        return asyncio.run(self._open(act))
+
+    async def _open(self, act):
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(self.path)
+        listener.listen(64)
+        ours, control = socket.socketpair()
+        serving = asyncio.ensure_future(
+            serve(self.desk.link, self.desk.gateway, listener, control, self.network)
+        )
+        looping = asyncio.ensure_future(self._loop())
+        try:
+            return await act()
+        finally:
+            looping.cancel()
+            ours.close()
+            await serving
+            listener.close()
+            control.close()
+
+    async def _loop(self):
+        while True:
+            self.desk.take()
+            await asyncio.sleep(0.001)
+
+    async def connect(self, data=b""):
+        reader, writer = await asyncio.open_unix_connection(self.path)
+        writer.write(data)
+        return reader, writer
+
+    async def say(self, data):
+        """Send what a client may send, and return what it is answered before the connection is closed."""
+        reader, writer = await self.connect(data)
+        writer.write_eof()
+        answer = await reader.read()
+        writer.close()
+        return answer
+
+    async def stopped(self):
+        """Say whether `stop` is taken from a client that comes now."""
+        reader, writer = await self.connect(STOP)
+        status = await reader.readline()
+        writer.close()
+        return status == b"HTTP/1.1 200 OK\r\n" and self.desk.taken[-1].kind == "stop"
+
+
+@pytest.fixture
+def door(desk, tmp_path):
+    return Door(desk, tmp_path / "s.sock")

@@ -19,70 +19,15 @@ import pytest
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.remote import gateway, server
 from dxlrun.remote.client import RemoteRobot
+from dxlrun.remote.commander import Client
 from dxlrun.remote.live.topics import framed
 from dxlrun.remote.requests.replies import RunEnded
-from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS, serve
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS
 from dxlrun.remote.sockets import MOST_BYTES, SocketLink
 
 STOP = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
 GO = b"POST /controllers/left/commands/go HTTP/1.1\r\nHost: x\r\n"
-
-
-class Door:
-    """The gateway's server on a socket, and the ways in which clients come."""
-
-    def __init__(self, desk, path):
-        self.desk, self.path = desk, str(path)
-
-    def open(self, act):
-        """Serve until `act` has ended; return what it returned."""
-        return asyncio.run(self._open(act))
-
-    async def _open(self, act):
-        listener = socket.socket(socket.AF_UNIX)
-        listener.bind(self.path)
-        listener.listen(64)
-        ours, control = socket.socketpair()
-        serving = asyncio.ensure_future(serve(self.desk.link, self.desk.gateway, listener, control))
-        looping = asyncio.ensure_future(self._loop())
-        try:
-            return await act()
-        finally:
-            looping.cancel()
-            ours.close()
-            await serving
-            listener.close()
-            control.close()
-
-    async def _loop(self):
-        while True:
-            self.desk.take()
-            await asyncio.sleep(0.001)
-
-    async def connect(self, data=b""):
-        reader, writer = await asyncio.open_unix_connection(self.path)
-        writer.write(data)
-        return reader, writer
-
-    async def say(self, data):
-        """Send what a client may send, and return what it is answered before the connection is closed."""
-        reader, writer = await self.connect(data)
-        writer.write_eof()
-        answer = await reader.read()
-        writer.close()
-        return answer
-
-    async def stopped(self):
-        """Say whether `stop` is taken from a client that comes now."""
-        reader, writer = await self.connect(STOP)
-        status = await reader.readline()
-        writer.close()
-        return status == b"HTTP/1.1 200 OK\r\n" and self.desk.taken[-1].kind == "stop"
-
-
-@pytest.fixture
-def door(desk, tmp_path):
-    return Door(desk, tmp_path / "s.sock")
 
 
 def test_clients_that_hang_do_not_keep_others_out(door):
@@ -134,7 +79,7 @@ def test_stop_is_taken_from_another_process_while_one_floods_the_socket_with_con
 
 def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, monkeypatch):
     process = iter([1, *[2] * 40, *range(3, 60)])
-    monkeypatch.setattr(server, "_peer", lambda _: (next(process), os.getuid()))
+    monkeypatch.setattr(server, "_client", lambda *_: Client(f"process {next(process)}", Role.ADMIN))
 
     async def remain(count, ends):
         while (left := [end for end in ends if not end[0].at_eof()])[count:]:

@@ -25,7 +25,7 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote import asked, link, server
 from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
 from dxlrun.remote.requests import table as requests
-from dxlrun.remote.requests.table import MOST_OPERATIONS, MOST_SET_POINTS
+from dxlrun.remote.requests.table import MOST_OPERATIONS, MOST_SET_POINTS, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True, "cycle": 0}
@@ -302,13 +302,13 @@ def test_a_flood_of_set_points_gives_the_loop_one_a_cycle_and_takes_nothing_from
     async def flood(count, client):
         return [(await desk.request("POST", SET_POINT, body, client=client))[0] for _ in range(count)]
 
-    told = asyncio.run(flood(1000, ("process 1", 0)))
+    told = asyncio.run(flood(1000, ("process 1", Role.ADMIN)))
     assert told == [202] * int(MOST_SET_POINTS / 10) + [429] * (1000 - int(MOST_SET_POINTS / 10))
-    assert asyncio.run(flood(1, ("process 2", 0))) == [202]
+    assert asyncio.run(flood(1, ("process 2", Role.ADMIN))) == [202]
     assert len(desk.take()) == 1
     assert desk.take() == []
     desk.now += 0.01
-    assert asyncio.run(flood(100, ("process 1", 0))).count(202) == MOST_SET_POINTS * 0.01
+    assert asyncio.run(flood(100, ("process 1", Role.ADMIN))).count(202) == MOST_SET_POINTS * 0.01
 
 
 def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(desk):
@@ -370,7 +370,7 @@ def test_long_bodies_count_as_many_short_ones_of_the_process_that_sends_them(des
     assert told == [422, 422, 429, 429, 429]
     desk.now += 0.05
     assert desk.ask("POST", "/pause")[0] == 429
-    assert desk.ask("POST", "/pause", client=("process 2", 0))[0] == 200
+    assert desk.ask("POST", "/pause", client=("process 2", Role.ADMIN))[0] == 200
     assert desk.ask("POST", "/stop")[0] == 200
     desk.now += 0.2
     assert desk.ask("POST", "/pause")[0] == 200

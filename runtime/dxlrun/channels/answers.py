@@ -123,6 +123,13 @@ class Code(StrEnum):
         "too_slow",
         "{controller} computed for more than {seconds:g} s; send less at once",
     )
+    # clients
+    NOT_ALLOWED = "not_allowed", "{client} may {role}, and this needs the role {needed}"
+    COMMANDED_BY = (
+        "commanded_by",
+        "{commander} commands this robot; it is free {seconds:.0f} s after its last command, and "
+        "`dxlrun take-over` does not wait",
+    )
     # requests
     UNKNOWN_PAGE = "unknown_page", "{method} {path} is no request of this version"
     WRONG_METHOD = "wrong_method", "{path} takes no {method}"

@@ -32,6 +32,13 @@ class Cancel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     controller: str = ""
 
 
+class NewCommander(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `commander`: another client commands from now on; the event that reports it is all."""
+
+    client: str
+    instead: str
+
+
 class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `parameters`: live parameters of a controller, checked against its model before."""
 

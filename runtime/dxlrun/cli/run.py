@@ -41,6 +41,7 @@ def run(
     virtual: Flag = False,
     ledger: Path | None = None,
     no_gateway: Flag = False,
+    listen: str | None = None,
     verbose: Flag = False,
     debug: Flag = False,
 ) -> int:
@@ -68,6 +69,9 @@ def run(
         virtual time not at all.
     no_gateway
         Run without a gateway: the run cannot be steered.
+    listen
+        Serve clients of other computers, too, at [NAME@]HOST:PORT, by mutual TLS with certificates of `dxlrun
+        keys`; NAME is that of the robot's certificate, by default the robot's.
     verbose
         Print all that the operating system granted for real time, not only what it refused.
     debug
@@ -89,6 +93,8 @@ def run(
                 "argument port:=sim, or leave out --ledger"
             )
         check_ledger(ledger)
+    if listen is not None:
+        _check_listen(listen, result.plan, served=not (no_gateway or virtual))
     from dxlrun.run.run_summary import RunOptions
 
     options = RunOptions(
@@ -98,6 +104,7 @@ def run(
         verbose=verbose,
         ledger=ledger,
         gateway=not no_gateway,
+        listen=listen or "",
     )
     console = out()
     if virtual:
@@ -109,6 +116,25 @@ def run(
 
         summary = run_robot(result.plan, options, console)
     return show_summary(summary, result.plan, console)
+
+
+def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
+    """Raise InputError where clients of other computers could not be served."""
+    from dxlrun.remote.network import server_context
+    from dxlrun.remote.sockets import address_of
+
+    address = address_of(text, plan.robot)
+    if not (served and plan.gateway):
+        raise InputError(
+            "--listen needs the gateway of a run in real time: leave out --no-gateway, --virtual"
+        )
+    server_context(address.name)
+    import socket
+
+    try:
+        socket.create_server((address.host, address.port)).close()
+    except OSError as error:
+        raise InputError(f"nothing can listen at {address.host}:{address.port}: {error}") from error
 
 
 def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:

@@ -42,6 +42,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "halt": f"{_STEERING}.steer:halt",
         "pause": f"{_STEERING}.steer:pause",
         "resume": f"{_STEERING}.steer:resume",
+        "take-over": f"{_STEERING}.steer:take_over",
         "load": f"{_STEERING}.steer:load",
         "unload": f"{_STEERING}.steer:unload",
     },
@@ -59,6 +60,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
 when it is used. Verbs of packages name their heading, see `Command.group`."""
 _PACKAGES = {
     "dxlrun_analysis": ("analyze", "export", "logs"),
+    "dxlrun_fleet": ("keys",),
     "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),
     "dxlrun_lab": (

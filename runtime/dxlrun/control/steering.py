@@ -17,6 +17,7 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.loop_requests import (
     Cancel,
+    NewCommander,
     Parameters,
     Rate,
     RebootRequest,
@@ -69,6 +70,7 @@ FORMS: Mapping[str, type[msgspec.Struct] | None] = {
     "get": RegisterReading,
     "torque": TorqueRequest,
     "reboot": RebootRequest,
+    "commander": NewCommander,
     "stop": None,
 }
 """Commands for the loop, with the form of their data; None: they carry nothing."""
@@ -281,6 +283,8 @@ class Steering:
                 found = place if isinstance(place, Refusal) else Done(self.record.cycle, place)
             case Unload():
                 found = manager.unload(request.controller)
+            case NewCommander():
+                pass
             case _ if command.kind == "halt":
                 found = self.halt.begin(command.number, time_ns)
             case _ if command.kind == "pause":

@@ -13,8 +13,9 @@ import msgspec
 import starlette.requests
 
 from dxlrun.channels.answers import Code
+from dxlrun.remote.commander import HERE, Client
 from dxlrun.remote.preparation import invalid, refused
-from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request
+from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 MOST_PEERS = 256
@@ -71,12 +72,22 @@ class Asked(Generic[Body]):
         """The client's name for the log: printable, at most 64 characters; the process if it has none."""
         given = self.http.headers.get("x-dxlrun-client", "").encode("latin-1", "replace")
         name = "".join(filter(str.isprintable, given.decode(errors="replace")))[:LONGEST_ORIGIN]
-        return name.strip() or peer(self.http)
+        client = client_of(self.http)
+        if client.commands_as != HERE:  # a name that it chose does not hide the certificate's
+            return f"{client.name}: {name}"[:LONGEST_ORIGIN] if name.strip() else client.name
+        return name.strip() or client.name
+
+
+def client_of(http: starlette.requests.Request) -> Client:
+    """Return the client that sent a request, as its connection has it."""
+    return (
+        Client(http.client.host, Role(http.client.port)) if http.client else Client("process ?", Role.ADMIN)
+    )
 
 
 def peer(http: starlette.requests.Request) -> str:
-    """Return the process that sent a request, as the operating system reports it."""
-    return http.client.host if http.client else "a process"
+    """Return the process that sent a request, as Linux reports it, or the name in its certificate."""
+    return client_of(http).name
 
 
 @dataclass(slots=True)

@@ -27,11 +27,12 @@ from msgspec.structs import asdict
 from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.live.listening import Listening, TopicMessage
+from dxlrun.remote.network import NetworkLink, known_robots
 from dxlrun.remote.requests import replies
 from dxlrun.remote.requests import table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
 from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Request, Row, Value
-from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, running, sockets
+from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, address_of, running, sockets
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.transform import Transform
@@ -91,11 +92,16 @@ Executed: TypeAlias = replies.Executed[RemoteGoal]
 
 
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
-    """Return a running robot, by its name; without one, the only one that runs.
+    """Return a running robot, by its name; without one, the only one that runs here.
 
-    `client` names you in the robot's log. Raises DxlrunError when no such robot runs, or several do.
+    `NAME@HOST:PORT` is a robot of another computer, and so is a name of the settings' `robots.yaml`. `client`
+    names you in the robot's log. Raises DxlrunError when no such robot runs, or several do.
     """
-    found = sockets()
+    found, client = sockets(), client or f"python {os.getpid()}"
+    if robot is not None and robot not in found:
+        address = address_of(robot) if "@" in robot else known_robots().get(robot)
+        if address is not None:
+            return RemoteRobot(address.name, NetworkLink(address, client))
     names = ", ".join(sorted(found))
     if robot is None:
         if not found:
@@ -107,7 +113,7 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
         raise DxlrunError(
             f"no robot {robot} runs that can be steered; " + (f"these do: {names}" if names else "start it")
         )
-    return RemoteRobot(robot, SocketLink(found[robot], client or f"python {os.getpid()}"))
+    return RemoteRobot(robot, SocketLink(found[robot], client))
 
 
 class RemoteRobot:
@@ -380,6 +386,10 @@ class RemoteRobot:
         `still_moving` when one does not after five seconds.
         """
         return self._execute(requests.HALT)
+
+    def take_over(self) -> Executed:
+        """Command the robot although a client of another computer does; its next command is refused."""
+        return self._execute(requests.TAKE_OVER)
 
     def pause(self) -> Executed:
         """Hold the joints, and stop the controllers' time."""

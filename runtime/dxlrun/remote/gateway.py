@@ -31,13 +31,22 @@ from dxlrun.channels.answers import Code, Done, Field, Refusal
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.heartbeat import Phase
-from dxlrun.channels.loop_requests import Cancel, Rate, RebootRequest, Switch, TorqueRequest, Unload
+from dxlrun.channels.loop_requests import (
+    Cancel,
+    NewCommander,
+    Rate,
+    RebootRequest,
+    Switch,
+    TorqueRequest,
+    Unload,
+)
 from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.remote.asked import Allowance, Asked, peer, received
+from dxlrun.remote.asked import Allowance, Asked, client_of, peer, received
+from dxlrun.remote.commander import Commander
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
 from dxlrun.remote.link import Link, Loaded
@@ -110,6 +119,7 @@ _STATUS = {
     Code.UNKNOWN_GOAL: 404,
     Code.UNKNOWN_TOPIC: 404,
     Code.UNKNOWN_PARAMETER: 404,
+    Code.NOT_ALLOWED: 403,
     Code.WRONG_METHOD: 405,
     Code.BODY_TIMEOUT: 408,
     Code.TOO_LONG: 413,
@@ -163,6 +173,7 @@ class GatewayApp:
         self._log = log
         self._allowances = {one.rate: Allowance(one.rate, now) for one in REQUESTS if one.rate}
         self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}
+        self._commander = Commander(now)
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
         self._released: dict[str, None] = {}
@@ -185,7 +196,11 @@ class GatewayApp:
             try:
                 if allowance is not None:
                     allowance.spend(peer(http))
-                return _response(await handler(self, await received(request, http, allowance)))
+                before = self._commander.admit(client_of(http), request)
+                asked = await received(request, http, allowance)
+                if before is not None:
+                    await self._note_commander(before, asked.origin)
+                return _response(await handler(self, asked))
             except RefusedRequest as error:
                 return _refused(error.refusal)
             except ClientDisconnect:
@@ -602,6 +617,16 @@ class GatewayApp:
         """Have the loop do something; `noted` is called when it is done."""
         done = await self._link.for_loop(kind, data, origin, noted)
         return Executed(done.cycle, halted=done.halted)
+
+    @_answers(requests.TAKE_OVER)
+    async def take_over(self, asked: Asked[None]) -> Executed[int]:
+        """Let this client command the robot although another one does."""
+        before = self._commander.become(client_of(asked.http))
+        return await self._note_commander(before or self._commander.name, asked.origin)
+
+    async def _note_commander(self, before: str, origin: str) -> Executed[int]:
+        """Log that a client commands instead of another."""
+        return await self._for_loop("commander", NewCommander(self._commander.name, before), origin)
 
     @_answers(requests.LOAD)
     async def load(self, asked: Asked[Row]) -> Executed[int]:

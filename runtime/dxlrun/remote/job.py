@@ -29,3 +29,5 @@ class GatewayJob:
     """Where the log is written, from the root; None: there is none."""
     epoch_offset_ns: int = 0
     """Wall time minus the run's clock."""
+    listen: str = ""
+    """Where clients of other computers are served, as `[NAME@]HOST:PORT`; empty: nowhere."""

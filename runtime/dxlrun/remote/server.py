@@ -3,6 +3,7 @@
 A client may hang in the middle of a request, never read its answer, or open connections without end. A
 process above its limit loses the connection of its own that was silent longest, so a flood closes none of
 another process, whose `stop` is served. The process ID comes from the Linux kernel (SO_PEERCRED, unix(7)).
+Of a client of another computer the name in its certificate counts instead; see `network.py`.
 """
 
 from __future__ import annotations
@@ -14,11 +15,15 @@ import os
 import selectors
 import signal
 import socket
+import ssl
 import struct
 import sys
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
+from typing import TypeAlias, TypedDict
 
 import msgspec
 import uvicorn
@@ -30,12 +35,15 @@ from dxlrun.channels.process import Failed, Finish, Listening, MessageChannel
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun.remote.commander import Client
 from dxlrun.remote.computation import PR_SET_PDEATHSIG
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
+from dxlrun.remote.network import Revoked, server_context
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.sockets import listen
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.sockets import address_of, listen
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
@@ -43,8 +51,12 @@ MOST_OF_PROCESS = 16
 SILENCE_S = 30.0
 """A connection is closed after so long without a byte from the other side, or in which it took none of what
 waits for it."""
+MOST_HANDSHAKES = 64
+"""Of TLS at once; one more ends the oldest."""
+HANDSHAKE_S = 5.0
 
 _CREDENTIALS = struct.Struct("3i")
+_REVOKED = Revoked({})
 
 
 def main() -> None:
@@ -63,6 +75,7 @@ def main() -> None:
         plugins = load_plugins(files=plan.included)
         preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
+        network = _on_network(job.listen, plan.robot) if job.listen else None
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))
@@ -71,7 +84,7 @@ def main() -> None:
     link.let_begin()
     try:
         with asyncio.Runner(loop_factory=_event_loop) as runner:
-            runner.run(serve(link, gateway, listener, control))
+            runner.run(serve(link, gateway, listener, control, network))
     finally:
         path.unlink(missing_ok=True)
 
@@ -81,7 +94,27 @@ def _event_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
-async def serve(link: Link, gateway: GatewayApp, listener: socket.socket, control: socket.socket) -> None:
+Secured: TypeAlias = tuple[socket.socket, ssl.SSLContext]
+"""A listening TCP socket, and the TLS that is spoken there."""
+
+
+def _on_network(text: str, robot: str) -> Secured:
+    """Return where clients of other computers connect; raises InputError and OSError."""
+    address = address_of(text, robot)
+    context = server_context(address.name)
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+    listener = socket.create_server((address.host, address.port), family=family, backlog=MOST_HANDSHAKES)
+    listener.setblocking(False)
+    return listener, context
+
+
+async def serve(
+    link: Link,
+    gateway: GatewayApp,
+    listener: socket.socket,
+    control: socket.socket,
+    network: Secured | None = None,
+) -> None:
     """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
     config = uvicorn.Config(
         gateway.app(),
@@ -99,6 +132,10 @@ async def serve(link: Link, gateway: GatewayApp, listener: socket.socket, contro
         h11_max_incomplete_event_size=16384,
     )
     server = _Server(config)
+    config.load()
+    if network is not None:
+        make = partial(Connection, config, server.server_state, {})
+        Handshakes(*network, make).begin()
 
     def end(*_: object) -> None:
         server.should_exit = True
@@ -127,6 +164,52 @@ class _Server(uvicorn.Server):
         yield
 
 
+class Certificate(TypedDict, total=False):
+    """The parts of `SSLSocket.getpeercert()` that count here."""
+
+    subject: tuple[tuple[tuple[str, str], ...], ...]
+    notAfter: str
+    serialNumber: str
+
+
+class Handshakes:
+    """TLS connections that begin: only so many at once, so that half-open ones cost neither memory nor files.
+
+    None of them is asked anything before its certificate was checked.
+    """
+
+    def __init__(
+        self, listener: socket.socket, context: ssl.SSLContext, make: Callable[[], asyncio.Protocol]
+    ) -> None:
+        self._listener, self._context, self._make = listener, context, make
+        self._begun: dict[asyncio.Future[object], socket.socket] = {}
+
+    def begin(self) -> None:
+        """Take connections from now on."""
+        asyncio.get_running_loop().add_reader(self._listener.fileno(), self._accept)
+
+    def _accept(self) -> None:
+        with suppress(OSError):  # it may be gone again
+            connection, _ = self._listener.accept()
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if len(self._begun) >= MOST_HANDSHAKES:
+                oldest = self._begun.pop(next(iter(self._begun)))
+                oldest.shutdown(socket.SHUT_RDWR)  # asyncio forgets a cancelled one that has not begun
+            shaking = asyncio.get_running_loop().connect_accepted_socket(
+                self._make, connection, ssl=self._context, ssl_handshake_timeout=HANDSHAKE_S
+            )
+            task = asyncio.ensure_future(shaking)
+            self._begun[task] = connection
+            task.add_done_callback(partial(self._end, connection))
+
+    def _end(self, connection: socket.socket, task: asyncio.Future[object]) -> None:
+        """Close a connection of which nothing came: a certificate that is refused, one of too many."""
+        self._begun.pop(task, None)
+        if task.cancelled() or task.exception() is not None:
+            connection.close()
+
+
 class Connection(H11Protocol):
     """HTTP/1.1 on one connection, closed when it is silent for too long, or one of too many."""
 
@@ -137,11 +220,12 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self.last_byte_s = self.loop.time()
         self._timer = self.loop.call_later(SILENCE_S, self._check)
-        process, user = _peer(transport)
-        if user not in (0, os.getuid()):  # the socket's mode forbids it too
+        self._certificate = _certificate(transport)
+        client = _client(transport, self._certificate)
+        if client is None or not self._valid():
             transport.abort()
             return
-        self.client = (f"process {process}", 0)
+        self.client = client
         crowded = self._crowded()
         if crowded:
             min(crowded, key=lambda one: (one.busy, one.last_byte_s)).transport.abort()
@@ -171,7 +255,18 @@ class Connection(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Take bytes."""
         self.last_byte_s = self.loop.time()
-        super().data_received(data)
+        if self._valid():
+            super().data_received(data)
+        else:
+            self.transport.abort()
+
+    def _valid(self) -> bool:
+        """Return whether the client's certificate counts still; a client of this computer has none."""
+        certificate = self._certificate
+        return not certificate or (
+            ssl.cert_time_to_seconds(certificate["notAfter"]) > time.time()
+            and not _REVOKED.has(certificate["serialNumber"])
+        )
 
     def resume_writing(self) -> None:
         """Go on with an answer of which the other side has taken some."""
@@ -193,16 +288,29 @@ class Connection(H11Protocol):
         if self.listening and not self.transport.get_write_buffer_size():
             self.last_byte_s = self.loop.time()
         silent_s = self.loop.time() - self.last_byte_s
-        if silent_s >= SILENCE_S:
+        if silent_s >= SILENCE_S or not self._valid():
             self.transport.abort()  # not close: that would wait for a reader that may never read
         else:
             self._timer = self.loop.call_later(SILENCE_S - silent_s + 0.01, self._check)
 
 
-def _peer(transport: asyncio.Transport) -> tuple[int, int]:
-    """Return process ID and user ID of a client."""
+def _certificate(transport: asyncio.Transport) -> Certificate:
+    """Return the certificate of a client, which TLS has checked; empty: the client is of this computer."""
+    secured = transport.get_extra_info("ssl_object")
+    found: Certificate = {} if secured is None else secured.getpeercert()
+    return found
+
+
+def _client(transport: asyncio.Transport, certificate: Certificate) -> Client | None:
+    """Return name and role of a client; None: it may ask nothing."""
+    if certificate:
+        subject = dict(pair for pairs in certificate["subject"] for pair in pairs)
+        role = subject.get("organizationalUnitName", "").upper()
+        name = f"{subject.get('commonName', '')} (network)"
+        return Client(name, Role[role]) if role in Role.__members__ else None
     end = transport.get_extra_info("socket")
     process, user, _ = _CREDENTIALS.unpack(
         end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     )
-    return process, user
+    # another user's: the socket's mode forbids it too
+    return Client(f"process {process}", Role.ADMIN) if user in (0, os.getuid()) else None

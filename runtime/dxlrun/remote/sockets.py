@@ -18,11 +18,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from dxlrun.errors import DxlrunError
+from dxlrun.errors import DxlrunError, InputError
 
 SUFFIX = ".sock"
+_ADDRESS = re.compile(r"(?:([\w.-]+)@)?(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 _HEAD = re.compile(rb"HTTP/1\.\d (\d{3}).*?\r\n\r\n", re.DOTALL)
 _LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)")
 _CHUNK = 65536
@@ -138,6 +139,26 @@ def sockets() -> dict[str, Path]:
     return found
 
 
+class Address(NamedTuple):
+    """Where the gateway of a robot listens."""
+
+    name: str
+    """In the robot's certificate."""
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.name}@{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+
+
+def address_of(text: str, name: str = "") -> Address:
+    """Return the address that `[NAME@]HOST:PORT` means; raises InputError."""
+    found = _ADDRESS.fullmatch(text)
+    if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
+        raise InputError(f"{text[:80]!r} is no address; write [NAME@]HOST:PORT, such as torso@lab3:7660")
+    return Address(found[1] or name, found[2].strip("[]"), int(found[3]))
+
+
 class RobotLink(Protocol):
     """How a client reaches a robot; everything raises OSError or ValueError when that does not answer."""
 
@@ -183,7 +204,7 @@ class SocketLink:
         end = self._end
         if end is None or time.monotonic() - self._used > _IDLE_S or _hung_up(end):
             self.close()
-            end = self._end = _connected(self._path)
+            end = self._end = self._connected()
         try:
             end.sendall(head.encode() + content)
             status, answer, closes = _answer(end)
@@ -197,7 +218,7 @@ class SocketLink:
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
         """Return status, first bytes and the connection of an answer that ends with the connection."""
-        end = _connected(self._path)
+        end = self._connected()
         try:
             end.sendall(f"GET {path} HTTP/1.0\r\n\r\n".encode())
             status, first, _ = _answer(end)
@@ -205,6 +226,9 @@ class SocketLink:
             end.close()
             raise
         return status, first, end
+
+    def _connected(self) -> socket.socket:
+        return _connected(self._path)
 
     def close(self) -> None:
         """Close the connection; the robot keeps running."""

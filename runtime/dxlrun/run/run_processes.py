@@ -157,7 +157,9 @@ def start_recorder(
     return child
 
 
-def start_gateway(log: Path | None, memory: RunMemory, epoch_offset_ns: int = 0) -> Child[GatewayMessage]:
+def start_gateway(
+    log: Path | None, memory: RunMemory, epoch_offset_ns: int, listen: str
+) -> Child[GatewayMessage]:
     """Start the gateway; it reports its socket when it is ready, and the run does not wait for that.
 
     Raises OSError when the system has no process left.
@@ -171,7 +173,7 @@ def start_gateway(log: Path | None, memory: RunMemory, epoch_offset_ns: int = 0)
         memory.answers,
         memory.messages,
     )
-    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None, epoch_offset_ns)
+    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None, epoch_offset_ns, listen)
     inherited = [memory.plan, *astuple(shared)]
     return _executed(Program("gateway", "dxlrun.remote"), job, inherited, memory, Decoder(GatewayMessage))
 

@@ -58,6 +58,8 @@ class RunOptions:
     """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
     gateway: bool = True
     """Let others steer the run, over a Unix socket."""
+    listen: str = ""
+    """And over mutual TLS, at this address; empty: not."""
 
 
 class RunSummary(msgspec.Struct, frozen=True):

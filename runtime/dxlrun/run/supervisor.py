@@ -285,7 +285,7 @@ class _Run:
         if self.gateway is None:
             if self.steerable and heartbeat.phase is Phase.RUNNING:
                 try:
-                    self.gateway = start_gateway(self.log, self.memory, self.offset_ns)
+                    self.gateway = start_gateway(self.log, self.memory, self.offset_ns, self.options.listen)
                 except OSError as error:
                     self._without_gateway(f"did not start ({error.strerror or error})")
         elif message := self.gateway.poll(0):

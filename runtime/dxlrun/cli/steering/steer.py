@@ -5,7 +5,7 @@ Each is one request to the gateway of the run: executed after the read of a cycl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
@@ -37,7 +37,7 @@ class Chosen:
     Parameters
     ----------
     robot
-        Name of the robot, where several run.
+        Name of the robot, where several run; NAME@HOST:PORT of one on another computer.
     as_json
         Print the result as JSON.
     debug
@@ -70,10 +70,11 @@ def list_robots(
         Print the traceback of an error.
     """
     from dxlrun.remote.client import connect, running
+    from dxlrun.remote.network import known_robots
 
-    names = running()
-    if robot is not None and robot not in names:
-        raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
+    here = running()
+    names = dict.fromkeys((*here, *known_robots()))
+    _require_known(robot, names)
     found, code = [], 0
     for name in names if robot is None else (robot,):
         try:
@@ -81,7 +82,7 @@ def list_robots(
                 found.append({**one.info(), "name": name})
         except DxlrunError as error:  # it may have ended meanwhile; the others are listed
             print_error(f"dxlrun: {error}")
-            code = 1
+            code |= robot is not None or name in here
     if as_json:
         show_json(found)
         return code
@@ -89,7 +90,7 @@ def list_robots(
         show(
             headline(info), *([drawing(info)] if graph else [controllers(info), sources(info), groups(info)])
         )
-    if not names:
+    if not found and not code:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
 
@@ -140,6 +141,13 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
         if (found := done.halted) is not None:
             text += f" after {found.seconds:.2f} s ({found.joint}: {found.velocity:.2g} rad/s)"
         return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it go on")
+
+
+def take_over(*, chosen: Chosen = ONLY_ONE) -> int:
+    """Command a robot that a client of another computer commands; that one is refused from now on."""
+    with robot_of(chosen, "take-over") as robot:
+        done = robot.take_over()
+        return report_done(robot, chosen, done, f"{robot.name} is commanded from here")
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
@@ -209,15 +217,22 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
     """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
     from dxlrun.remote.client import connect, running
+    from dxlrun.remote.network import known_robots
 
     names = running()
-    if not names:
+    if chosen.robot is not None:
+        _require_known(chosen.robot, (*names, *known_robots()))
+    elif not names:
         raise DxlrunError("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
-    if chosen.robot is None and len(names) > 1:
+    elif len(names) > 1:
         raise InputError(f"several robots run; choose one: --robot {', --robot '.join(names)}")
-    if chosen.robot is not None and chosen.robot not in names:
-        raise InputError(f"no robot {chosen.robot} runs; {suggestion(chosen.robot, names)}")
     return connect(chosen.robot or names[0], f"dxlrun {verb}")
+
+
+def _require_known(robot: str | None, names: Collection[str]) -> None:
+    """Raise InputError for a name that is no robot's; an address, NAME@HOST:PORT, is known to be one."""
+    if robot is not None and robot not in names and "@" not in robot:
+        raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
 
 
 def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:

@@ -7,6 +7,7 @@ this table.
 from __future__ import annotations
 
 import re
+from enum import IntEnum, unique
 from types import NoneType
 from typing import Generic, TypeAlias, TypeVar
 from urllib.parse import quote
@@ -38,6 +39,16 @@ Body = TypeVar("Body")
 Answer = TypeVar("Answer")
 
 
+@unique
+class Role(IntEnum):
+    """What a client may request; each role may do what those before it may."""
+
+    OBSERVE = 1
+    COMMAND = 2
+    ADMIN = 3
+    """Change registers, the loop's rate and its controllers; a client on the robot's own computer has it."""
+
+
 class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
     """A request that clients may make."""
 
@@ -52,6 +63,8 @@ class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
     """How many a second of one process, together with all others of this number; 0: it is always taken."""
     query: tuple[str, ...] = ()
     """What may follow behind a question mark."""
+    role: Role = Role.COMMAND
+    """The least that a client needs; halt and stop ask for no lease, see `commander.py`."""
 
     def target(self, *names: object) -> str:
         """Return the path with these names, which cannot leave their places."""
@@ -86,42 +99,45 @@ class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 Row: TypeAlias = dict[str, object]
 Done: TypeAlias = Executed[int]
 
-ROBOT = Request("GET", "/robot", NoneType, RobotInfo, MOST_LOOKS)
-STATES = Request("GET", "/states", NoneType, bytes, MOST_LOOKS)
-FRAMES = Request("GET", "/frames", NoneType, Frames, MOST_LOOKS)
-LOG_HEADER = Request("GET", "/log-header", NoneType, bytes, MOST_LOOKS)
-EVENTS = Request("GET", "/events", NoneType, Events, MOST_LOOKS, ("after",))
-TOPICS = Request("GET", "/topics", NoneType, Topics, MOST_LOOKS)
-STREAM = Request("GET", "/stream", NoneType, bytes, MOST_LOOKS, ("topic", "newest", "rate", "once"))
-GOALS = Request("GET", "/goals", NoneType, Goals, MOST_LOOKS)
-GOAL = Request("GET", "/goals/{number}", NoneType, GoalState, MOST_LOOKS, ("wait",))
+ROBOT = Request("GET", "/robot", NoneType, RobotInfo, MOST_LOOKS, role=Role.OBSERVE)
+STATES = Request("GET", "/states", NoneType, bytes, MOST_LOOKS, role=Role.OBSERVE)
+FRAMES = Request("GET", "/frames", NoneType, Frames, MOST_LOOKS, role=Role.OBSERVE)
+LOG_HEADER = Request("GET", "/log-header", NoneType, bytes, MOST_LOOKS, role=Role.OBSERVE)
+EVENTS = Request("GET", "/events", NoneType, Events, MOST_LOOKS, ("after",), role=Role.OBSERVE)
+TOPICS = Request("GET", "/topics", NoneType, Topics, MOST_LOOKS, role=Role.OBSERVE)
+STREAM = Request(
+    "GET", "/stream", NoneType, bytes, MOST_LOOKS, ("topic", "newest", "rate", "once"), role=Role.OBSERVE
+)
+GOALS = Request("GET", "/goals", NoneType, Goals, MOST_LOOKS, role=Role.OBSERVE)
+GOAL = Request("GET", "/goals/{number}", NoneType, GoalState, MOST_LOOKS, ("wait",), role=Role.OBSERVE)
 CANCEL = Request("POST", "/goals/{number}/cancel", NoneType, Done)
 CANCEL_OF = Request("POST", "/controllers/{name}/cancel", NoneType, Done)
-PARAMETERS = Request("GET", "/controllers/{name}/parameters", NoneType, Parameters)
+PARAMETERS = Request("GET", "/controllers/{name}/parameters", NoneType, Parameters, role=Role.OBSERVE)
 CHANGE = Request("POST", "/controllers/{name}/parameters", NewValues, Changed)
 COMMAND = Request("POST", "/controllers/{name}/commands/{kind}", bytes, Done, query=("units", "in"))
 SET_POINT = Request(
     "POST", "/controllers/{name}/set-points/{kind}", bytes, Clamped, MOST_SET_POINTS, ("lease",)
 )
-LOAD = Request("POST", "/controllers", Row, Done)
-UNLOAD = Request("DELETE", "/controllers/{name}", NoneType, Done)
+LOAD = Request("POST", "/controllers", Row, Done, role=Role.ADMIN)
+UNLOAD = Request("DELETE", "/controllers/{name}", NoneType, Done, role=Role.ADMIN)
 PLAY = Request("POST", "/play", NewMotion, Done)
 SWITCH = Request("POST", "/switch", Switch, Done)
 # paths, since servos that share joints have names such as hip/1
-REGISTER = Request("POST", "/joints/{name:path}/registers/{item}", Value, Done)
+REGISTER = Request("POST", "/joints/{name:path}/registers/{item}", Value, Done, role=Role.ADMIN)
 READ_REGISTER = Request("GET", "/joints/{name:path}/registers/{item}", NoneType, Row)
-JOINT = Request("GET", "/joints/{name:path}", NoneType, Row, MOST_LOOKS)
+JOINT = Request("GET", "/joints/{name:path}", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
 TORQUE = Request("POST", "/torque", TorqueRequest, Done)
 REBOOT = Request("POST", "/reboot", RebootRequest, Done)
-RATE = Request("POST", "/rate", Rate, Done)
+RATE = Request("POST", "/rate", Rate, Done, role=Role.ADMIN)
 HALT = Request("POST", "/halt", NoneType, Done, 0)
 PAUSE = Request("POST", "/pause", NoneType, Done)
 RESUME = Request("POST", "/resume", NoneType, Done)
 STOP = Request("POST", "/stop", NoneType, Done, 0)
-DESCRIPTION = Request("GET", "/openapi.json", NoneType, Row, MOST_LOOKS)
+TAKE_OVER = Request("POST", "/take-over", NoneType, Done, 0)
+DESCRIPTION = Request("GET", "/openapi.json", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
 
 REQUESTS = tuple(one for one in tuple(globals().values()) if isinstance(one, Request))
-"""All of them, in this order. Halt and stop are always taken, as far as there is room."""
+"""All of them, in this order. Halt, stop and a take-over are always taken, as far as there is room."""
 
 EXAMPLES = {
     NewValues: '{"values": {"speed": "20 deg/s"}}',

@@ -1,0 +1,178 @@
+"""Authority: a certificate authority of one's own, which signs for robots and clients (extra `network`).
+
+Its key and all certificates that it signed lie in `authority` of the keys' directory. Certificates after
+RFC 5280: a robot's serves only as a server's, a client's only as a client's (extended key usage), and the
+role of a client is the organizational unit of its subject.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from dxlrun.errors import InputError
+from dxlrun.remote.network import CLIENT, keys_place
+from dxlrun.remote.requests.table import Role
+
+_AUTHORITY_DAYS = 3650
+_EARLIER = timedelta(minutes=5)
+"""Certificates are valid from this long before: clocks of computers differ."""
+
+
+class Issued(NamedTuple):
+    """A certificate that the authority signed."""
+
+    name: str
+    certificate: x509.Certificate
+
+    @property
+    def role(self) -> str:
+        """The role of a client; `robot` of a robot."""
+        found = self.certificate.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+        return str(found[0].value) if found else "robot"
+
+    @property
+    def serial(self) -> str:
+        """As TLS names it: hexadecimal, an even number of digits."""
+        digits = f"{self.certificate.serial_number:X}"
+        return digits.zfill(len(digits) + len(digits) % 2)
+
+
+def place() -> Path:
+    """Return the directory of the authority."""
+    return keys_place() / "authority"
+
+
+def issued() -> Iterator[Issued]:
+    """Yield the newest certificate of each name, in order of the names."""
+    for path in sorted(place().glob("issued/*.crt")):
+        yield Issued(path.stem, x509.load_pem_x509_certificate(path.read_bytes()))
+
+
+def revoked() -> frozenset[str]:
+    """Return the serial numbers that robots refuse."""
+    path = keys_place() / "revoked"
+    return frozenset(path.read_text().split()) if path.exists() else frozenset()
+
+
+def revoke(one: Issued) -> None:
+    """Let the robots of this computer refuse a certificate from now on."""
+    lines = "".join(f"{serial}\n" for serial in sorted(revoked() | {one.serial}))
+    (keys_place() / "revoked").write_text(lines)
+
+
+def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
+    """Sign a certificate, and write it with its key and the authority's to a directory.
+
+    `role` is a client's; None: the certificate is a robot's. Raises InputError when a key would be written
+    over that is another name's.
+    """
+    file = name if role is None else CLIENT
+    issuer, signer = _authority()
+    kept = place() / "issued" / f"{name}.crt"
+    there = to / f"{file}.crt"
+    if there.exists() and not _is_named(there, name):
+        raise InputError(f"{there} is another name's: give --to DIRECTORY for another computer's files")
+    key = ec.generate_private_key(ec.SECP256R1())
+    unit = [] if role is None else [_attribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role.name.lower())]
+    usage = ExtendedKeyUsageOID.SERVER_AUTH if role is None else ExtendedKeyUsageOID.CLIENT_AUTH
+    builder = (
+        _builder(x509.Name([*unit, _attribute(NameOID.COMMON_NAME, name)]), issuer.subject, key, days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([usage]), critical=True)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
+    )
+    if role is None:
+        builder = builder.add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
+    one = Issued(name, builder.sign(signer, hashes.SHA256()))
+    kept.write_bytes(one.certificate.public_bytes(Encoding.PEM))
+    to.mkdir(parents=True, exist_ok=True)
+    _write_key(to / f"{file}.key", key)
+    there.write_bytes(kept.read_bytes())
+    (to / "ca.crt").write_bytes(issuer.public_bytes(Encoding.PEM))
+    return one
+
+
+def _is_named(path: Path, name: str) -> bool:
+    subject = x509.load_pem_x509_certificate(path.read_bytes()).subject
+    return subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == name
+
+
+def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Return the authority's certificate and key, which are made at the first use."""
+    certificate, path = keys_place() / "ca.crt", place() / "ca.key"
+    if not path.exists():
+        if certificate.exists():
+            raise InputError(f"{certificate} is of another computer's authority: make certificates there")
+        (place() / "issued").mkdir(parents=True, mode=0o700)
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = x509.Name([_attribute(NameOID.COMMON_NAME, "dxlrun")])
+        usage = x509.KeyUsage(
+            key_cert_sign=True,
+            crl_sign=True,
+            digital_signature=False,
+            content_commitment=False,
+            key_encipherment=False,
+            data_encipherment=False,
+            key_agreement=False,
+            encipher_only=False,
+            decipher_only=False,
+        )
+        signed = (
+            _builder(name, name, key, _AUTHORITY_DAYS)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(usage, critical=True)
+            .sign(key, hashes.SHA256())
+        )
+        _write_key(path, key)
+        certificate.write_bytes(signed.public_bytes(Encoding.PEM))
+    signer = load_pem_private_key(path.read_bytes(), None)
+    if not isinstance(signer, ec.EllipticCurvePrivateKey):
+        raise InputError(f"{path} is no key of this version; move {place()} away to begin anew")
+    return x509.load_pem_x509_certificate(certificate.read_bytes()), signer
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int
+) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _EARLIER)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _attribute(kind: x509.ObjectIdentifier, value: str) -> x509.NameAttribute[str]:
+    return x509.NameAttribute(kind, value)
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Write a key that only this user can read."""
+    data = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    part = path.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
+        stream.write(data)
+    part.replace(path)

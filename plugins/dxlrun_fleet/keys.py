@@ -1,0 +1,119 @@
+"""`dxlrun keys`: certificates for the gateways of robots and for their clients."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import InputError
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import show, show_json
+from dxlrun.remote.requests.table import Role
+
+if TYPE_CHECKING:
+    from dxlrun_fleet.authority import Issued
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", re.ASCII)
+MOST_DAYS = 3650
+
+
+def keys(
+    action: Literal["robot", "client", "renew", "revoke", "list"] = "list",
+    name: str | None = None,
+    /,
+    *,
+    role: Literal["observe", "command", "admin"] = "observe",
+    days: int = 365,
+    to: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Make certificates for robots and clients of a network, renew and revoke them.
+
+    The first use makes an authority of one's own, on this computer; its key never leaves it.
+
+    Parameters
+    ----------
+    action
+        robot NAME and client NAME make a certificate, renew NAME makes it anew, revoke NAME lets the robots
+        of this computer refuse it, list shows all.
+    name
+        Of a robot, as in its robot file, or of a client, as the robot's log shall name it.
+    role
+        What a client may do: observe, command, or admin, which is registers, rates and controllers, too.
+    days
+        How long the certificate is valid.
+    to
+        Write it to this directory, to be copied to `~/.config/dxlrun/keys` of another computer; without, this
+        computer uses it.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    try:
+        from dxlrun_fleet import authority
+    except ImportError as error:
+        raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
+    from dxlrun.remote.network import CLIENT, keys_place
+
+    if action != "list":
+        if name is None or not _NAME.fullmatch(name) or name in (CLIENT, "ca"):
+            raise InputError(
+                f"`dxlrun keys {action}` needs a name of letters, digits, _ . and -, such as torso"
+            )
+        if not 0 < days <= MOST_DAYS:
+            raise InputError(f"--days {days} is no time from 1 to {MOST_DAYS}")
+        known = {one.name: one for one in authority.issued()}
+        directory = keys_place() if to is None else to
+        if action in ("robot", "client"):
+            if name in known:
+                raise InputError(
+                    f"{name} has a certificate: `dxlrun keys renew {name}`, or take another name"
+                )
+            chosen = None if action == "robot" else Role[role.upper()]
+        elif name not in known:
+            raise InputError(f"{name} has no certificate; there are: {', '.join(known) or 'none'}")
+        else:
+            chosen = None if known[name].role == "robot" else Role[known[name].role.upper()]
+        if action == "revoke":
+            authority.revoke(known[name])
+            sentence = (
+                f"{name} is refused by the robots of this computer; copy {keys_place() / 'revoked'} to others"
+            )
+        else:
+            one = authority.issue(name, chosen, days, directory)
+            where = "" if to is None else f"; copy it to ~/.config/dxlrun/keys of {name}'s computer"
+            sentence = f"{directory} has the certificate of {name} ({one.role}, {days} days){where}"
+        if not as_json:
+            show(sentence)
+            return 0
+    rows = [
+        {
+            "name": one.name,
+            "role": one.role,
+            "until": one.certificate.not_valid_after_utc.date().isoformat(),
+            "state": _state(one, authority.revoked()),
+            "serial": one.serial,
+        }
+        for one in authority.issued()
+    ]
+    if as_json:
+        show_json(rows)
+        return 0
+    columns = [Column(name, "name") for name in ("name", "role", "until", "state")]
+    show(
+        Table.of("Certificates", columns, ([*row.values()][:4] for row in rows))
+        if rows
+        else "no certificate yet; `dxlrun keys robot NAME` and `dxlrun keys client NAME` make some"
+    )
+    return 0
+
+
+def _state(one: Issued, revoked: frozenset[str]) -> str:
+    if one.serial in revoked:
+        return "revoked"
+    return "valid" if one.certificate.not_valid_after_utc > datetime.now(UTC) else "expired"

@@ -1,0 +1,25 @@
+"""The verbs for several robots and computers, by the same hooks as any other package."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun import CONTRACT_VERSION, Command, hookimpl
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for: the one it is published with."""
+    return CONTRACT_VERSION
+
+
+@hookimpl
+def dxlrun_commands() -> Sequence[Command]:
+    """Return the verbs."""
+    return (
+        Command(
+            "keys",
+            "dxlrun_fleet.keys:keys",
+            "Make certificates for robots and clients of a network, renew and revoke them.",
+        ),
+    )

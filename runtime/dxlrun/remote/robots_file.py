@@ -1,0 +1,39 @@
+"""Robots of other computers: the file that names them, `robots.yaml` of the settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.document import grow, parse, read_text
+from dxlrun.description.form import Form, key, refuse
+from dxlrun.description.problems import read_form
+from dxlrun.errors import InputError
+from dxlrun.remote.sockets import Address, address_of
+
+
+def _address(text: str) -> str:
+    try:
+        address_of(text, "robot")
+    except InputError as error:
+        what, _, fix = str(error).partition("; ")
+        raise refuse(what, fix) from error
+    return text
+
+
+class RobotsFile(Form):
+    """Where the gateways of robots listen."""
+
+    robots: dict[str, Annotated[str, AfterValidator(_address)]] = key(
+        "Addresses by the names of certificates.", "{torso: lab3:7660}"
+    )
+
+
+def read_robots(path: Path) -> dict[str, Address]:
+    """Return the addresses of a file by name; raises InputError with the place of each mistake."""
+    file = str(path)
+    robots = read_form(grow(parse(read_text(path), file), file, refuse_arguments), RobotsFile).robots
+    return {name: address_of(text, name) for name, text in robots.items()}
