@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dxlrun.errors import InputError
-from dxlrun.remote.network import CLIENT, keys_place
+from dxlrun.remote.network.certificates import CLIENT, keys_place
 from dxlrun.remote.requests.table import Role
 
 _AUTHORITY_DAYS = 3650

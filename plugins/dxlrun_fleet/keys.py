@@ -58,7 +58,7 @@ def keys(
         from dxlrun_fleet import authority
     except ImportError as error:
         raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
-    from dxlrun.remote.network import CLIENT, keys_place
+    from dxlrun.remote.network.certificates import CLIENT, keys_place
 
     if action != "list":
         if name is None or not _NAME.fullmatch(name) or name in (CLIENT, "ca"):

@@ -314,7 +314,9 @@ def test_a_flood_of_set_points_gives_the_loop_one_a_cycle_and_takes_nothing_from
 def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(desk):
     async def flood():
         for process in range(1000):
-            await desk.request("POST", SET_POINT, {"positions": [0]}, client=(f"process {process}", 0))
+            await desk.request(
+                "POST", SET_POINT, {"positions": [0]}, client=(f"process {process}", Role.ADMIN)
+            )
 
     asyncio.run(flood())
     assert len(desk.gateway._allowances[requests.MOST_SET_POINTS]._left) == asked.MOST_PEERS
@@ -325,7 +327,7 @@ def test_what_waits_for_a_silent_loop_is_bounded_and_stop_is_taken_all_the_same(
     monkeypatch.setattr(link, "ANSWER_S", 0.05)
 
     async def crowd():
-        clients = [(f"process {number}", 0) for number in range(100)]
+        clients = [(f"process {number}", Role.ADMIN) for number in range(100)]
         wishes = [desk.request("POST", GO, {"positions": [0]}, client=client) for client in clients]
         stop = desk.request("POST", "/stop")
         return [status for status, _ in await asyncio.gather(*wishes, stop)]

@@ -15,12 +15,12 @@ from tests.remote.conftest import STOP, Door
 
 from dxlrun.channels.answers import Code
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.remote import network
 from dxlrun.remote.client import RemoteRobot, connect
 from dxlrun.remote.commander import LEASE_S
-from dxlrun.remote.network import NetworkLink, client_context, keys_place, server_context
+from dxlrun.remote.network.certificates import client_context, keys_place, server_context
+from dxlrun.remote.network.handshakes import MOST_HANDSHAKES, Secured
+from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests.table import REQUESTS, Role
-from dxlrun.remote.server import MOST_HANDSHAKES
 from dxlrun.remote.sockets import Address, address_of
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
@@ -60,7 +60,7 @@ class NetDoor(Door):
         listener = socket.create_server(("127.0.0.1", 0), backlog=256)
         listener.setblocking(False)
         self.address = Address("pair", *listener.getsockname())
-        self.network = listener, server_context("pair")
+        self.network = Secured(listener, server_context("pair"))
 
     def be(self, name):
         """Have the settings of a client from now on."""
@@ -110,11 +110,11 @@ def test_a_client_looks_listens_and_commands_as_on_the_robots_own_computer(net):
 
     net.while_served(act)
     assert [(one.kind, one.origin) for one in net.desk.taken] == [
-        ("commander", "admin (network): test"),
-        ("go", "admin (network): test"),
-        ("stop", "admin (network): test"),
+        ("commander", "client admin: test"),
+        ("go", "client admin: test"),
+        ("stop", "client admin: test"),
     ]
-    assert json.loads(net.desk.taken[0].data) == {"client": "admin (network)", "instead": "this computer"}
+    assert json.loads(net.desk.taken[0].data) == {"client": "client admin", "instead": "this computer"}
 
 
 def test_each_role_may_what_the_table_has_and_the_loop_gets_nothing_else(desk):
@@ -122,7 +122,7 @@ def test_each_role_may_what_the_table_has_and_the_loop_gets_nothing_else(desk):
         for request in REQUESTS:
             desk.taken.clear()
             names = request.path.replace(":path", "").replace("{", "").replace("}", "")
-            status, answer = desk.ask(request.method, names, {}, client=(f"{role.name} (network)", role))
+            status, answer = desk.ask(request.method, names, {}, client=(f"client {role.name}", role))
             allowed = role >= request.role
             assert (answer is not None and answer.get("code") == Code.NOT_ALLOWED) == (not allowed)
             assert (status == 403) == (not allowed)
@@ -295,11 +295,11 @@ def test_addresses(monkeypatch, tmp_path):
     (tmp_path / "dxlrun").mkdir()
     (tmp_path / "dxlrun" / "robots.yaml").write_text("robots:\n  torso: lab3:7660\n  arm: lab4\n  leg: x:y\n")
     with pytest.raises(InputError) as found:
-        network.known_robots()
+        known_robots()
     places = [(one.mark.line, one.mark.column) for one in found.value.problems]
     assert places == [(3, 8), (4, 8)]
     (tmp_path / "dxlrun" / "robots.yaml").write_text("robots: {torso: 'lab3:7660', b: 'c@lab4:1'}")
-    assert network.known_robots() == {"torso": ("torso", "lab3", 7660), "b": ("c", "lab4", 1)}
+    assert known_robots() == {"torso": ("torso", "lab3", 7660), "b": ("c", "lab4", 1)}
     with pytest.raises(InputError, match="is missing; `dxlrun keys` makes"):
         connect("torso")
 

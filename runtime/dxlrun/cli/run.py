@@ -120,7 +120,7 @@ def run(
 
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
     """Raise InputError where clients of other computers could not be served."""
-    from dxlrun.remote.network import server_context
+    from dxlrun.remote.network.handshakes import Secured
     from dxlrun.remote.sockets import address_of
 
     address = address_of(text, plan.robot)
@@ -128,11 +128,8 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
         raise InputError(
             "--listen needs the gateway of a run in real time: leave out --no-gateway, --virtual"
         )
-    server_context(address.name)
-    import socket
-
     try:
-        socket.create_server((address.host, address.port)).close()
+        Secured.at(address).listener.close()
     except OSError as error:
         raise InputError(f"nothing can listen at {address.host}:{address.port}: {error}") from error
 

@@ -80,9 +80,7 @@ class Asked(Generic[Body]):
 
 def client_of(http: starlette.requests.Request) -> Client:
     """Return the client that sent a request, as its connection has it."""
-    return (
-        Client(http.client.host, Role(http.client.port)) if http.client else Client("process ?", Role.ADMIN)
-    )
+    return Client(http.client.host, Role(http.client.port)) if http.client else Client("", Role.OBSERVE)
 
 
 def peer(http: starlette.requests.Request) -> str:

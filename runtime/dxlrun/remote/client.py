@@ -27,7 +27,7 @@ from msgspec.structs import asdict
 from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.live.listening import Listening, TopicMessage
-from dxlrun.remote.network import NetworkLink, known_robots
+from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests import replies
 from dxlrun.remote.requests import table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState

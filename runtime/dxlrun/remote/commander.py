@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from dxlrun.channels.answers import Code
 from dxlrun.remote.preparation import refused
-from dxlrun.remote.requests.table import Answer, Body, Request, Role
+from dxlrun.remote.requests.table import HALT, STOP, TAKE_OVER, Answer, Body, Request, Role
 
 LEASE_S = 5.0
 """A client that sends no command for so long commands no longer; another may then."""
@@ -20,13 +20,19 @@ class Client(NamedTuple):
     """The other end of a connection; where HTTP has host and port, so it comes along with each request."""
 
     name: str
-    """A process of this computer, or the name in a certificate."""
+    """`process N` of this computer, or `client NAME` with the name in a certificate."""
     role: Role
 
     @property
     def commands_as(self) -> str:
         """Return as what it commands."""
         return HERE if self.name.startswith("process ") else self.name
+
+    def require_role(self, request: Request[Body, Answer]) -> None:
+        """Raise RefusedRequest when its role does not allow a request."""
+        if self.role < request.role:
+            needed, role = request.role.name.lower(), self.role.name.lower()
+            raise refused(Code.NOT_ALLOWED, {"client": self.name, "role": role, "needed": needed})
 
 
 @dataclass(slots=True)
@@ -41,12 +47,9 @@ class Commander:
     def admit(self, client: Client, request: Request[Body, Answer]) -> str | None:
         """Return the client's predecessor when it begins to command with this request.
 
-        Raises RefusedRequest when its role does not allow the request, or another client commands.
+        Raises RefusedRequest when another client commands.
         """
-        if client.role < request.role:
-            needed, role = request.role.name.lower(), client.role.name.lower()
-            raise refused(Code.NOT_ALLOWED, {"client": client.name, "role": role, "needed": needed})
-        if request.method == "GET" or not request.rate:
+        if request.method == "GET" or request in (HALT, STOP, TAKE_OVER):
             return None
         if client.commands_as != self.name and self.now() < self._until:
             left = self._until - self.now()

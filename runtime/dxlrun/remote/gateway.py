@@ -196,10 +196,9 @@ class GatewayApp:
             try:
                 if allowance is not None:
                     allowance.spend(peer(http))
-                before = self._commander.admit(client_of(http), request)
+                client_of(http).require_role(request)
                 asked = await received(request, http, allowance)
-                if before is not None:
-                    await self._note_commander(before, asked.origin)
+                await self._admit(asked, request)
                 return _response(await handler(self, asked))
             except RefusedRequest as error:
                 return _refused(error.refusal)
@@ -398,6 +397,7 @@ class GatewayApp:
             raise RefusedRequest(played)
         if await asked.http.is_disconnected():  # it could not be cancelled by its number
             raise ClientDisconnect
+        await self._admit(asked, requests.PLAY)  # the check took its time
         done = await self._link.command(
             LOOP, "play", played.data, f"{asked.origin}: {file}", request=played.request
         )
@@ -623,6 +623,14 @@ class GatewayApp:
         """Let this client command the robot although another one does."""
         before = self._commander.become(client_of(asked.http))
         return await self._note_commander(before or self._commander.name, asked.origin)
+
+    async def _admit(self, asked: Asked[Body], request: Request[Body, Answer]) -> None:
+        """Let a client command with a request, and log when it begins to; raises RefusedRequest."""
+        client = client_of(asked.http)
+        before = self._commander.admit(client, request)
+        if before is not None:
+            await self._note_commander(before, asked.origin)
+            self._commander.admit(client, request)  # another one may have taken over meanwhile
 
     async def _note_commander(self, before: str, origin: str) -> Executed[int]:
         """Log that a client commands instead of another."""

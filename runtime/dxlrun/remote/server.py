@@ -3,7 +3,7 @@
 A client may hang in the middle of a request, never read its answer, or open connections without end. A
 process above its limit loses the connection of its own that was silent longest, so a flood closes none of
 another process, whose `stop` is served. The process ID comes from the Linux kernel (SO_PEERCRED, unix(7)).
-Of a client of another computer the name in its certificate counts instead; see `network.py`.
+Of a client of another computer the name in its certificate counts instead; see `network/`.
 """
 
 from __future__ import annotations
@@ -15,15 +15,12 @@ import os
 import selectors
 import signal
 import socket
-import ssl
 import struct
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import TypeAlias, TypedDict
 
 import msgspec
 import uvicorn
@@ -40,7 +37,8 @@ from dxlrun.remote.computation import PR_SET_PDEATHSIG
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
-from dxlrun.remote.network import Revoked, server_context
+from dxlrun.remote.network.certificates import Certificate, counts
+from dxlrun.remote.network.handshakes import Handshakes, Secured
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.table import Role
 from dxlrun.remote.sockets import address_of, listen
@@ -51,12 +49,8 @@ MOST_OF_PROCESS = 16
 SILENCE_S = 30.0
 """A connection is closed after so long without a byte from the other side, or in which it took none of what
 waits for it."""
-MOST_HANDSHAKES = 64
-"""Of TLS at once; one more ends the oldest."""
-HANDSHAKE_S = 5.0
 
 _CREDENTIALS = struct.Struct("3i")
-_REVOKED = Revoked({})
 
 
 def main() -> None:
@@ -75,7 +69,7 @@ def main() -> None:
         plugins = load_plugins(files=plan.included)
         preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
-        network = _on_network(job.listen, plan.robot) if job.listen else None
+        network = Secured.at(address_of(job.listen, plan.robot)) if job.listen else None
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))
@@ -92,20 +86,6 @@ def main() -> None:
 def _event_loop() -> asyncio.AbstractEventLoop:
     """Return an event loop that waits parts of a millisecond: epoll(7), the usual way, counts whole ones."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
-
-
-Secured: TypeAlias = tuple[socket.socket, ssl.SSLContext]
-"""A listening TCP socket, and the TLS that is spoken there."""
-
-
-def _on_network(text: str, robot: str) -> Secured:
-    """Return where clients of other computers connect; raises InputError and OSError."""
-    address = address_of(text, robot)
-    context = server_context(address.name)
-    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
-    listener = socket.create_server((address.host, address.port), family=family, backlog=MOST_HANDSHAKES)
-    listener.setblocking(False)
-    return listener, context
 
 
 async def serve(
@@ -134,8 +114,7 @@ async def serve(
     server = _Server(config)
     config.load()
     if network is not None:
-        make = partial(Connection, config, server.server_state, {})
-        Handshakes(*network, make).begin()
+        Handshakes(network, partial(Connection, config, server.server_state, {})).begin()
 
     def end(*_: object) -> None:
         server.should_exit = True
@@ -162,52 +141,6 @@ class _Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
         yield
-
-
-class Certificate(TypedDict, total=False):
-    """The parts of `SSLSocket.getpeercert()` that count here."""
-
-    subject: tuple[tuple[tuple[str, str], ...], ...]
-    notAfter: str
-    serialNumber: str
-
-
-class Handshakes:
-    """TLS connections that begin: only so many at once, so that half-open ones cost neither memory nor files.
-
-    None of them is asked anything before its certificate was checked.
-    """
-
-    def __init__(
-        self, listener: socket.socket, context: ssl.SSLContext, make: Callable[[], asyncio.Protocol]
-    ) -> None:
-        self._listener, self._context, self._make = listener, context, make
-        self._begun: dict[asyncio.Future[object], socket.socket] = {}
-
-    def begin(self) -> None:
-        """Take connections from now on."""
-        asyncio.get_running_loop().add_reader(self._listener.fileno(), self._accept)
-
-    def _accept(self) -> None:
-        with suppress(OSError):  # it may be gone again
-            connection, _ = self._listener.accept()
-            connection.setblocking(False)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if len(self._begun) >= MOST_HANDSHAKES:
-                oldest = self._begun.pop(next(iter(self._begun)))
-                oldest.shutdown(socket.SHUT_RDWR)  # asyncio forgets a cancelled one that has not begun
-            shaking = asyncio.get_running_loop().connect_accepted_socket(
-                self._make, connection, ssl=self._context, ssl_handshake_timeout=HANDSHAKE_S
-            )
-            task = asyncio.ensure_future(shaking)
-            self._begun[task] = connection
-            task.add_done_callback(partial(self._end, connection))
-
-    def _end(self, connection: socket.socket, task: asyncio.Future[object]) -> None:
-        """Close a connection of which nothing came: a certificate that is refused, one of too many."""
-        self._begun.pop(task, None)
-        if task.cancelled() or task.exception() is not None:
-            connection.close()
 
 
 class Connection(H11Protocol):
@@ -262,11 +195,7 @@ class Connection(H11Protocol):
 
     def _valid(self) -> bool:
         """Return whether the client's certificate counts still; a client of this computer has none."""
-        certificate = self._certificate
-        return not certificate or (
-            ssl.cert_time_to_seconds(certificate["notAfter"]) > time.time()
-            and not _REVOKED.has(certificate["serialNumber"])
-        )
+        return not self._certificate or counts(self._certificate)
 
     def resume_writing(self) -> None:
         """Go on with an answer of which the other side has taken some."""
@@ -306,7 +235,7 @@ def _client(transport: asyncio.Transport, certificate: Certificate) -> Client | 
     if certificate:
         subject = dict(pair for pairs in certificate["subject"] for pair in pairs)
         role = subject.get("organizationalUnitName", "").upper()
-        name = f"{subject.get('commonName', '')} (network)"
+        name = f"client {subject.get('commonName', '')}"  # never as a process of this computer
         return Client(name, Role[role]) if role in Role.__members__ else None
     end = transport.get_extra_info("socket")
     process, user, _ = _CREDENTIALS.unpack(

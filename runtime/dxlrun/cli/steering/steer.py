@@ -70,7 +70,7 @@ def list_robots(
         Print the traceback of an error.
     """
     from dxlrun.remote.client import connect, running
-    from dxlrun.remote.network import known_robots
+    from dxlrun.remote.network.network_link import known_robots
 
     here = running()
     names = dict.fromkeys((*here, *known_robots()))
@@ -217,7 +217,7 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
     """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
     from dxlrun.remote.client import connect, running
-    from dxlrun.remote.network import known_robots
+    from dxlrun.remote.network.network_link import known_robots
 
     names = running()
     if chosen.robot is not None:

@@ -107,7 +107,7 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
         except KeyboardInterrupt:
             return 0
         except DxlrunError as error:
-            if not _ended(robot):
+            if robot.link.alive:
                 raise
             if not chosen.as_json:
                 show(
@@ -130,12 +130,6 @@ def _first_look(watched: Watched) -> None:
         else:
             return
     watched.look()
-
-
-def _ended(robot: RemoteRobot) -> bool:
-    from dxlrun.remote.client import running
-
-    return robot.name not in running()
 
 
 def _print_lines(watched: Watched, *, once: bool) -> None:

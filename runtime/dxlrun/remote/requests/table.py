@@ -64,7 +64,7 @@ class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
     query: tuple[str, ...] = ()
     """What may follow behind a question mark."""
     role: Role = Role.COMMAND
-    """The least that a client needs; halt and stop ask for no lease, see `commander.py`."""
+    """The least that a client needs; halt, stop and a take-over ask for no lease, see `commander.py`."""
 
     def target(self, *names: object) -> str:
         """Return the path with these names, which cannot leave their places."""
@@ -133,11 +133,11 @@ HALT = Request("POST", "/halt", NoneType, Done, 0)
 PAUSE = Request("POST", "/pause", NoneType, Done)
 RESUME = Request("POST", "/resume", NoneType, Done)
 STOP = Request("POST", "/stop", NoneType, Done, 0)
-TAKE_OVER = Request("POST", "/take-over", NoneType, Done, 0)
+TAKE_OVER = Request("POST", "/take-over", NoneType, Done)
 DESCRIPTION = Request("GET", "/openapi.json", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
 
 REQUESTS = tuple(one for one in tuple(globals().values()) if isinstance(one, Request))
-"""All of them, in this order. Halt, stop and a take-over are always taken, as far as there is room."""
+"""All of them, in this order. Halt and stop are always taken, as far as there is room."""
 
 EXAMPLES = {
     NewValues: '{"values": {"speed": "20 deg/s"}}',

@@ -1,0 +1,112 @@
+"""Certificates: mutual TLS 1.3 between computers, by an authority of one's own.
+
+Certificates and keys lie in `keys` of dxlrun's directory for settings: `ca.crt`, NAME.crt and NAME.key of
+each robot that runs here, client.crt and client.key of this user (`dxlrun keys` makes them). There is no way
+without: TLS checks the other end's certificate before any byte of a request is read.
+"""
+
+from __future__ import annotations
+
+import os
+import ssl
+import time
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import TypedDict
+
+from dxlrun.errors import InputError
+
+CLIENT = "client"
+"""Name of the files with the certificate and the key of a client."""
+
+
+class Certificate(TypedDict, total=False):
+    """The parts of `SSLSocket.getpeercert()` that count here."""
+
+    subject: tuple[tuple[tuple[str, str], ...], ...]
+    notAfter: str
+    serialNumber: str
+
+
+def settings() -> Path:
+    """Return the directory of this user's settings (XDG Base Directory Specification)."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dxlrun"
+
+
+def keys_place() -> Path:
+    """Return the directory of certificates and keys."""
+    return settings() / "keys"
+
+
+def server_context(name: str) -> ssl.SSLContext:
+    """Return TLS as a robot's gateway has it; raises InputError where its certificate would be refused."""
+    context = _context(ssl.PROTOCOL_TLS_SERVER, name)
+    context.num_tickets = 0  # no byte is sent that answers no request, and no session is resumed
+    _try(context, name)
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+def client_context() -> ssl.SSLContext:
+    """Return TLS as a client has it; raises InputError."""
+    return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT)
+
+
+def _context(protocol: int, name: str) -> ssl.SSLContext:
+    place = keys_place()
+    authority, certificate, key = (place / file for file in ("ca.crt", f"{name}.crt", f"{name}.key"))
+    for file in (authority, certificate, key):
+        if not file.is_file():
+            raise InputError(f"{file} is missing; `dxlrun keys` makes certificates")
+    if key.stat().st_mode & 0o077:
+        raise InputError(f"{key} can be read by other users: chmod 600 {key}, or renew it")
+    context = ssl.SSLContext(protocol)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    try:
+        context.load_cert_chain(certificate, key, password="")
+        context.load_verify_locations(authority)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{certificate}, its key and {authority} do not fit together: {error}") from error
+    return context
+
+
+def _try(server: ssl.SSLContext, name: str) -> None:
+    """Shake hands with a robot's certificate as a client would; raises InputError where that refuses it."""
+    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    trusting.load_verify_locations(keys_place() / "ca.crt")
+    here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (
+        trusting.wrap_bio(here, there, server_hostname=name),
+        server.wrap_bio(there, here, server_side=True),
+    )
+    try:
+        for end in (*ends, *ends):
+            with suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    except ssl.SSLCertVerificationError as error:
+        certificate = keys_place() / f"{name}.crt"
+        raise InputError(
+            f"{certificate}: {error.verify_message}; `dxlrun keys renew {name}` makes a new one"
+        ) from error
+
+
+def counts(certificate: Certificate) -> bool:
+    """Return whether a certificate that TLS has checked counts still."""
+    until = ssl.cert_time_to_seconds(certificate["notAfter"])
+    return until > time.time() and certificate["serialNumber"] not in revoked()
+
+
+def revoked() -> frozenset[str]:
+    """Return the serial numbers of the file `revoked`, one a line, whose certificates robots here refuse."""
+    path = keys_place() / "revoked"
+    try:
+        return _serials(path, path.stat().st_mtime_ns)
+    except FileNotFoundError:
+        return frozenset()
+
+
+@lru_cache(maxsize=1)
+def _serials(path: Path, changed_ns: int) -> frozenset[str]:
+    """Return the numbers that a file has since it was changed."""
+    return frozenset(path.read_text().upper().split())
