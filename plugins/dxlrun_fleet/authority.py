@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dxlrun.errors import InputError
-from dxlrun.remote.network.certificates import CLIENT, keys_place
+from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
 from dxlrun.remote.requests.table import Role
 
 _AUTHORITY_DAYS = 3650
@@ -34,10 +34,12 @@ _EARLIER = timedelta(minutes=5)
 
 
 class Issued(NamedTuple):
-    """A certificate that the authority signed."""
+    """What the authority signed for a robot or a client."""
 
     name: str
     certificate: x509.Certificate
+    """The newest."""
+    earlier: tuple[x509.Certificate, ...] = ()
 
     @property
     def role(self) -> str:
@@ -46,10 +48,10 @@ class Issued(NamedTuple):
         return str(found[0].value) if found else "robot"
 
     @property
-    def serial(self) -> str:
-        """As TLS names it: hexadecimal, an even number of digits."""
-        digits = f"{self.certificate.serial_number:X}"
-        return digits.zfill(len(digits) + len(digits) % 2)
+    def serials(self) -> list[str]:
+        """The newest certificate's number, then those before: hexadecimal with even digits, as TLS has it."""
+        found = [f"{one.serial_number:X}" for one in (self.certificate, *self.earlier)]
+        return [digits.zfill(len(digits) + len(digits) % 2) for digits in found]
 
 
 def place() -> Path:
@@ -58,35 +60,34 @@ def place() -> Path:
 
 
 def issued() -> Iterator[Issued]:
-    """Yield the newest certificate of each name, in order of the names."""
+    """Yield what was signed for each name, in order of the names."""
     for path in sorted(place().glob("issued/*.crt")):
-        yield Issued(path.stem, x509.load_pem_x509_certificate(path.read_bytes()))
-
-
-def revoked() -> frozenset[str]:
-    """Return the serial numbers that robots refuse."""
-    path = keys_place() / "revoked"
-    return frozenset(path.read_text().split()) if path.exists() else frozenset()
+        *earlier, newest = x509.load_pem_x509_certificates(path.read_bytes())
+        yield Issued(path.stem, newest, (*earlier,))
 
 
 def revoke(one: Issued) -> None:
-    """Let the robots of this computer refuse a certificate from now on."""
-    lines = "".join(f"{serial}\n" for serial in sorted(revoked() | {one.serial}))
-    (keys_place() / "revoked").write_text(lines)
+    """Let the robots of this computer refuse all certificates of a name from now on."""
+    lines = "".join(f"{serial}\n" for serial in sorted(revoked().union(one.serials)))
+    _write(keys_place() / "revoked", lines.encode())
 
 
 def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     """Sign a certificate, and write it with its key and the authority's to a directory.
 
-    `role` is a client's; None: the certificate is a robot's. Raises InputError when a key would be written
-    over that is another name's.
+    `role` is a client's; None: the certificate is a robot's. Raises InputError when a file would be written
+    over that is another name's or another authority's.
     """
     file = name if role is None else CLIENT
     issuer, signer = _authority()
     kept = place() / "issued" / f"{name}.crt"
     there = to / f"{file}.crt"
-    if there.exists() and not _is_named(there, name):
-        raise InputError(f"{there} is another name's: give --to DIRECTORY for another computer's files")
+    root = issuer.public_bytes(Encoding.PEM)
+    held = there.exists() and _is_named(there, name)
+    if not held and (there.exists() or (kept.exists() and to == keys_place())):
+        raise InputError(f"{there} is not of {name}: give --to DIRECTORY for another computer's files")
+    if (to / "ca.crt").exists() and (to / "ca.crt").read_bytes() != root:
+        raise InputError(f"{to / 'ca.crt'} is of another authority: give another directory")
     key = ec.generate_private_key(ec.SECP256R1())
     unit = [] if role is None else [_attribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role.name.lower())]
     usage = ExtendedKeyUsageOID.SERVER_AUTH if role is None else ExtendedKeyUsageOID.CLIENT_AUTH
@@ -101,11 +102,12 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     if role is None:
         builder = builder.add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
     one = Issued(name, builder.sign(signer, hashes.SHA256()))
-    kept.write_bytes(one.certificate.public_bytes(Encoding.PEM))
-    to.mkdir(parents=True, exist_ok=True)
+    signed = one.certificate.public_bytes(Encoding.PEM)
+    _write(kept, (kept.read_bytes() if kept.exists() else b"") + signed)
+    to.mkdir(parents=True, exist_ok=True, mode=0o700)
     _write_key(to / f"{file}.key", key)
-    there.write_bytes(kept.read_bytes())
-    (to / "ca.crt").write_bytes(issuer.public_bytes(Encoding.PEM))
+    _write(there, signed)
+    _write(to / "ca.crt", root)
     return one
 
 
@@ -141,7 +143,7 @@ def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
             .sign(key, hashes.SHA256())
         )
         _write_key(path, key)
-        certificate.write_bytes(signed.public_bytes(Encoding.PEM))
+        _write(certificate, signed.public_bytes(Encoding.PEM))
     signer = load_pem_private_key(path.read_bytes(), None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
         raise InputError(f"{path} is no key of this version; move {place()} away to begin anew")
@@ -169,8 +171,11 @@ def _attribute(kind: x509.ObjectIdentifier, value: str) -> x509.NameAttribute[st
 
 
 def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Write a key that only this user can read."""
-    data = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    _write(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file whole, and so that only this user can read it."""
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:

@@ -58,7 +58,7 @@ def keys(
         from dxlrun_fleet import authority
     except ImportError as error:
         raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
-    from dxlrun.remote.network.certificates import CLIENT, keys_place
+    from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
 
     if action != "list":
         if name is None or not _NAME.fullmatch(name) or name in (CLIENT, "ca"):
@@ -96,8 +96,8 @@ def keys(
             "name": one.name,
             "role": one.role,
             "until": one.certificate.not_valid_after_utc.date().isoformat(),
-            "state": _state(one, authority.revoked()),
-            "serial": one.serial,
+            "state": _state(one, revoked()),
+            "serial": one.serials[0],
         }
         for one in authority.issued()
     ]
@@ -113,7 +113,7 @@ def keys(
     return 0
 
 
-def _state(one: Issued, revoked: frozenset[str]) -> str:
-    if one.serial in revoked:
+def _state(one: Issued, refused: frozenset[str]) -> str:
+    if one.serials[0] in refused:
         return "revoked"
     return "valid" if one.certificate.not_valid_after_utc > datetime.now(UTC) else "expired"

@@ -21,5 +21,6 @@ def dxlrun_commands() -> Sequence[Command]:
             "keys",
             "dxlrun_fleet.keys:keys",
             "Make certificates for robots and clients of a network, renew and revoke them.",
+            "Robots that run",
         ),
     )

@@ -84,6 +84,7 @@ TESTS = {
     "steering.md": ("tests/cli/test_steer.py",),
     "teleoperation.md": ("tests/teleop/test_page.py", "tests/teleop/test_terminal.py"),
     "tools.md": ("tests/cli/test_docs.py",),
+    "network.md": ("tests/remote/test_network_run.py",),
     "foxglove.md": ("tests/foxglove/test_live.py",),
     "view.md": ("tests/view/test_command.py",),
 }

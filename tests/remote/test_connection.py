@@ -19,8 +19,8 @@ import pytest
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.remote import gateway, server
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.commander import Client
 from dxlrun.remote.live.topics import framed
+from dxlrun.remote.network.commander import Client
 from dxlrun.remote.requests.replies import RunEnded
 from dxlrun.remote.requests.table import Role
 from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS

@@ -656,7 +656,7 @@ def test_of_thousands_of_wrong_names_an_answer_has_some(desk):
         ("/controllers/left/commands/positions?units=true", {"positions": names}),
         ("/controllers/left/commands/position?units=true", {"positions": names}),
     ):
-        _, answer = desk.ask("POST", path, body, client=(path, 0))
+        _, answer = desk.ask("POST", path, body, client=(f"process of {path}", Role.ADMIN))
         codes = {"unknown_controller", "unknown_joint", "unknown_command", "wrong_quantity"}
         assert answer["code"] in codes
         assert len(json.dumps(answer)) < 10_000

@@ -16,8 +16,8 @@ from tests.remote.conftest import STOP, Door
 from dxlrun.channels.answers import Code
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.remote.client import RemoteRobot, connect
-from dxlrun.remote.commander import LEASE_S
 from dxlrun.remote.network.certificates import client_context, keys_place, server_context
+from dxlrun.remote.network.commander import LEASE_S
 from dxlrun.remote.network.handshakes import MOST_HANDSHAKES, Secured
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests.table import REQUESTS, Role

@@ -30,6 +30,7 @@ from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.requests.table import Role
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab.guided.rig import Cycles, Rig, RunGone
 
@@ -166,6 +167,7 @@ class RobotOnVirtualTime:
             "path": path,
             "query_string": query.encode(),
             "headers": [(b"x-dxlrun-client", ORIGIN)],
+            "client": ("process of the experiment", Role.ADMIN),
         }
         answer: list[Message] = []
 

@@ -127,7 +127,7 @@ class Code(StrEnum):
     NOT_ALLOWED = "not_allowed", "{client} may {role}, and this needs the role {needed}"
     COMMANDED_BY = (
         "commanded_by",
-        "{commander} commands this robot; it is free {seconds:.0f} s after its last command, and "
+        "{commander} commands this robot, until it sends no command for {seconds:g} s; "
         "`dxlrun take-over` does not wait",
     )
     # requests

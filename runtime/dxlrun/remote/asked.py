@@ -13,7 +13,7 @@ import msgspec
 import starlette.requests
 
 from dxlrun.channels.answers import Code
-from dxlrun.remote.commander import HERE, Client
+from dxlrun.remote.network.commander import HERE, Client
 from dxlrun.remote.preparation import invalid, refused
 from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
 from dxlrun.remote.sockets import MOST_BYTES

@@ -46,7 +46,6 @@ from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.asked import Allowance, Asked, client_of, peer, received
-from dxlrun.remote.commander import Commander
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
 from dxlrun.remote.link import Link, Loaded
@@ -66,7 +65,8 @@ from dxlrun.remote.named.joints import (
 )
 from dxlrun.remote.named.named_commands import DEVICE_COMMANDS, INTERFACES, device_command, joint_command
 from dxlrun.remote.named.parameters import Change, changed, parameters_of
-from dxlrun.remote.openapi import openapi
+from dxlrun.remote.network.commander import Commander
+from dxlrun.remote.network.openapi import openapi
 from dxlrun.remote.preparation import (
     Preparation,
     RefusedRequest,

@@ -32,12 +32,12 @@ from dxlrun.channels.process import Failed, Finish, Listening, MessageChannel
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
-from dxlrun.remote.commander import Client
 from dxlrun.remote.computation import PR_SET_PDEATHSIG
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.network.certificates import Certificate, counts
+from dxlrun.remote.network.commander import Client
 from dxlrun.remote.network.handshakes import Handshakes, Secured
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.table import Role

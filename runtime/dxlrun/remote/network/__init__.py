@@ -1,1 +1,1 @@
-"""Beyond one computer: certificates, connections that begin, a client's link, the file that names robots."""
+"""Beyond one computer: certificates, roles and one commander, connections, files of robots and requests."""

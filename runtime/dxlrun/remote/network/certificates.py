@@ -101,12 +101,13 @@ def revoked() -> frozenset[str]:
     """Return the serial numbers of the file `revoked`, one a line, whose certificates robots here refuse."""
     path = keys_place() / "revoked"
     try:
-        return _serials(path, path.stat().st_mtime_ns)
+        found = path.stat()
+        return _serials(path, found.st_ino, found.st_mtime_ns)
     except FileNotFoundError:
         return frozenset()
 
 
 @lru_cache(maxsize=1)
-def _serials(path: Path, changed_ns: int) -> frozenset[str]:
-    """Return the numbers that a file has since it was changed."""
+def _serials(path: Path, file: int, changed_ns: int) -> frozenset[str]:
+    """Return the numbers that a file has since it was written."""
     return frozenset(path.read_text().upper().split())

@@ -1,7 +1,7 @@
 """Requests: all that clients may ask of a running robot, each with its path, its body and its answer.
 
-The gateway's routes, the client's methods and the description for other programs (`openapi.py`) follow from
-this table.
+The gateway's routes, the client's methods and the description for other programs (`network/openapi.py`)
+follow from this table.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
     query: tuple[str, ...] = ()
     """What may follow behind a question mark."""
     role: Role = Role.COMMAND
-    """The least that a client needs; halt, stop and a take-over ask for no lease, see `commander.py`."""
+    """The least that a client needs; `network/commander.py` has what else."""
 
     def target(self, *names: object) -> str:
         """Return the path with these names, which cannot leave their places."""

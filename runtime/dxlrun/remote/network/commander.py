@@ -52,8 +52,7 @@ class Commander:
         if request.method == "GET" or request in (HALT, STOP, TAKE_OVER):
             return None
         if client.commands_as != self.name and self.now() < self._until:
-            left = self._until - self.now()
-            raise refused(Code.COMMANDED_BY, {"commander": self.name, "seconds": left})
+            raise refused(Code.COMMANDED_BY, {"commander": self.name, "seconds": LEASE_S})
         return self.become(client)
 
     def become(self, client: Client) -> str | None:

@@ -1,6 +1,7 @@
 """OpenAPI: the table of requests as other programs read it (OpenAPI Specification 3.1).
 
-Bodies and answers are JSON Schemas of the types that gateway and client go by.
+Bodies and answers are JSON Schemas of the types that gateway and client go by. Each request names
+the roles that may make it, by a certificate over TLS; the Unix socket of this user needs none.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import numpy as np
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.requests import table as requests
 from dxlrun.remote.requests.replies import NotDone
-from dxlrun.remote.requests.table import REQUESTS, Request
+from dxlrun.remote.requests.table import REQUESTS, Request, Role
 
 _JSON = "application/json"
+_TLS = "certificate"
 
 
 def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
@@ -43,6 +45,7 @@ def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
                 for where, name in given
             ],
             **({} if one.body is NoneType else {"requestBody": body}),
+            "security": [{_TLS: [role.name.lower()]} for role in Role if role >= one.role],
             "responses": {
                 "2XX": {"description": "it is done", "content": {kind: {"schema": schemas[answers[one]]}}},
                 "default": {"description": "refused", "content": {_JSON: {"schema": schemas[NotDone]}}},
@@ -52,7 +55,12 @@ def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
         "openapi": "3.1.0",
         "info": {"title": "dxlrun", "version": version("dxlrun")},
         "paths": paths,
-        "components": {"schemas": components},
+        "components": {
+            "schemas": components,
+            "securitySchemes": {
+                _TLS: {"type": "mutualTLS", "description": "TLS 1.3; the role is the OU of the certificate"}
+            },
+        },
     }
 
 

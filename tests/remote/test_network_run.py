@@ -1,0 +1,235 @@
+"""network.md, by its commands: a run, reached from another computer; the simulated bus is the judge."""
+
+import http.client
+import json
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from tests.kit.pages import page_text
+
+import dxlrun
+from dxlrun.cli import main
+from dxlrun.errors import Refused
+from dxlrun.remote.network.certificates import client_context
+from dxlrun.remote.requests.table import EXAMPLES, REQUESTS, Role
+from dxlrun.simulation.bus.ledger import read_ledger
+
+pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
+
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+ROOT = Path(__file__).parents[2]
+PAGE = page_text("network.md")
+NAME = "bioloid_torso"
+HEAD = b'{"positions": [0.1, 0.1], "velocities": [1.0, 1.0]}'
+BODIES = {
+    "/torque": b'{"joints": "all", "on": false}',
+    "/switch": b'{"activate": ["whole_body_position"], "deactivate": ["head", "left_arm", "right_arm"]}',
+    "/controllers/head/commands/posvel": HEAD,
+    "/controllers/head/set-points/posvel": HEAD,
+    "/joints/head_yaw_joint/registers/cw_compliance_slope": b'{"value": 128}',
+    "/rate": b'{"rate": 25}',
+}
+NAMES = {"name": "head", "kind": "posvel", "item": "cw_compliance_slope", "number": "1"}
+
+
+class Computers:
+    """A robot's computer and a client's: each has its own settings and sockets, both are this machine."""
+
+    def __init__(self, place, patch, capsys):
+        self.place, self.patch, self.capsys = place, patch, capsys
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+
+    def at(self, computer):
+        """Be at one of them from now on."""
+        home = self.place / computer
+        for name, folder in (("XDG_CONFIG_HOME", "settings"), ("XDG_RUNTIME_DIR", "run")):
+            (home / folder).mkdir(parents=True, exist_ok=True)
+            self.patch.setenv(name, str(home / folder))
+        self.patch.chdir(home)
+        if not (home / "robots").exists():
+            (home / "robots").symlink_to(ROOT / "robots")
+        return home
+
+    def typed(self, line):
+        """Do a line of the page; return what it printed."""
+        words = shlex.split(line.replace("lab3", "127.0.0.1").replace("7660", str(self.port)))
+        code = main(words[1:])
+        told = self.capsys.readouterr()
+        assert (code, told.err) == (0, ""), line
+        return told.out
+
+
+@pytest.fixture
+def computers(tmp_path, monkeypatch, capsys):
+    return Computers(tmp_path, monkeypatch, capsys)
+
+
+def command_of(pattern):
+    (found,) = re.findall(rf"(?:^    |`)({pattern}[^\n`]*)", PAGE, re.MULTILINE)
+    return found
+
+
+def ways(robot):
+    """Yield each request of the table with names and a body that would move the robot, if it were allowed."""
+    for request in REQUESTS:
+        names = dict(NAMES, name="head_yaw_joint") if "/joints/" in request.path else NAMES
+        path = re.sub(r"\{(\w+)(:path)?\}", lambda word, names=names: names[word[1]], request.path)
+        body = BODIES.get(path, EXAMPLES.get(request.body, "{}").encode())
+        if request.path == "/stream":
+            status, answer, end = robot.link.stream(f"{path}?topic=/joint_states&once=true")
+            end.close()
+        else:
+            status, answer = robot.link.exchange(request.method, path, body)
+        yield request, status, answer
+
+
+def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_description(computers):
+    here = computers.at("lab3")
+    computers.typed(command_of("dxlrun keys robot"))
+    computers.typed(command_of("dxlrun keys client anna"))
+    computers.typed("dxlrun keys client olga --role observe --to olga")
+    assert "anna" in computers.typed("dxlrun keys")
+    for name in ("anna", "olga"):
+        keys = computers.at(name) / "settings/dxlrun/keys"
+        shutil.copytree(here / name, keys)
+        (text,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+        (keys.parent / "robots.yaml").write_text(text.replace("lab3:7660", f"127.0.0.1:{computers.port}"))
+    computers.at("lab3")
+    start = shlex.split(command_of("dxlrun robots/").replace("7660", str(computers.port)))
+    with subprocess.Popen(
+        [DXLRUN, *start[1:], "--ledger", "wire.jsonl"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as run:
+        try:
+            until = time.monotonic() + 60
+            while NAME not in dxlrun.running():
+                assert time.monotonic() < until
+                time.sleep(0.02)
+            computers.at("olga")
+            began, ended = sweep(computers)
+            computers.at("anna")
+            assert NAME in computers.typed("dxlrun list")
+            assert "head_yaw_joint" in computers.typed(f"{command_of('dxlrun watch')} --once")
+            commanded(computers)
+        finally:
+            run.terminate()
+            out, err = run.communicate(timeout=60)
+    assert b"Traceback" not in out + err
+    asked = [one for one in read_ledger(here / "wire.jsonl") if one.direction == "in"]
+    before = {one.data for one in asked if one.t_ns < began}
+    during = {one.data for one in asked if began <= one.t_ns < ended}
+    assert during <= before
+    assert {one.data for one in asked if one.t_ns >= ended} - before
+
+
+def sweep(computers):
+    """Ask all that an observer may not, and all that it may; return when that began and ended."""
+    with dxlrun.connect(NAME, "sweep") as robot:
+        until = robot.info()["cycles"] + 50
+        while robot.info()["cycles"] < until:
+            time.sleep(0.01)
+        began = time.monotonic_ns()
+        for request, status, answer in ways(robot):
+            if request.role is Role.OBSERVE:
+                assert status in (200, 404), request
+            else:
+                assert (status, json.loads(answer)["code"]) == (403, "not_allowed"), request
+        until = robot.info()["cycles"] + 5
+        while robot.info()["cycles"] < until:
+            time.sleep(0.01)
+        return began, time.monotonic_ns()
+
+
+def commanded(computers):
+    """Command by the typed client, by the description and by curl, beside the robot's own computer."""
+    with dxlrun.connect(NAME, "anna's program") as robot:
+        robot.send("head", "posvel", {"positions": [0.2, 0.1], "velocities": [1.0, 1.0]})
+        computers.at("lab3")
+        with dxlrun.connect(NAME) as own:
+            with pytest.raises(Refused, match="client anna commands this robot") as refused:
+                own.switch(activate=["whole_body_position"], deactivate=["head"])
+            assert refused.value.code == "commanded_by"
+            own.take_over()
+            with pytest.raises(Refused, match="this computer commands this robot"):
+                robot.send("head", "posvel", {"positions": [0.0, 0.0], "velocities": [1.0, 1.0]})
+            computers.at("anna")
+            computers.typed(command_of("dxlrun take-over"))
+            told = [one["text"] for one in own.events()["events"] if "commander" in one["text"]]
+        assert [re.findall(r'"client":"(.*?)","instead":"(.*?)"', text) for text in told] == [
+            [("client anna", "this computer")],
+            [("this computer", "client anna")],
+            [("client anna", "this computer")],
+        ]
+    described(computers)
+    if shutil.which("curl"):
+        line = command_of("curl ").replace("lab3", "127.0.0.1").replace("7660", str(computers.port))
+        keys = computers.place / "anna/settings/dxlrun/keys"
+        found = subprocess.run(["/bin/bash", "-c", f"{line} -s"], cwd=keys, capture_output=True, check=True)
+        assert json.loads(found.stdout)["robot"] == NAME
+    computers.typed(f"dxlrun stop --robot {NAME}@127.0.0.1:{computers.port}")
+
+
+def described(computers):
+    """Ask what the description has, with Python's own HTTP."""
+
+    class Connection(http.client.HTTPSConnection):
+        def connect(self):
+            end = socket.create_connection(("127.0.0.1", computers.port))
+            self.sock = client_context().wrap_socket(end, server_hostname=NAME)
+
+    def ask(method, path):
+        with closing(Connection(NAME)) as connection:
+            connection.request(method, path)
+            answer = connection.getresponse()
+            return answer.status, json.loads(answer.read())
+
+    paths = ask("GET", "/openapi.json")[1]["paths"]
+    for path, methods in paths.items():
+        for method, one in methods.items():
+            roles = {role for way in one["security"] for role in way["certificate"]}
+            if method == "get" and "{" not in path and path != "/stream":
+                assert "command" in roles
+                assert ask("GET", path)[0] == 200, path
+            elif "command" not in roles:
+                assert ask(method.upper(), path.replace("{", "").replace("}", ""))[0] == 403, path
+
+
+def test_keys_write_over_nothing_that_is_anothers(computers):
+    computers.at("lab3")
+    for line in ("keys robot torso", "keys client anna --role admin"):
+        computers.typed(f"dxlrun {line}")
+    keys = Path("settings/dxlrun/keys")
+    kept = {path: path.read_bytes() for path in keys.rglob("*") if path.is_file()}
+    assert {path.stat().st_mode & 0o777 for path in kept} == {0o600}
+    for line in (
+        "client anna",
+        "client bert",
+        "robot client",
+        "robot ../x",
+        "renew carl",
+        "client bert --days 0",
+    ):
+        assert main(["keys", *line.split()]) == 2, line
+    assert main(["keys", "client", "bert", "--to", "bert"]) == 0
+    assert main(["keys", "renew", "bert"]) == 2
+    assert main(["keys", "renew", "bert", "--to", "bert"]) == 0
+    assert main(["keys", "revoke", "bert"]) == 0
+    assert len((keys / "revoked").read_text().split()) == 2
+    rows = computers.capsys.readouterr() and json.loads(computers.typed("dxlrun keys --json"))
+    assert [(one["name"], one["role"], one["state"]) for one in rows] == [
+        ("anna", "admin", "valid"),
+        ("bert", "observe", "revoked"),
+        ("torso", "robot", "valid"),
+    ]
+    assert {path: path.read_bytes() for path in kept} == kept
+    computers.at("other")
+    assert main(["keys", "robot", "arm", "--to", str(computers.place / "lab3/bert")]) == 2
+    assert "is of another authority" in computers.capsys.readouterr().err
