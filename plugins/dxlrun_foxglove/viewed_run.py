@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 
 import msgspec
 
@@ -22,6 +23,8 @@ from dxlrun_foxglove.viewer import Channel, Viewer
 
 ENCODING = "json"
 """Of calls of services."""
+RATE = 50.0
+"""Hz: so often what has come meanwhile is taken; more costs the machine, and no screen shows it."""
 LOOK_S = 2.0
 """Between two looks for topics that were opened meanwhile."""
 _OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
@@ -94,7 +97,8 @@ class ViewedRun(RunMessages):
     async def _listen(self, topics: set[str]) -> None:
         """Take the messages of topics until the run ends. Raises DxlrunError then, too."""
         with _robot(self._name) as robot:
-            async for message in await asyncio.to_thread(robot.listen, *topics):
+            listen = partial(robot.listen, *topics, rate=RATE, newest=False)
+            async for message in await asyncio.to_thread(listen):
                 self._take(message)
         raise DxlrunError(f"the run of {self._name} has ended")
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from mcap.reader import make_reader
+from tests.foxglove import fuzz
 from tests.foxglove.foreign import ForeignViewer
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.pages import page_text
@@ -21,6 +25,9 @@ from websockets.exceptions import ConnectionClosed
 import dxlrun
 
 COMMANDS = re.findall(r"^    dxlrun (foxglove.*)$", page_text("foxglove.md"), re.MULTILINE)
+FRAMES = int(os.environ.get("DXLRUN_FOXGLOVE_FRAMES", "1000"))
+SEED = int(os.environ.get("DXLRUN_FOXGLOVE_SEED", "1"))
+PAGE = os.sysconf("SC_PAGE_SIZE")
 MAIN = "from dxlrun.cli import main; main()"
 ROBOT = "bioloid_torso_imu"
 LATCHED = {"/robot_description", "/tf_static"}
@@ -37,9 +44,21 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     one.end()
 
 
+class Started(NamedTuple):
+    """A server."""
+
+    url: str
+    process: int
+
+    @property
+    def memory(self) -> float:
+        """MB"""
+        return int(Path(f"/proc/{self.process}/statm").read_text().split()[1]) * PAGE / 1e6
+
+
 @pytest.fixture
-def started(run: Run) -> Iterator[list[str]]:
-    """The addresses of a server for each command of docs/how-to/foxglove.md; Ctrl-C ends them."""
+def started(run: Run) -> Iterator[list[Started]]:
+    """A server for each command of docs/how-to/foxglove.md; Ctrl-C ends them."""
     processes = [
         subprocess.Popen(
             [sys.executable, "-P", "-c", MAIN, *words.split()], stdout=subprocess.PIPE, text=True
@@ -47,7 +66,7 @@ def started(run: Run) -> Iterator[list[str]]:
         for words in COMMANDS
     ]
     found = [re.search(r"ws://\S+", (one.stdout or sys.stdin).readline()) for one in processes]
-    yield [one[0] for one in found if one]
+    yield [Started(url[0], process.pid) for url, process in zip(found, processes, strict=True) if url]
     for process in processes:
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 0
@@ -55,9 +74,10 @@ def started(run: Run) -> Iterator[list[str]]:
         process.stdout.close()
 
 
-def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, started: list[str]) -> None:
+@pytest.mark.campaign
+def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, started: list[Started]) -> None:
     looks, control = started
-    with ForeignViewer(looks) as only_looks, ForeignViewer(control) as steers:
+    with ForeignViewer(looks.url) as only_looks, ForeignViewer(control.url) as steers:
         info = only_looks.words("serverInfo")
         assert "services" not in info["capabilities"]
         assert "clientPublish" not in info["capabilities"]
@@ -65,6 +85,7 @@ def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, sta
         only_looks.until(lambda: only_looks.channels.keys() >= EVERY)
         only_looks.subscribe(*only_looks.channels)
         may_not_change(only_looks, steers)
+        nothing_comes_of_noise(looks)
         assert not written(run, TORQUE_ENABLE, 0)
         changes_parameters(only_looks, steers)
         steers_the_robot(run, steers)
@@ -81,6 +102,9 @@ def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, sta
         run.process.wait(DEADLINE_S)
     (log,) = run.place.glob("logs/*.mcap")
     same_as_in_the_log(only_looks, log)
+    commands = dxlrun.open_log(log).columns("/commands", "kind", "origin")
+    asked = commands["kind"][commands["origin"] == "dxlrun foxglove"].tolist()
+    assert asked == ["parameters", "torque", "torque", "switch", "halt"]  # the first torque was refused
 
 
 def written(run: Run, address: int, value: int) -> set[int]:
@@ -101,6 +125,22 @@ def may_not_change(only_looks: ForeignViewer, steers: ForeignViewer) -> None:
     assert "no frame of this protocol" in only_looks.words("status")["message"]
     only_looks.socket.send(struct.pack("<BI", 1, 1) + b"x")
     assert "no frame of this protocol" in only_looks.words("status")["message"]
+
+
+def nothing_comes_of_noise(looks: Started) -> None:
+    """Fuzzed frames, handshakes without the token, half-open connections: a viewer still gets in, memory
+    does not grow."""
+    fuzz.fuzz(looks.url, FRAMES // 10, SEED)
+    fuzz.knock(looks.url, FRAMES // 100, SEED)
+    before = looks.memory
+    fuzz.fuzz(looks.url, FRAMES, SEED + 1)
+    fuzz.knock(looks.url, FRAMES // 20, SEED + 1)
+    with ExitStack() as opened:
+        for one in fuzz.half_open(looks.url, FRAMES // 1000):
+            opened.enter_context(one)
+        with ForeignViewer(looks.url) as viewer:
+            viewer.words("serverInfo")
+    assert looks.memory < before + 20.0, f"{before} MB before"
 
 
 def changes_parameters(only_looks: ForeignViewer, steers: ForeignViewer) -> None:
@@ -158,18 +198,14 @@ def publishers(viewer: ForeignViewer) -> None:
 def same_as_in_the_log(viewer: ForeignViewer, log: Path) -> None:
     """The messages of a topic are those of the log, with their times, one after the other."""
     logged: dict[str, list[tuple[int, bytes]]] = {}
-    origins = set()
     with log.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
             logged.setdefault(channel.topic, []).append((message.log_time, message.data))
-            if channel.topic == "/commands":
-                origins.add(b"dxlrun foxglove" in message.data)
             if (shown := viewer.channels.get(channel.topic)) is not None:
                 assert shown["schema"] == schema.data.decode()
                 assert (shown["schemaName"], shown["schemaEncoding"]) == (schema.name, schema.encoding)
                 assert shown["encoding"] == channel.message_encoding
-    assert True in origins  # the log names what has steered
     for topic in {topic for topic, _, _ in viewer.messages}:
         seen = [(time_ns, data) for name, time_ns, data in viewer.messages if name == topic]
         if topic in LATCHED:  # of the time when the run, or the server, began

@@ -211,7 +211,7 @@ class RemoteRobot:
         with self._listen((topic,), "&once=true") as found:
             return next(iter(found), None)
 
-    def listen(self, *topics: str, newest: bool = False, rate: float | None = None) -> Listening:
+    def listen(self, *topics: str, newest: bool | None = None, rate: float | None = None) -> Listening:
         """Listen to topics: their messages as they come, from the newest on, until the run ends.
 
             for message in robot.listen("/joint_states"):
@@ -219,9 +219,11 @@ class RemoteRobot:
 
         Every message comes, where this end is no more than some ten seconds behind: `lost` counts those
         that do not. With `newest` what is older is left out when this end is slower, with `rate` (Hz) at most
-        so many looks a second are taken. `async for` does the same. Raises Refused for an unknown topic.
+        so many looks a second are taken, of the newest only unless `newest` is False. `async for` does the
+        same. Raises Refused for an unknown topic.
         """
-        query = f"&newest=true&rate={rate:g}" if rate is not None else "&newest=true" if newest else ""
+        only_newest = rate is not None if newest is None else newest
+        query = "&newest=true" * only_newest + ("" if rate is None else f"&rate={rate:g}")
         return self._listen(topics, query)
 
     def _listen(self, topics: Sequence[str], query: str) -> Listening:

@@ -328,7 +328,7 @@ class GatewayApp:
                 yield frames
             if ended and not stream.behind:
                 break
-            await asyncio.sleep(0 if stream.behind else look_s)
+            await asyncio.sleep(0 if stream.behind else max(look_s, min(due - now, BEAT_S)))
         yield framed(RunEnded())
 
     @_answers(requests.GOALS)
