@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import signal
 import ssl
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from dxlrun_foxglove.server import FoxgloveServer
 
 PORT = 8765
+NICENESS = 10
+"""As the gateway's: viewers get the processor time that the robot leaves."""
 LOOPBACK = "127.0.0.1"
 APP = "https://app.foxglove.dev"
 """The viewer on the web, the one page that may connect without `--origin`."""
@@ -69,6 +73,8 @@ def foxglove(
             f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
         )
     leave_real_time()
+    with suppress(OSError):
+        os.nice(NICENESS)
     try:
         from dxlrun_foxglove.server import FoxgloveServer
     except ImportError as error:

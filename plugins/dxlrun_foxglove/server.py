@@ -10,6 +10,7 @@ import asyncio
 import logging
 import secrets
 import ssl
+import traceback
 from asyncio import BaseTransport
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -89,9 +90,8 @@ class FoxgloveServer:
             why = "open the address that `dxlrun foxglove` printed: it has the token\n"
             return connection.respond(HTTPStatus.UNAUTHORIZED, why)
         if len(self._viewers) >= MOST_VIEWERS:
-            return connection.respond(
-                HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} viewers look already\n"
-            )
+            why = f"{MOST_VIEWERS} viewers look already\n"
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, why)
         return None
 
     async def _served(self, connection: ServerConnection) -> None:
@@ -103,6 +103,7 @@ class FoxgloveServer:
         try:
             run = await self._begun()
             self._greet(viewer, run)
+            run.viewers.add(viewer)
             async for frame in connection:
                 self._take(viewer, run, frame)
         except DxlrunError as error:
@@ -111,6 +112,8 @@ class FoxgloveServer:
             pass
         finally:
             self._viewers.discard(viewer)
+            if self._run is not None:
+                self._run.viewers.discard(viewer)
             for task in (sending, *viewer.requests):
                 task.cancel()
             if not self._viewers and self._following is not None:
@@ -123,17 +126,21 @@ class FoxgloveServer:
         """Return the run that viewers see. Raises DxlrunError when the robot does not run."""
         async with self._beginning:
             if self._run is None:
-                run = await asyncio.to_thread(ViewedRun.begun, self.name, self._viewers)
+                run = await asyncio.to_thread(ViewedRun, self.name)
                 run.on_changed = partial(self._tell_parameters, run)
                 self._run, self._following = run, asyncio.create_task(self._follow(run))
             return self._run
 
     async def _follow(self, run: ViewedRun) -> None:
         """Pass on a run's messages; when it has ended close the connections: viewers open them again."""
-        why = await run.follow()
+        try:
+            why = await run.follow()
+        except Exception as error:  # the last resort: viewers see that nothing more comes
+            traceback.print_exc()
+            why = f"{type(error).__name__}: {error}"
         if self._run is run:
             self._run = self._following = None
-        for viewer in tuple(self._viewers):
+        for viewer in tuple(run.viewers):
             with suppress(ConnectionClosed):
                 await viewer.connection.close(GOING_AWAY, why[:100])
 
@@ -215,7 +222,7 @@ class FoxgloveServer:
 
     def _tell_parameters(self, run: ViewedRun, controller: str) -> None:
         """Send parameters that have changed to the viewers that want to know."""
-        for viewer in self._viewers:
+        for viewer in run.viewers:
             names = [one for one in viewer.parameters if one.startswith(f"{controller}.")]
             if names:
                 self._ask(viewer, run, Words("getParameters", parameter_names=names))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 import msgspec
@@ -13,7 +13,6 @@ from dxlrun.channels.events import Event, EventCode
 from dxlrun.channels.loop_requests import Switch, TorqueRequest
 from dxlrun.log import schemas
 from dxlrun.log.run_messages import RunMessages
-from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import TopicMessage
@@ -43,19 +42,16 @@ HALT = 0
 class ViewedRun(RunMessages):
     """One run of a robot, as long as a viewer looks."""
 
-    def __init__(self, name: str, header: LogHeader, viewers: Iterable[Viewer]) -> None:
-        super().__init__(header)
-        self._name, self._viewers = name, viewers
-        self._channels: list[Channel] = []
+    def __init__(self, name: str) -> None:
+        """Look at the run of a robot as it is now. Raises DxlrunError."""
+        with _robot(name) as robot:
+            super().__init__(robot.log_header())
+        self._name = name
+        self.viewers: set[Viewer] = set()
         self.on_changed: Callable[[str], object] = lambda controller: None
         """Called when parameters of a controller have changed."""
+        self._channels: list[Channel] = []
         self._open_channels()
-
-    @classmethod
-    def begun(cls, name: str, viewers: Iterable[Viewer]) -> ViewedRun:
-        """Return the run of a robot as it is now. Raises DxlrunError."""
-        with _robot(name) as robot:
-            return cls(name, robot.log_header(), viewers)
 
     # Messages
 
@@ -66,7 +62,7 @@ class ViewedRun(RunMessages):
     def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
         put = self._channels[channel]
         first, put.newest = put.newest is None, (wall_ns, data)
-        for viewer in self._viewers:
+        for viewer in self.viewers:
             if first:
                 viewer.reply(advertised((put,)))
             if first and viewer.graph:
@@ -105,7 +101,7 @@ class ViewedRun(RunMessages):
     def _take(self, message: TopicMessage) -> None:
         if message.lost:
             lost = f"{message.lost} messages of {message.topic} were lost before they came here"
-            for viewer in self._viewers:
+            for viewer in self.viewers:
                 viewer.reply(status(WARNING, lost))
         if message.topic == schemas.CYCLE_TOPIC:
             self.cycle(message.data[len(ENCAPSULATION) :])

@@ -109,7 +109,7 @@ class Foxglove:
     def _connected(self, address: str) -> ClientConnection:
         url = re.findall(r"ws://\S+", address)[0]
         protocols = [Subprotocol("foxglove.websocket.v1")]
-        return connect(url, subprotocols=protocols, compression=None, logger=SILENT)
+        return connect(url, subprotocols=protocols, compression=None, close_timeout=0.1, logger=SILENT)
 
     def _take(self, viewer: ClientConnection) -> bool:
         """Take a frame, and subscribe to new channels; return whether it was no message."""
@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     words = parser.parse_args()
     program = Path(sys.executable).with_name("dxlrun")
-    duration = (2 * words.blocks + 1) * words.seconds + 120
+    duration = 2 * (2 * words.blocks + 1) * words.seconds + 120
     with tempfile.TemporaryDirectory() as folder:
         ran = [program, words.robot.resolve(), "--duration", str(duration)]
         with subprocess.Popen(ran, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as robot:

@@ -46,6 +46,12 @@ class ForeignViewer:
         """All other frames of text."""
         self._subscriptions: dict[int, str] = {}
 
+    @property
+    def first(self) -> str:
+        """The operation of the first frame of text, which is taken here."""
+        self.take()
+        return str(self.told[0]["op"]) if self.told else "another"
+
     def __enter__(self) -> ForeignViewer:
         return self
 

@@ -78,6 +78,7 @@ def started(run: Run) -> Iterator[list[Started]]:
 def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, started: list[Started]) -> None:
     looks, control = started
     with ForeignViewer(looks.url) as only_looks, ForeignViewer(control.url) as steers:
+        assert (only_looks.first, steers.first) == ("serverInfo", "serverInfo")
         info = only_looks.words("serverInfo")
         assert "services" not in info["capabilities"]
         assert "clientPublish" not in info["capabilities"]
