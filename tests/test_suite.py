@@ -117,7 +117,9 @@ def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if name.startswith("dxlrun/examples/")]
         shipped = {Path(name).relative_to("dxlrun/examples"): archive.read(name) for name in names}
-    tracked = [path for path in (ROOT / "robots").rglob("*") if path.suffix in {".yaml", ".urdf", ".json"}]
+    tracked = [
+        path for path in (ROOT / "robots").rglob("*") if path.suffix in {".yaml", ".urdf", ".json", ".py"}
+    ]
     assert shipped == {path.relative_to(ROOT / "robots"): path.read_bytes() for path in tracked}
 
 

@@ -46,15 +46,9 @@ def test_a_copy_is_whole_and_is_what_it_was_copied_from(dxlrun: Callable, tmp_pa
         assert path.read_bytes() == (ROBOTS / path.relative_to(target)).read_bytes()
     command, robot, *play = hint.removeprefix("next: ").split()
     assert (command, robot) == ("dxlrun", copied[0])
-    # the motions of three are for controllers that arguments activate, those of two are in their own files
-    own = {
-        "single_joint",
-        "diff_drive",
-        "bioloid_torso_keyframes",
-        "stand_up",
-        "leader_follower_two_ports",
-        "koch",
-    }
+    # one has no motion; those of three need arguments, those of two are in their own files
+    own = {"single_joint", "diff_drive", "bioloid_torso_keyframes", "stand_up", "leader_follower_two_ports"}
+    own |= {"koch", "wave"}
     assert bool(play) == (name not in own)
     assert compile_files(target / f"{name}.yaml", {}, [Path(motion) for motion in play[1:]]).plan
 

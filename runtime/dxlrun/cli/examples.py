@@ -105,6 +105,7 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
 
 
 def _example(path: Path) -> Example:
+    from dxlrun.control.controllers.single_files import file_of
     from dxlrun.description.motion import read_motion
     from dxlrun.description.reading import read_robot
 
@@ -119,7 +120,8 @@ def _example(path: Path) -> Example:
     needed += [source / robot.model.urdf] if robot.model else []
     named = {(getattr(joint, "motor", None), joint.simulation.motor) for joint in robot.joints.values()}
     motors = sorted({each for both in named for each in both if each})
-    needed += [source / motor for motor in motors]
+    code = sorted({file_of(entry.type) or "" for entry in robot.controllers.values()} - {""})
+    needed += [source / file for file in (*motors, *code)]
     files = [path.name, *(str(each.relative_to(source)) for each in needed)]
     folders = {Path(name).parent for name in files}
     schemas = (name for name in _SCHEMAS if Path(name).parent in folders)
