@@ -88,6 +88,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 EXTRAS = {
     "bokeh": "report",
     "duckdb": "logs",
+    "fsspec": "store",
     "matplotlib": "report",
     "mujoco": "physics",
     "pyarrow": "logs",

@@ -37,4 +37,10 @@ def dxlrun_commands() -> Sequence[Command]:
             "Show all logs below a directory as a table, one row a log.",
             "Logs",
         ),
+        Command(
+            "upload",
+            f"{_PLACE}.logs:upload",
+            "Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.",
+            "Logs",
+        ),
     )

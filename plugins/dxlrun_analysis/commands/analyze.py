@@ -9,17 +9,31 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
-from dxlrun.errors import InputError, LogError, counted
+from dxlrun.errors import InputError, LogError, counted, missing_extra
 from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
+    from cyclopts import Token
+
     from dxlrun.log.reader import LogReader
 
 MOST_WORST = 10  # Cycles of which the analysis keeps the packets
 
 
+def _log(_: object, tokens: Sequence[Token]) -> Path:
+    """Return the path of a log, or of a copy of one that lies in a store."""
+    place = tokens[0].value
+    if "://" not in place:
+        return Path(place)
+    if missing := missing_extra("a log of a store", "store", "fsspec", "pyarrow"):
+        raise InputError(missing)
+    from dxlrun_analysis.season.store import fetch
+
+    return fetch(place)
+
+
 def analyze(
-    *logs: Annotated[Path, Parameter(name="log")],
+    *logs: Annotated[Path, Parameter(name="log", converter=_log)],
     report: Path | None = None,
     worst: int = 0,
     as_json: JsonFlag = False,
@@ -33,7 +47,7 @@ def analyze(
     ----------
     logs
         The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
-        logs. Several logs get one line each.
+        logs. Several logs get one line each. s3://BUCKET/LOG is read from a store, as a whole.
     report
         Also write a page with all numbers and plots to this file, such as report.html. A zoom in one plot
         is one in all; the page loads nothing from anywhere, and prints. Needs bokeh:

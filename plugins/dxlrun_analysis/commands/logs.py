@@ -1,4 +1,4 @@
-"""`dxlrun logs`: the logs of a season as a table."""
+"""`dxlrun logs`: the logs of a season as a table; `dxlrun upload`: logs into a store."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
-from dxlrun.output.terminal import print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun_analysis.season.query import Answer
     from dxlrun_analysis.season.runs import Folder
+    from dxlrun_analysis.season.store import Store
 
 Row = Mapping[str, object]
 _MOST_SHOWN = 1000
@@ -25,7 +26,7 @@ Text = Annotated[str | None, Parameter(show_default=False, allow_leading_hyphen=
 
 
 def logs(
-    directory: Path,
+    directory: str,
     /,
     *,
     where: Text = None,
@@ -42,7 +43,7 @@ def logs(
     Parameters
     ----------
     directory
-        The directory with the logs.
+        The directory with the logs, or s3://BUCKET/PREFIX, where `dxlrun upload` has put some.
     where
         Only logs that meet this condition in SQL, such as "not good and lost > 10", or
         "list_contains(findings, 'latency_timer')". A wrong name is answered with all names.
@@ -58,12 +59,14 @@ def logs(
     _check(directory, where, sort, sql)
     from dxlrun_analysis.season import query, runs
 
-    folder = runs.find_logs(directory)
+    folder = _found(directory)
     statement = query.where(where or "", sort or "") if sql is None else sql
     option = "--sql" if sql is not None else "--where" if sort is None else "--where or --sort"
     try:
         with progress_bar(hidden=as_json) as draw:
-            table, read = runs.table_of(folder, draw)
+            table, read = (
+                runs.table_of(folder, draw) if isinstance(folder, runs.Folder) else folder.table(draw)
+            )
     except OSError as error:
         raise InputError(
             f"the table cannot be kept in {runs.cache_directory()} ({error.strerror or error}); "
@@ -80,21 +83,79 @@ def logs(
     return 0
 
 
-def _check(directory: Path, where: str | None, sort: str | None, sql: str | None) -> None:
+def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: Flag = False) -> int:
+    """Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.
+
+    Logs that are there as a whole are left out, and so is one that changed within the last 10 s; what an
+    ended connection left is done the next time. Nothing is deleted, and no other run is written over. Needs
+    `pip install 'dxlrun[store]'`. The exit code is 1 when a log could not be copied.
+
+    Parameters
+    ----------
+    directory
+        The directory with the logs.
+    store
+        Such as s3://BUCKET/PREFIX, or file:///DIRECTORY. Keys and the address of a server of one's own are
+        those of the AWS command line: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if missing := missing_extra("`dxlrun upload`", "store", "fsspec", "duckdb", "pyarrow"):
+        raise InputError(missing)
+    _check(str(directory), None, None, None)
+    from dxlrun_analysis.season import runs
+    from dxlrun_analysis.season import store as stores
+
+    folder = runs.find_logs(directory)
+    with progress_bar(hidden=as_json) as draw:
+        result = stores.upload(folder, store, draw)
+    if as_json:
+        show_json(result._asdict())
+        return 1 if result.others else 0
+    for name in result.others:
+        print_error(f"{store} has another run named {name}; give each robot a prefix of its own")
+    for name in result.written:
+        print_warning(f"{name} changed within the last 10 s: a run may write it still, so it was left out")
+    uploaded = counted(len(result.uploaded), "log was", "logs were")
+    show(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there")
+    return 1 if result.others else 0
+
+
+def _found(place: str) -> Folder | Store:
+    """Return the logs of a directory or a store; raises InputError where there are none."""
+    from dxlrun_analysis.season import runs
+
+    if "://" not in place:
+        return runs.find_logs(Path(place))
+    from dxlrun_analysis.season.store import find_store
+
+    store = find_store(place)
+    if not store.logs:
+        raise InputError(f"{place}: there are no logs in it; `dxlrun upload DIRECTORY {place}` brings some")
+    return store
+
+
+def _check(place: str, where: str | None, sort: str | None, sql: str | None) -> None:
     """Raise InputError with all that is wrong with the command line."""
-    wrong = []
-    if not directory.is_dir():
+    wrong: list[str] = []
+    needed = ("logs", "duckdb", "pyarrow")
+    directory = Path(place)
+    if "://" in place:
+        needed = ("store", "duckdb", "fsspec")
+    elif not directory.is_dir():
         fix = "`dxlrun analyze` takes single logs" if directory.exists() else "runs leave their logs in logs"
         wrong.append(f"there is no directory {directory}; {fix}")
     if sql is not None and (where is not None or sort is not None):
         wrong.append("--sql is a whole statement; write WHERE and ORDER BY in it, or leave it out")
-    if missing := missing_extra("logs", "logs", "duckdb", "pyarrow"):
+    if missing := missing_extra("logs", *needed):
         wrong.append(missing)
     if wrong:
         raise InputError("\n".join(wrong))
 
 
-def _others(folder: Folder) -> str:
+def _others(folder: Folder | Store) -> str:
     named = ", ".join(folder.others[:_MOST_NAMED])
     more = len(folder.others) - _MOST_NAMED
     rest = f" and {more} more" if more > 0 else ""
@@ -102,7 +163,7 @@ def _others(folder: Folder) -> str:
     return f"{files} in {folder.directory}: {named}{rest}"
 
 
-def _show(answer: Answer, folder: Folder, *, whole: bool) -> None:
+def _show(answer: Answer, folder: Folder | Store, *, whole: bool) -> None:
     shown = answer.rows[:_MOST_SHOWN]
     if whole:
         columns = [Column(name, _kind(shown, index)) for index, name in enumerate(answer.columns)]

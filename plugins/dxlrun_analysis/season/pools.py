@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -35,5 +36,6 @@ def processes(count: int) -> Iterator[Executor]:
 
 
 def _follow() -> None:
-    """End with the process that started this one."""
+    """End with the process that started this one, and give way to others: a robot may run here."""
+    os.nice(10)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
 from time import time_ns
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import pyarrow as pa
 from pyarrow import parquet
@@ -206,20 +206,46 @@ def table_of(folder: Folder, progress: Progress) -> tuple[pa.Table, int]:
 
     Raises OSError when the table cannot be kept for the next time.
     """
-    name = blake2b(os.fsencode(folder.directory.resolve()), digest_size=16).hexdigest()
+    place = os.fsencode(folder.directory.resolve())
+    return kept_table(place, folder.logs, lambda missing: _rows(missing, progress))
+
+
+class Stamped(Protocol):
+    """A log of a table that is kept."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the table."""
+
+    @property
+    def stamp(self) -> str:
+        """How it is now; empty: it may change without another stamp."""
+
+
+AnyLog = TypeVar("AnyLog", bound=Stamped)
+
+
+def kept_table(
+    place: bytes, logs: Sequence[AnyLog], read: Callable[[Sequence[AnyLog]], Mapping[str, Row]]
+) -> tuple[pa.Table, int]:
+    """Return the table of the logs of a place, and how many rows were read: those whose stamps changed.
+
+    Raises OSError when the table cannot be kept for the next time.
+    """
+    name = blake2b(place, digest_size=16).hexdigest()
     kept_at = cache_directory() / code_hashes()[RUNTIME][:16] / f"{name}.parquet"
     kept_at.parent.mkdir(parents=True, exist_ok=True)
     known: dict[str, Row] = {}
     with suppress(OSError, pa.ArrowException):  # there is none yet, or it is damaged: all are read again
         known = {row["log"]: row for row in parquet.read_table(kept_at, schema=_KEPT).to_pylist()}
-    stamps = {log.name: log.stamp for log in folder.logs}
+    stamps = {log.name: log.stamp for log in logs}
     missing = [
         log
-        for log in folder.logs
+        for log in logs
         if not (stamp := stamps[log.name]) or known.get(log.name, {}).get("stamp") != stamp
     ]
-    known |= _rows(missing, progress)
-    rows = [known[log.name] | {"stamp": stamps[log.name]} for log in folder.logs]
+    known |= read(missing)
+    rows = [known[log.name] | {"stamp": stamps[log.name]} for log in logs]
     table = pa.Table.from_pylist(rows, _KEPT)
     if missing:
         beside = kept_at.with_suffix(f".{os.getpid()}")

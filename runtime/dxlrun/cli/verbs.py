@@ -59,7 +59,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
 """The headings of the help in their order, and `module:function` of each verb of the core, which is imported
 when it is used. Verbs of packages name their heading, see `Command.group`."""
 _PACKAGES = {
-    "dxlrun_analysis": ("analyze", "export", "logs"),
+    "dxlrun_analysis": ("analyze", "export", "logs", "upload"),
     "dxlrun_fleet": ("keys",),
     "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),

@@ -1,0 +1,207 @@
+"""Logs in an object store, reached by fsspec: `s3://BUCKET/PREFIX`, or `file:///DIRECTORY` for a mounted one.
+
+Beside each log lies its row of the table of logs, as JSON. It is written last: a log that has one is there
+as a whole, and the table of a store is made of these rows, without a byte of the logs.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from tempfile import mkdtemp
+from time import time_ns
+from typing import NamedTuple
+
+import fsspec
+import msgspec
+import pyarrow as pa
+from pyarrow import json
+
+from dxlrun.errors import DxlrunError, InputError, missing_extra
+from dxlrun_analysis.season.runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
+
+_ROW, _LOG = ".run.json", ".mcap"
+UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot goes on with it"
+DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it anew"
+_AT_ONCE = 500
+"""Rows that are asked for together."""
+_QUIET_NS = 10_000_000_000
+"""A log that changed so lately may be written still: a recorder writes twice a second."""
+_OPTIONS: Mapping[str, Mapping[str, object]] = {
+    "s3": {
+        "skip_instance_cache": True,
+        "use_listings_cache": False,
+        "max_concurrency": 1,  # parts of a large log in memory, 50 MB each
+        "config_kwargs": {"connect_timeout": 5, "read_timeout": 20, "retries": {"max_attempts": 3}},
+    },
+    "file": {"auto_mkdir": True},
+}
+
+
+class StoredLog(NamedTuple):
+    """One log of a store."""
+
+    name: str
+    row: str  # Where its row is; empty: there is none yet
+    stamp: str
+
+
+class Store(NamedTuple):
+    """What a store has below a prefix."""
+
+    directory: str  # The URL
+    files: fsspec.AbstractFileSystem
+    root: str
+    logs: tuple[StoredLog, ...]
+    others: tuple[str, ...]
+
+    def table(self, progress: Progress) -> tuple[pa.Table, int]:
+        """Return the table of all logs, and how many rows were read this time.
+
+        Raises OSError when the table cannot be kept for the next time.
+        """
+        return kept_table(self.directory.encode(), self.logs, lambda missing: self._rows(missing, progress))
+
+    def _rows(self, logs: Sequence[StoredLog], progress: Progress) -> dict[str, Row]:
+        rows: dict[str, Row] = {log.name: {"log": log.name, "unreadable": UNFINISHED} for log in logs}
+        there = [log for log in logs if log.row]
+        for first in range(0, len(there), _AT_ONCE):
+            some = there[first : first + _AT_ONCE]
+            with _reached(self.directory):
+                found = self.files.cat([log.row for log in some])
+            rows |= {log.name: _row(log.name, found[log.row]) for log in some}
+            progress(f"{first + len(some)} of {len(there)} logs", (first + len(some)) / len(there))
+        return rows
+
+
+def is_store(place: str) -> bool:
+    """Return whether a place is the URL of a store, and no path."""
+    return "://" in place
+
+
+def find_store(url: str) -> Store:
+    """Return what lies in a store. Raises InputError for a wrong URL, DxlrunError without connection."""
+    files, root = _opened(url)
+    with _reached(url):
+        found = files.find(root, detail=True)
+    names = {path.removeprefix(root).lstrip("/"): (path, about) for path, about in found.items()}
+    logs = {
+        name.removesuffix(_ROW): StoredLog(name.removesuffix(_ROW), path, _stamp(about))
+        for name, (path, about) in names.items()
+        if name.endswith(_ROW)
+    }
+    others = []
+    for name in names:
+        folder = os.path.dirname(name)
+        if name.endswith(_LOG) and name not in logs and folder not in logs:
+            logs[name] = StoredLog(name, "", "")
+        elif not name.endswith((_ROW, _LOG)):
+            others.append(name)
+    return Store(url, files, root, tuple(logs[name] for name in sorted(logs)), tuple(sorted(others)))
+
+
+def fetch(url: str) -> Path:
+    """Return a copy of one log of a store, which is deleted at this program's end."""
+    files, root = _opened(url)
+    copy = Path(mkdtemp(prefix="dxlrun-")) / root.rpartition("/")[2]
+    atexit.register(shutil.rmtree, copy.parent, ignore_errors=True)
+    with _reached(url):
+        files.get(root, str(copy), recursive=files.isdir(root))
+    return copy
+
+
+class Upload(NamedTuple):
+    """What became of the logs of a directory."""
+
+    uploaded: tuple[str, ...]
+    there: tuple[str, ...]  # before
+    written: tuple[str, ...]  # by a run that has not ended
+    others: tuple[str, ...]  # of which the store has another run with the same name
+
+
+def upload(folder: Folder, url: str, progress: Progress) -> Upload:
+    """Copy the logs of runs that have ended to a store, each with its row; what is there as a whole stays.
+
+    Raises DxlrunError when the store cannot be reached; the next call goes on behind the last whole log.
+    """
+    store = find_store(url)
+    quiet = folder._replace(logs=tuple(log for log in folder.logs if _is_quiet(log)))
+    known = {row["log"]: row for row in store.table(progress)[0].to_pylist()}
+    rows = table_of(quiet, progress)[0].to_pylist() if quiet.logs else []
+    uploaded, there, others = [], [], []
+    written = [log.name for log in folder.logs if log not in quiet.logs]
+    for done, (log, row) in enumerate(zip(quiet.logs, rows, strict=True)):
+        progress(log.name, done / len(rows))
+        before = known.get(log.name, {"unreadable": UNFINISHED})
+        if before["unreadable"] not in (UNFINISHED, DAMAGED):
+            same = all(before[each] == row[each] for each in ("robot", "began", "host"))
+            if not same or (row["began"] is None and before["bytes"] != row["bytes"]):
+                others.append(log.name)
+                continue
+            if before["bytes"] >= row["bytes"]:
+                there.append(log.name)
+                continue
+        with _reached(url):
+            size = sum(_put(store, file, log) for file in log.files)
+            if size != row["bytes"]:
+                written.append(log.name)
+                continue
+            store.files.pipe_file(f"{store.root}/{log.name}{_ROW}", msgspec.json.encode(row))
+        uploaded.append(log.name)
+    return Upload(tuple(uploaded), tuple(there), tuple(written), tuple(others))
+
+
+def _put(store: Store, file: Path, log: FoundLog) -> int:
+    """Copy one file; return how many bytes the store has of it."""
+    to = f"{store.root}/{log.name}" + ("" if file == log.path else f"/{file.name}")
+    store.files.put_file(str(file), to)
+    return int(store.files.info(to)["size"])
+
+
+def _is_quiet(log: FoundLog) -> bool:
+    """Return whether a log has not changed for some time; a clock may have been set back since."""
+    try:
+        return all(abs(time_ns() - file.stat().st_mtime_ns) > _QUIET_NS for file in log.files)
+    except OSError:
+        return False
+
+
+def _row(name: str, data: bytes) -> Row:
+    options = json.ParseOptions(explicit_schema=SCHEMA, unexpected_field_behavior="ignore")
+    try:
+        (row,) = json.read_json(BytesIO(data), parse_options=options).to_pylist()
+    except (pa.ArrowException, ValueError):
+        return {"log": name, "unreadable": DAMAGED}
+    return {**row, "log": name}
+
+
+def _stamp(about: Mapping[str, object]) -> str:
+    return f"{about['size']} {about.get('ETag') or about.get('mtime')}"
+
+
+def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
+    """Return the file system of a store and the path in it."""
+    protocol, _, path = url.partition("://")
+    if protocol not in _OPTIONS:
+        raise InputError(f"{url}: no such store; write s3://BUCKET/PREFIX or file:///DIRECTORY")
+    if protocol == "s3" and (missing := missing_extra("a store of S3", "store", "s3fs")):
+        raise InputError(missing)
+    if not path.strip("/"):
+        raise InputError(f"{url}: it names no bucket or directory; write s3://BUCKET/PREFIX")
+    files, root = fsspec.core.url_to_fs(url, **_OPTIONS[protocol])
+    return files, root.rstrip("/")
+
+
+@contextmanager
+def _reached(url: str) -> Iterator[None]:
+    """Raise DxlrunError with the URL for whatever the library of a store raises: it has no common class."""
+    try:
+        yield
+    except Exception as error:
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise DxlrunError(f"{url}: {reason}") from error
