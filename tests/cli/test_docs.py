@@ -85,6 +85,7 @@ TESTS = {
     "teleoperation.md": ("tests/teleop/test_page.py", "tests/teleop/test_terminal.py"),
     "tools.md": ("tests/cli/test_docs.py",),
     "network.md": ("tests/remote/test_network_run.py",),
+    "fleet.md": ("tests/fleet/test_fleet.py",),
     "foxglove.md": ("tests/foxglove/test_live.py",),
     "view.md": ("tests/view/test_command.py",),
 }

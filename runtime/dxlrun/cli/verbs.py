@@ -60,7 +60,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
 when it is used. Verbs of packages name their heading, see `Command.group`."""
 _PACKAGES = {
     "dxlrun_analysis": ("analyze", "export", "logs", "upload"),
-    "dxlrun_fleet": ("keys",),
+    "dxlrun_fleet": ("fleet", "keys"),
     "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),
     "dxlrun_lab": (

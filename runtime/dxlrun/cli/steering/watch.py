@@ -145,7 +145,7 @@ def _show_live(watched: Watched) -> None:
     from rich.live import Live
 
     console = out()
-    with _keys() as pressed, Live(console=console, screen=True, auto_refresh=False) as live:
+    with keys_pressed() as pressed, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
             width, height = console.size
             live.update(view(watched, width - 1, height), refresh=True)  # a full line may wrap
@@ -155,10 +155,10 @@ def _show_live(watched: Watched) -> None:
 
 
 @contextmanager
-def _keys() -> Iterator[_Pressed]:
+def keys_pressed() -> Iterator[Pressed]:
     """Give what waits for the key q; without a terminal on stdin it only waits."""
     if not sys.stdin.isatty():
-        yield _Pressed(None)
+        yield Pressed(None)
         return
     import termios
     import tty
@@ -167,13 +167,15 @@ def _keys() -> Iterator[_Pressed]:
     before = termios.tcgetattr(keyboard)
     try:
         tty.setcbreak(keyboard)
-        yield _Pressed(keyboard)
+        yield Pressed(keyboard)
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
 
 
 @dataclass(frozen=True, slots=True)
-class _Pressed:
+class Pressed:
+    """Waits for the key q."""
+
     keyboard: int | None
 
     def __call__(self, seconds: float) -> bool:
@@ -305,13 +307,13 @@ def view(watched: Watched, width: int, height: int) -> Group:
 
     head, rows, other = headline(watched), joints(watched), controllers(watched)
     left = height - 2 - len(rows.rows)
-    parts: list[RenderableType] = [_line(head, width), _compact(rows)]
+    parts: list[RenderableType] = [_line(head, width), compact(rows)]
     between = sources(watched)
     if between.rows and left >= len(between.rows) + 2:
-        parts.append(_compact(between))
+        parts.append(compact(between))
         left -= len(between.rows) + 1
     if left >= len(other.rows) + 2:
-        parts.append(_compact(other))
+        parts.append(compact(other))
         left -= len(other.rows) + 1
     elif left > 0:
         active = [row[0].text for row in other.rows if row[1].text != "inactive"]
@@ -329,7 +331,7 @@ def _line(sentence: Sentence, width: int) -> Text:
     return text
 
 
-def _compact(table: Table) -> RenderableType:
+def compact(table: Table) -> RenderableType:
     """Return a table without rules, cut at the right where there is no room."""
     from rich.table import Table as RichTable
     from rich.text import Text

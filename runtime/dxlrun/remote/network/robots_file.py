@@ -24,12 +24,14 @@ def _address(text: str) -> str:
     return text
 
 
+ListedAddress = Annotated[str, AfterValidator(_address)]
+"""`[NAME@]HOST:PORT`; the name of the key when there is none."""
+
+
 class RobotsFile(Form):
     """Where the gateways of robots listen."""
 
-    robots: dict[str, Annotated[str, AfterValidator(_address)]] = key(
-        "Addresses by the names of certificates.", "{torso: lab3:7660}"
-    )
+    robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
 
 
 def read_robots(path: Path) -> dict[str, Address]:

@@ -1,0 +1,97 @@
+"""Agent: starts robots where none runs, for clients with the role admin, by mutual TLS.
+
+It starts the lines of its own file and nothing else: a request has a robot's name alone. A run is a process
+of its own, which goes on when the agent ends. Its output goes to NAME.out beside the file; that is locked
+for as long as a process of the run lives, so that a robot runs once, whichever agent started it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from urllib.parse import unquote
+
+import uvicorn
+from starlette.responses import PlainTextResponse
+from starlette.types import Receive, Scope, Send
+from uvicorn.server import ServerState
+
+from dxlrun.remote.network.handshakes import Handshakes, Secured
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.server import Connection
+from dxlrun_fleet.fleet_file import Agent
+
+START = "/robots/"
+"""Before the name of a robot: POST starts it, GET asks whether it runs; 200: it does."""
+_MOST_TOLD = 4096
+_MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
+_MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
+
+
+class Starter:
+    """Starts the robots of an agent, each once."""
+
+    def __init__(self, agent: Agent, directory: Path) -> None:
+        self._agent, self._directory = agent, directory
+        self._runs: list[subprocess.Popen[bytes]] = []
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request (ASGI)."""
+        status, text = self.answer(scope["method"], unquote(scope["path"]), scope["client"].role)
+        await PlainTextResponse(text, status)(scope, receive, send)
+
+    def answer(self, method: str, path: str, role: Role) -> tuple[int, str]:
+        """Return status and text: 200 runs or was started, 409 ran already, 410 does not run."""
+        name = path.removeprefix(START)
+        if role < Role.ADMIN:
+            return 403, "only a client with the role admin may start robots"
+        if method not in ("GET", "POST") or name not in self._agent.starts:
+            return 404, f"this agent starts {', '.join(self._agent.starts)}"
+        self._runs = [run for run in self._runs if run.poll() is None]
+        path_out = self._directory / f"{name.replace('/', '_')}.out"
+        with os.fdopen(os.open(path_out, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as output:
+            try:
+                fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return (409, "it runs already") if method == "POST" else (200, "it runs")
+            if method == "GET":
+                output.seek(max(0, os.fstat(output.fileno()).st_size - _MOST_TOLD))
+                told = output.read().decode(errors="replace").split("\n")
+                last = [line for line in told if line.strip()][-1:]
+                return 410, f"it does not run; {path_out} ends with: {''.join(last) or 'nothing'}"
+            output.truncate(0)
+            self._runs.append(
+                subprocess.Popen(
+                    [sys.executable, "-P", "-c", _MAIN, *self._agent.starts[name]],
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    cwd=self._directory,
+                    start_new_session=True,
+                )
+            )
+        return 200, "it was started"
+
+
+async def serve(agent: Agent, directory: Path) -> None:
+    """Serve until the process ends. Raises InputError for certificates that are refused, and OSError."""
+    config = uvicorn.Config(
+        Starter(agent, directory),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        log_level="critical",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        h11_max_incomplete_event_size=16384,
+    )
+    config.load()
+    Handshakes(Secured.at(agent.address), partial(Connection, config, ServerState(), {})).begin()
+    await asyncio.Event().wait()

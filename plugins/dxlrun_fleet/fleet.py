@@ -1,0 +1,164 @@
+"""`dxlrun fleet`: several robots in one table, started and stopped from here."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+from urllib.parse import quote
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun.output.terminal import print_error, show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun_fleet.fleet_file import Fleet
+
+_START_S = 60.0
+_POLL_S = 0.2
+Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
+
+
+def fleet(
+    file: Path,
+    /,
+    *,
+    start: Names = (),
+    stop: Names = (),
+    serve: str | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Show the robots of a file in one table, live; q or Ctrl-C ends it. Start and stop them.
+
+    Into a pipe, or with --json, one look. The exit code is 1 when a robot is unreachable, or was not started
+    or stopped. Needs certificates of `dxlrun keys`.
+
+    Parameters
+    ----------
+    file
+        Names the robots and where they listen, and the agents that start them.
+    start
+        Let their agents start these robots; needs the role admin.
+    stop
+        Stop these robots, by their policy on_exit; needs the role command.
+    serve
+        Be the agent of this name: start the robots that the file names for it. Robots go on when it ends.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.remote.network.certificates import client_context
+    from dxlrun_fleet.fleet_file import read_fleet
+
+    found = read_fleet(file)
+    if serve is not None:
+        return _serve(found, serve)
+    client_context()  # what is wrong with the certificates is wrong with all robots
+    found.require((*start, *stop))
+    if start or stop:
+        return _change(found, start, stop, as_json=as_json)
+    return _view(found, as_json=as_json)
+
+
+def _serve(fleet: Fleet, name: str) -> int:
+    if name not in fleet.agents:
+        raise InputError(f"the file has no agent {name}; it has {', '.join(fleet.agents) or 'none'}")
+    import asyncio
+
+    from dxlrun_fleet.agent import serve
+
+    agent = fleet.agents[name]
+    for robot, words in agent.starts.items():
+        if not (fleet.directory / words[0]).is_file():
+            raise InputError(f"there is no {fleet.directory / words[0]}, by which {robot} is started")
+    show(f"{agent.address} starts {', '.join(agent.starts)}; Ctrl-C ends it, and no robot")
+    try:
+        asyncio.run(serve(agent, fleet.directory))
+    except KeyboardInterrupt:
+        return 0
+    except OSError as error:
+        raise DxlrunError(f"{agent.address} cannot listen: {error.strerror or error}") from error
+    return 0
+
+
+def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_json: bool) -> int:
+    """Start and stop robots, all at once: one that does not answer delays no other."""
+    work = {
+        **{name: partial(_start, fleet) for name in start},
+        **{name: partial(_stop, fleet) for name in stop},
+    }
+
+    def done(name: str, act: Callable[[str], str]) -> dict[str, object]:
+        try:
+            return {"robot": name, "done": True, "text": act(name)}
+        except (DxlrunError, OSError, ValueError) as error:
+            return {"robot": name, "done": False, "text": f"{name}: {error}"}
+
+    with ThreadPoolExecutor(len(work)) as threads:
+        rows = list(threads.map(done, work, work.values()))
+    if as_json:
+        show_json(rows)
+    for row in () if as_json else rows:
+        (show if row["done"] else print_error)(str(row["text"]))
+    return 0 if all(row["done"] for row in rows) else 1
+
+
+def _start(fleet: Fleet, name: str) -> str:
+    """Let a robot's agent start it; return when it can be reached."""
+    from dxlrun.remote.network.network_link import NetworkLink
+    from dxlrun_fleet.agent import START
+
+    robot, path = NetworkLink(fleet.robots[name], "dxlrun fleet"), START + quote(name)
+    with closing(NetworkLink(fleet.agent_of(name).address, "dxlrun fleet")) as agent:
+        status, text = agent.exchange("POST", path, None)
+        until = time.monotonic() + _START_S
+        while status == 200:
+            if robot.alive:
+                return f"{name} runs"
+            if time.monotonic() > until:
+                raise DxlrunError(f"it was started, but {fleet.robots[name]} takes no connection")
+            time.sleep(_POLL_S)
+            status, text = agent.exchange("GET", path, None)
+    raise DxlrunError(text.decode(errors="replace"))
+
+
+def _stop(fleet: Fleet, name: str) -> str:
+    from dxlrun.remote.client import RemoteRobot
+    from dxlrun.remote.network.network_link import NetworkLink
+
+    with RemoteRobot(name, NetworkLink(fleet.robots[name], "dxlrun fleet")) as robot:
+        robot.info()  # to a client, one that cannot be reached has been stopped
+        robot.stop()
+    return f"{name} has ended"
+
+
+def _view(fleet: Fleet, *, as_json: bool) -> int:
+    from dxlrun.cli.steering.watch import keys_pressed
+    from dxlrun_fleet.fleet_view import SILENT_S, RobotView, fleet_table, show_live
+
+    with ExitStack() as ends:
+        views = [
+            ends.enter_context(closing(RobotView(name, address))) for name, address in fleet.robots.items()
+        ]
+        if sys.stdout.isatty() and not as_json:
+            with suppress(KeyboardInterrupt), keys_pressed() as pressed:
+                show_live(views, pressed)
+            return 0
+        until = time.monotonic() + SILENT_S
+        for view in views:
+            view.tried.wait(max(0.0, until - time.monotonic()))
+        rows = [view.seen() for view in views]
+    if as_json:
+        show_json(rows)
+    else:
+        show(fleet_table(rows))
+    return 1 if any(row.state == "unreachable" for row in rows) else 0

@@ -1,0 +1,88 @@
+"""The file of a fleet: where its robots listen, and the agents that start them."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import AfterValidator
+
+from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.document import grow, parse, read_text
+from dxlrun.description.form import Form, key, refuse
+from dxlrun.description.problems import read_form
+from dxlrun.errors import InputError, suggestion
+from dxlrun.remote.network.robots_file import ListedAddress, RobotsFile
+from dxlrun.remote.sockets import Address, address_of
+
+
+def _line(text: str) -> str:
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise refuse(f"{text!r} is no line of words: {error}", "write it as behind `dxlrun`") from error
+    if not words or not words[0].endswith((".yaml", ".yml")):
+        raise refuse(f"{text!r} begins with no robot file", "write ROBOT.yaml and what follows it")
+    return text
+
+
+class AgentForm(Form):
+    """A computer where `dxlrun fleet FILE --serve NAME` starts robots."""
+
+    address: ListedAddress = key("Where its agent listens.", "lab3:7659")
+    starts: dict[str, Annotated[str, AfterValidator(_line)]] = key(
+        "What follows `dxlrun` for each robot; paths are seen from this file's directory.",
+        "{torso: robots/bioloid_torso.yaml port:=/dev/ttyUSB0 --listen 0.0.0.0:7660}",
+    )
+
+
+class FleetForm(RobotsFile):
+    """Robots, and the agents that start them."""
+
+    agents: dict[str, AgentForm] = key("By the names of their certificates.", "{lab3: {}}", {})
+
+
+class Agent(NamedTuple):
+    """An agent, and the words behind `dxlrun` of each robot that it starts."""
+
+    address: Address
+    starts: dict[str, tuple[str, ...]]
+
+
+class Fleet(NamedTuple):
+    """Robots and agents by name."""
+
+    robots: dict[str, Address]
+    agents: dict[str, Agent]
+    directory: Path
+
+    def agent_of(self, robot: str) -> Agent:
+        """Return the agent that starts a robot; raises InputError."""
+        for agent in self.agents.values():
+            if robot in agent.starts:
+                return agent
+        raise InputError(f"no agent of the file starts {robot}; name it under agents: NAME: starts")
+
+    def require(self, names: tuple[str, ...]) -> None:
+        """Raise InputError for the first name that is no robot."""
+        for name in names:
+            if name not in self.robots:
+                raise InputError(f"the file has no robot {name}; {suggestion(name, tuple(self.robots))}")
+
+
+def read_fleet(path: Path) -> Fleet:
+    """Return the fleet of a file; raises InputError with the place of each mistake."""
+    file = str(path)
+    form = read_form(grow(parse(read_text(path), file), file, refuse_arguments), FleetForm)
+    return Fleet(
+        {name: address_of(text, name) for name, text in form.robots.items()},
+        {
+            name: Agent(
+                address_of(agent.address, name),
+                {robot: tuple(shlex.split(line)) for robot, line in agent.starts.items()},
+            )
+            for name, agent in form.agents.items()
+        },
+        path.resolve().parent,
+    )

@@ -1,0 +1,153 @@
+"""View of a fleet: what each robot replied last, by a thread a robot: none delays another."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from datetime import datetime
+
+import msgspec
+import numpy as np
+
+from dxlrun.channels.answers import Code
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.output.table import Cell, Column, Columns, Table
+from dxlrun.remote.client import RemoteRobot
+from dxlrun.remote.network.network_link import NetworkLink
+from dxlrun.remote.requests.replies import Events, RobotInfo
+from dxlrun.remote.sockets import Address
+
+LOOK_S = 0.5
+SILENT_S = 1.5
+"""A robot that has not replied for so long is unreachable."""
+_ERROR = 40
+"""The least severity of an event that is an error."""
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """One robot, as it replied last."""
+
+    robot: str
+    state: str = "unreachable"
+    """running, paused, starting, unreachable"""
+    since: str = ""
+    """Wall time of the last reply, or of the first try, of a robot that is unreachable."""
+    reason: str = ""
+    voltage: float | None = None
+    """The lowest of its servos, V"""
+    temperature: float | None = None
+    """The highest of its servos, deg C"""
+    hottest: str = ""
+    error: str = ""
+    """The text of its last error."""
+    log: str | None = None
+
+
+class RobotView:
+    """Looks at one robot twice a second."""
+
+    def __init__(self, name: str, address: Address) -> None:
+        self._address = address
+        self._seen = Seen(name)
+        self._replied = time.monotonic()
+        self.tried = threading.Event()
+        """Set once the first look succeeded or failed."""
+        self._ended = threading.Event()
+        threading.Thread(target=self._look_on, daemon=True).start()
+
+    def close(self) -> None:
+        """Look no more; a robot that hangs is not waited for."""
+        self._ended.set()
+
+    def seen(self) -> Seen:
+        """Return the robot as it is now."""
+        seen, silent = self._seen, time.monotonic() - self._replied
+        if seen.state != "unreachable" and silent <= SILENT_S:
+            return seen
+        since = datetime.fromtimestamp(time.time() - silent).astimezone().isoformat(timespec="seconds")
+        reason = seen.reason or "it does not answer"
+        return msgspec.structs.replace(
+            seen, state="unreachable", since=since, reason=reason, voltage=None, temperature=None, hottest=""
+        )
+
+    def _look_on(self) -> None:
+        while not self._ended.wait(LOOK_S if self.tried.is_set() else 0.0):
+            try:
+                with RemoteRobot(self._seen.robot, NetworkLink(self._address, "dxlrun fleet")) as robot:
+                    last = 0
+                    while not self._ended.wait(LOOK_S if last else 0.0):
+                        last = self._look(robot, last)
+                        self._replied = time.monotonic()
+                        self.tried.set()
+            except (DxlrunError, OSError, ValueError) as error:
+                self._seen = msgspec.structs.replace(self._seen, state="unreachable", reason=str(error))
+            self.tried.set()
+
+    def _look(self, robot: RemoteRobot, last: int) -> int:
+        """Ask the robot; return the number of its last event."""
+        info = msgspec.convert(robot.info(), RobotInfo)
+        events = msgspec.convert(robot.events(last), Events)
+        errors = [event.text for event in events.events if event.severity >= _ERROR]
+        seen = msgspec.structs.replace(
+            self._seen,
+            state="paused" if info.paused else "running",
+            reason="",
+            log=info.log,
+            error=errors[-1] if errors else self._seen.error if last else "",
+        )
+        try:
+            states = robot.states()
+        except Refused as refused:
+            if refused.code != Code.NO_CYCLE:
+                raise
+            self._seen = msgspec.structs.replace(seen, state="starting")
+            return events.last
+        hottest = _at_most(states.temperature)
+        lowest = _at_most(-states.voltage)
+        self._seen = msgspec.structs.replace(
+            seen,
+            voltage=None if lowest is None else float(states.voltage[lowest]),
+            temperature=None if hottest is None else float(states.temperature[hottest]),
+            hottest="" if hottest is None else states.joints[hottest],
+        )
+        return events.last
+
+
+def _at_most(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> int | None:
+    """Return where the highest value is; None: none is known."""
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
+
+
+def fleet_table(robots: list[Seen]) -> Table:
+    """Return a row for each robot."""
+    columns: Columns[Seen] = [
+        (Column("robot", "name"), lambda one: one.robot),
+        (Column("state", "name"), _state),
+        (Column("battery", form="{:.1f} V", missing="-"), lambda one: one.voltage),
+        (Column("hottest", form="{:.0f} deg C", missing="-"), lambda one: one.temperature),
+        (Column("of", "name", missing="-"), lambda one: one.hottest or None),
+        (Column("last error", "text", missing="-"), lambda one: one.reason or one.error or None),
+        (Column("log", "text", missing="-", detail=True), lambda one: one.log),
+    ]
+    return Table.listing("", columns, robots)
+
+
+def _state(one: Seen) -> Cell:
+    if one.state == "unreachable":
+        return Cell(f"unreachable since {one.since[11:19]}", "error")
+    return Cell(one.state, "good" if one.state == "running" else "warning")
+
+
+def show_live(views: list[RobotView], wait: Callable[[float], bool]) -> None:
+    """Draw the table until `wait` returns True."""
+    from rich.live import Live
+
+    from dxlrun.cli.steering.watch import compact
+    from dxlrun.output.terminal import out
+
+    with Live(console=out(), screen=True, auto_refresh=False) as live:
+        while True:
+            live.update(compact(fleet_table([view.seen() for view in views])), refresh=True)
+            if wait(LOOK_S / 2):
+                return

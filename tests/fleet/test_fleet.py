@@ -1,0 +1,274 @@
+"""`dxlrun fleet`: rows of robots that run, hang and are gone; an agent that starts what its own file has."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+import pytest
+from tests.kit.awaited import until
+from tests.kit.commands import Dxlrun
+from tests.kit.pages import page_text
+
+from dxlrun.channels.answers import Code
+from dxlrun.cli import app
+from dxlrun.errors import InputError, Refused
+from dxlrun.remote.network.certificates import keys_place
+from dxlrun.remote.network.network_link import NetworkLink
+from dxlrun.remote.requests.replies import EventRow, Events, RobotInfo
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.sockets import Address
+from dxlrun_fleet.agent import START, Starter
+from dxlrun_fleet.fleet_file import Agent, read_fleet
+from dxlrun_fleet.fleet_view import RobotView
+
+authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
+
+Closing = TypeVar("Closing", RobotView, socket.socket)
+INFO = RobotInfo("joint", 50.0, False, 0, 0, (), {}, {}, {}, {}, {}, (), (), "x.yaml", None)
+ADDRESS = Address("lab3", "127.0.0.1", 1)
+TERMINAL = {"TERM": "xterm", "COLUMNS": "120", "LINES": "30"}
+ROBOTS = Path(__file__).parents[2] / "robots"
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of a fleet of one robot that an agent starts, and one whose network hangs; with all keys."""
+    for name in ("XDG_CONFIG_HOME", "XDG_RUNTIME_DIR"):
+        (tmp_path / name).mkdir(mode=0o700)
+        monkeypatch.setenv(name, str(tmp_path / name))
+    authority.issue("lab3", None, 30, keys_place())
+    authority.issue("joint", None, 30, keys_place())
+    authority.issue("me", Role.ADMIN, 30, keys_place())
+    port = free_port()
+    shutil.copy(ROBOTS / "single_joint.yaml", tmp_path)
+    (tmp_path / "lab.yaml").write_text(
+        f"robots:\n  joint: 127.0.0.1:{port}\n  hung: 127.0.0.1:{free_port()}\n"
+        f"agents:\n  lab3:\n    address: 127.0.0.1:{free_port()}\n    starts:\n"
+        f"      joint: single_joint.yaml --listen joint@127.0.0.1:{port}\n"
+    )
+    return tmp_path / "lab.yaml"
+
+
+@pytest.fixture
+def agent(lab: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """The agent of that file, which takes connections."""
+    with subprocess.Popen([DXLRUN, "fleet", lab, "--serve", "lab3"], stdout=subprocess.DEVNULL) as process:
+        until(lambda: NetworkLink(read_fleet(lab).agents["lab3"].address, "test").alive, "the agent")
+        yield process
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+
+
+@pytest.fixture
+def closed() -> Iterator[Callable[[Closing], Closing]]:
+    """Return what closes a thing at the test's end."""
+    with ExitStack() as ends:
+        yield lambda one: ends.enter_context(closing(one))
+
+
+def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
+    lab: Path, agent: subprocess.Popen[bytes], dxlrun: Dxlrun, closed: Callable[[Closing], Closing]
+) -> None:
+    fleet = read_fleet(lab)
+    closed(socket.create_server(fleet.robots["hung"][1:], backlog=1))
+    said = dxlrun("fleet", lab, "--start", "joint")
+    assert (said.code, said.out, said.err) == (0, "joint runs\n", "")
+    said = dxlrun("fleet", lab, "--start", "joint")
+    assert (said.code, said.errors) == (1, ["joint: it runs already"])
+
+    views = {name: closed(RobotView(name, address)) for name, address in fleet.robots.items()}
+    row = until(lambda: (seen := views["joint"].seen()).voltage and seen, "a row")
+    assert (row.state, row.voltage, row.hottest, row.reason, row.error) == ("running", 12.0, "joint", "", "")
+    assert (lab.parent / str(row.log)).exists()
+    (one, other) = json.loads(dxlrun("fleet", lab, "--json").out)
+    assert (one["state"], other["state"], other["reason"]) == ("running", "unreachable", "it does not answer")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d\d:\d\d", other["since"])
+
+    os.kill(process_of(agent.pid, "dxlrun.run.loop_process"), signal.SIGKILL)
+    row = until(lambda: (seen := views["joint"].seen()).state == "unreachable" and seen, "its end")
+    assert (row.voltage, row.temperature, row.hottest) == (None, None, "")
+    assert row.reason.startswith("joint no longer answers: ")
+    until(lambda: "log: " in (lab.parent / "joint.out").read_text(), "the run's last line")
+    said = dxlrun("fleet", lab, "--stop", "joint")
+    assert (said.code, len(said.errors)) == (1, 1)
+    assert "Connection refused" in said.errors[0]
+
+    assert dxlrun("fleet", lab, "--start", "joint").code == 0
+    until(lambda: views["joint"].seen().state == "running", "it runs again")
+    said = dxlrun("fleet", lab, "--stop", "joint", "--json")
+    assert json.loads(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
+
+
+def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
+    """Of a run that begins, and has no cycle yet."""
+
+    class Begins:
+        rows = ("a motor fell off", 40), ("a packet was lost", 30)
+
+        def info(self) -> object:
+            return msgspec.to_builtins(INFO)
+
+        def events(self, after: int) -> object:
+            rows = [
+                EventRow(number, 0.0, "x", how, "loop", text) for number, (text, how) in enumerate(self.rows)
+            ]
+            return msgspec.to_builtins(Events(tuple(rows[after:]), len(rows)))
+
+        def states(self) -> object:
+            raise Refused("it has had no cycle yet", code=Code.NO_CYCLE)
+
+    with closing(RobotView("joint", ADDRESS)) as view:
+        view.tried.wait()
+        view.close()
+        view._replied = time.monotonic() + 3600.0
+        for last in (0, 2):
+            assert view._look(Begins(), last) == 2
+            assert (view.seen().state, view.seen().error, view.seen().voltage) == (
+                "starting",
+                "a motor fell off",
+                None,
+            )
+
+
+def process_of(parent: int, words: str) -> int:
+    """Return the process below another one that has these words in its command line."""
+    for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        if words in Path(f"/proc/{child}/cmdline").read_bytes().decode():
+            return int(child)
+        if found := process_of(int(child), words):
+            return found
+    return 0
+
+
+def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts what its own file names, for an admin, once, also when another agent started it."""
+    (tmp_path / "wait.py").write_text(
+        "import sys\nprint(sys.argv[1:], flush=True)\nsys.stdin.read()\ninput()\n"
+    )
+    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", (tmp_path / "wait.py").read_text())
+    first, second = (Starter(Agent(ADDRESS, {"arm": ("arm.yaml", "port:=x")}), tmp_path) for _ in range(2))
+    for method, path, role, status in (
+        ("POST", START + "arm", Role.COMMAND, 403),
+        ("GET", START + "arm", Role.OBSERVE, 403),
+        ("POST", START + "arm ledger:=x", Role.ADMIN, 404),
+        ("POST", START + "../arm", Role.ADMIN, 404),
+        ("POST", START, Role.ADMIN, 404),
+        ("POST", "/stop", Role.ADMIN, 404),
+        ("DELETE", START + "arm", Role.ADMIN, 404),
+    ):
+        assert first.answer(method, path, role)[0] == status, (method, path)
+    assert [path.name for path in tmp_path.iterdir()] == ["wait.py"]
+    assert first.answer("POST", START + "arm", Role.ADMIN) == (200, "it was started")
+    out = tmp_path / "arm.out"
+    until(lambda: "EOFError" in out.read_text(), "its end")
+    status, text = until(lambda: (one := second.answer("GET", START + "arm", Role.ADMIN))[0] == 410 and one)
+    assert text == f"it does not run; {out} ends with: EOFError: EOF when reading a line"
+    assert out.read_text().startswith("['arm.yaml', 'port:=x']\n")
+
+    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import signal; signal.pause()")
+    assert first.answer("POST", START + "arm", Role.ADMIN)[0] == 200
+    for starter in (first, second):
+        assert starter.answer("GET", START + "arm", Role.ADMIN) == (200, "it runs")
+        assert starter.answer("POST", START + "arm", Role.ADMIN) == (409, "it runs already")
+    (run,) = first._runs
+    assert os.getsid(run.pid) == run.pid
+    run.kill()
+    run.wait()
+    assert until(lambda: second.answer("GET", START + "arm", Role.ADMIN)[0] == 410)
+
+
+def test_an_agent_asks_for_a_certificate_with_the_role_admin(
+    lab: Path, agent: subprocess.Popen[bytes], dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    authority.issue("looks", Role.OBSERVE, 30, tmp_path / "other" / "dxlrun" / "keys")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "other"))
+    assert "only a client with the role admin may start" in dxlrun("fleet", lab, "--start", "joint").err
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "stranger"))
+    authority.issue("stranger", Role.ADMIN, 30, keys_place())
+    assert "certificate verify failed" in dxlrun("fleet", lab, "--start", "joint").err
+    assert not list(lab.parent.glob("*.out"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "sentence"),
+    [
+        ("robots: {arm: lab3}", (), "lab.yaml:1:15: robots.arm: 'lab3' is no address"),
+        ("robots: {arm: lab3:7}\nagent: {}", (), "lab.yaml:2:1"),
+        (
+            "robots: {}\nagents: {a: {address: h:1, starts: {arm: servo /dev/ttyUSB0 1}}}",
+            (),
+            "begins with no robot file",
+        ),
+        ("robots: {arm: lab3:7}", ("--start", "arm"), "no agent of the file starts arm"),
+        ("robots: {arm: lab3:7}", ("--stop", "amr"), "did you mean arm?"),
+        ("robots: {arm: lab3:7}", ("--serve", "lab3"), "the file has no agent lab3; it has none"),
+        (
+            "robots: {}\nagents: {a: {address: h:1, starts: {arm: arm.yaml}}}",
+            ("--serve", "a"),
+            "there is no ",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_one_sentence(
+    lab: Path, dxlrun: Dxlrun, text: str, words: tuple[str, ...], sentence: str
+) -> None:
+    lab.write_text(text)
+    said = dxlrun("fleet", lab, *words)
+    assert (said.code, len(said.errors)) == (1 if "--start" in words else 2, 1), said
+    assert sentence in said.errors[0]
+
+
+def test_the_live_table_ends_with_q(lab: Path) -> None:
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [DXLRUN, "fleet", lab], stdin=theirs, stdout=theirs, env=os.environ | TERMINAL
+    ) as view:
+        os.close(theirs)
+        shown = b""
+        while b"unreachable since" not in shown:
+            shown += os.read(ours, 4096)
+        os.write(ours, b"q")
+        assert view.wait(10) == 0
+    os.close(ours)
+
+
+def test_fleet_md_has_a_file_that_is_read_and_lines_that_can_be_typed(tmp_path: Path) -> None:
+    page = page_text("fleet.md")
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "lab.yaml").write_text(text)
+    fleet = read_fleet(tmp_path / "lab.yaml")
+    lines = [shlex.split(line)[1:] for line in re.findall(r"^    (dxlrun fleet .*)$", page, re.MULTILINE)]
+    assert len(lines) >= 4
+    for line in lines:
+        _, bound, _ = app.build("fleet").parse_args(line, print_error=False, exit_on_error=False)
+        assert bound.arguments["file"] == Path("lab.yaml")
+        fleet.require((*bound.arguments.get("start", ()), *bound.arguments.get("stop", ())))
+        assert bound.arguments.get("serve") in (None, *fleet.agents)
+    for agent in fleet.agents.values():
+        assert set(agent.starts) <= set(fleet.robots)
+        assert [(words[1], words[-2]) for words in agent.starts.values()] == [
+            ("port:=/dev/ttyUSB0", "--listen")
+        ]
+    with pytest.raises(InputError, match="no agent"):
+        fleet.agent_of("bioloid_torso_2")
