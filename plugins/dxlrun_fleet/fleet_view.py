@@ -29,8 +29,8 @@ class Seen(msgspec.Struct, frozen=True):
     """One robot, as it replied last."""
 
     robot: str
-    state: str = "unreachable"
-    """running, paused, starting, unreachable"""
+    state: str = "connecting"
+    """connecting, starting, running, paused, unreachable"""
     since: str = ""
     """Wall time of the last reply, or of the first try, of a robot that is unreachable."""
     reason: str = ""

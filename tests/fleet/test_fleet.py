@@ -34,7 +34,7 @@ from dxlrun.remote.requests.table import Role
 from dxlrun.remote.sockets import Address
 from dxlrun_fleet.agent import START, Starter
 from dxlrun_fleet.fleet_file import Agent, read_fleet
-from dxlrun_fleet.fleet_view import RobotView
+from dxlrun_fleet.fleet_view import SILENT_S, RobotView
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
@@ -101,7 +101,9 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     row = until(lambda: (seen := views["joint"].seen()).voltage and seen, "a row")
     assert (row.state, row.voltage, row.hottest, row.reason, row.error) == ("running", 12.0, "joint", "", "")
     assert (lab.parent / str(row.log)).exists()
-    (one, other) = json.loads(dxlrun("fleet", lab, "--json").out)
+    said = dxlrun("fleet", lab, "--json")
+    assert said.code == 1
+    (one, other) = json.loads(said.out)
     assert (one["state"], other["state"], other["reason"]) == ("running", "unreachable", "it does not answer")
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d\d:\d\d", other["since"])
 
@@ -142,6 +144,8 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
         view.tried.wait()
         view.close()
         view._replied = time.monotonic() + 3600.0
+        assert view.seen().state == "unreachable"
+        assert view.seen().reason == "joint no longer answers: [Errno 111] Connection refused"
         for last in (0, 2):
             assert view._look(Begins(), last) == 2
             assert (view.seen().state, view.seen().error, view.seen().voltage) == (
@@ -149,6 +153,8 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
                 "a motor fell off",
                 None,
             )
+        view._replied = time.monotonic() - 1.01 * SILENT_S
+        assert (view.seen().state, view.seen().reason) == ("unreachable", "it does not answer")
 
 
 def process_of(parent: int, words: str) -> int:
@@ -188,6 +194,7 @@ def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import signal; signal.pause()")
     assert first.answer("POST", START + "arm", Role.ADMIN)[0] == 200
+    assert out.read_text() == ""
     for starter in (first, second):
         assert starter.answer("GET", START + "arm", Role.ADMIN) == (200, "it runs")
         assert starter.answer("POST", START + "arm", Role.ADMIN) == (409, "it runs already")

@@ -160,8 +160,31 @@ def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
     assert rows(dxlrun, url)[0][1]["unreadable"] == stores.DAMAGED
     (there / "parts.run.json").unlink()
     assert rows(dxlrun, url)[0][2]["unreadable"] == stores.UNFINISHED
+    os.utime(logs / "one.mcap", (4e9, 4e9))  # before the clock was set back
     again = told(dxlrun, logs, url, code=1)
     assert again == {"uploaded": ["one.mcap", "parts"], "others": ["may/second.mcap"]}
+    row = there / "one.mcap.run.json"
+    row.write_text(row.read_text().replace('"began":null', '"began":"2026-11-24T09:00:00"'))
+    assert "one.mcap" in told(dxlrun, logs, url, code=1)["others"]
+    row.write_text(row.read_text().replace('"2026-', '"2025-'))  # of the same size
+    assert rows(dxlrun, url)[0][1]["began"] == "2025-11-24T09:00:00"
+
+
+def test_a_log_that_grows_while_it_is_copied_has_no_row(
+    logs: Path, there: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, url = type(fsspec.filesystem("file")), f"file://{there}"
+    true = files.put_file
+
+    def put_file(self: object, path: str, to: str) -> None:
+        with Path(path).open("ab") as log:
+            log.write(b"more")
+        true(self, path, to)
+
+    monkeypatch.setattr(files, "put_file", put_file)
+    assert told(dxlrun, logs, url) == {"written": NAMES}
+    monkeypatch.undo()
+    assert list(there.rglob("*.json")) == []
 
 
 @pytest.mark.parametrize(
