@@ -5,6 +5,8 @@ A statement only reads: one SELECT, no file but the table, no extension, no sett
 
 from __future__ import annotations
 
+import atexit
+import gc
 import re
 from collections.abc import Sequence
 from decimal import Decimal
@@ -15,6 +17,7 @@ import pyarrow as pa
 
 from dxlrun.errors import InputError
 
+atexit.register(gc.unfreeze)  # at its end DuckDB prints what of it is not collected, and the cli freezes all
 TABLE = "logs"
 Value = object
 

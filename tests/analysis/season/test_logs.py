@@ -7,6 +7,8 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
@@ -223,6 +225,13 @@ def test_the_table_for_people(known: Path, dxlrun: Dxlrun) -> None:
     assert "this is no MCAP file" in " ".join(said.out.split())
     assert said.out.rstrip().endswith("5 of 5 logs")
     assert dxlrun("logs", known, "--where", "lost > 5").out.strip() == "0 of 5 logs"
+
+
+def test_a_program_of_its_own_prints_nothing_at_its_end(known: Path) -> None:
+    """DuckDB would print there what of it is not collected."""
+    words = [Path(sys.executable).with_name("dxlrun"), "logs", known / "may", "--where", "lost > 5"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("0 of 4 logs", "")
 
 
 @pytest.mark.parametrize(
