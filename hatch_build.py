@@ -70,14 +70,20 @@ def system_compiler(root: Path) -> list[str]:
     return compiler if works else []
 
 
-def get_requires_for_build_wheel(config_settings: dict[str, Any] | None = None) -> list[str]:
-    """Return what a build needs: a compiler, too, where there is none."""
-    needed = hatchling.build.get_requires_for_build_wheel(config_settings)
+def compiler_needed() -> list[str]:
+    """Return the compiler that a build needs where none works."""
     missing = sys.platform.startswith("linux") and not system_compiler(Path.cwd())
-    return [*needed, "ziglang"] if missing else needed
+    return ["ziglang"] if missing else []
 
 
-get_requires_for_build_editable = get_requires_for_build_wheel
+def get_requires_for_build_wheel(config_settings: dict[str, Any] | None = None) -> list[str]:
+    """Return what a wheel needs to be built."""
+    return [*hatchling.build.get_requires_for_build_wheel(config_settings), *compiler_needed()]
+
+
+def get_requires_for_build_editable(config_settings: dict[str, Any] | None = None) -> list[str]:
+    """Return what an editable install needs, which is more than a wheel does."""
+    return [*hatchling.build.get_requires_for_build_editable(config_settings), *compiler_needed()]
 
 
 class KernelHook(BuildHookInterface[Any]):
