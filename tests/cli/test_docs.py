@@ -352,7 +352,7 @@ def test_architecture_md_names_what_the_code_has() -> None:
     code = "\n".join(path.read_text() for path in SOURCES if path.relative_to(ROOT).parts[0] != "tests")
     names = re.findall(r"`([A-Za-z_]\w+(?:\.[a-z_]\w+)?)(?:\(\))?`", PAGES["architecture.md"])
     names = [name for name in names if not name.endswith((".py", ".so", ".toml"))]
-    assert {"Program", "commands"} <= set(names)
+    assert {"Plan", "commands"} <= set(names)
     for name in names:
         for word in name.split("."):
             assert re.search(rf"\b{word}\b", code), name
