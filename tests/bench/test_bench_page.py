@@ -44,8 +44,8 @@ def test_the_search_for_a_rate_is_understood_as_the_page_has_it(capsys: pytest.C
     (line,) = re.findall(r"^    dxlrun (bench .+)$", PAGE, re.MULTILINE)
     words = [str(ROOT / word) if word.startswith("robots/") else word for word in shlex.split(line)]
     # refused for this alone, so everything before it was understood
-    assert main([*words, "--seconds", "-1"]) == 2
-    assert capsys.readouterr().err.startswith("dxlrun: --seconds -1: give from")
+    assert main([*words, "--duration", "-1"]) == 2
+    assert capsys.readouterr().err.startswith("dxlrun: --duration -1: give from")
 
 
 @pytest.mark.parametrize("line", EXCHANGES)

@@ -77,7 +77,7 @@ def started(monkeypatch):
     found = []
     ready = [Gateway(Listening("/nowhere/robot.sock"))]
 
-    def start(log, memory, epoch_offset_ns):
+    def start(log, memory, epoch_offset_ns, listen):
         if isinstance(ready[0], OSError):
             raise ready[0]
         found.append(ready[0])
