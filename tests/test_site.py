@@ -64,7 +64,9 @@ def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
         set(re.findall(r"^### `(\w+)`", names, re.MULTILINE))
         == {*dxlrun.__all__, "simulated_robot"} - units - values
     )
-    assert "#### `send`" in names
+    client = names.partition("### `RemoteRobot`")[2].partition("\n### ")[0]
+    methods = {one for one in dir(dxlrun.RemoteRobot) if not one.startswith("_")} - {"name"}
+    assert methods == set(re.findall(r"^#### `(\w+)`", client, re.MULTILINE))
     verbs = (sources / "reference/commands.md").read_text()
     sections = dict(re.findall(r"^### ([a-z -]+)\n(.*?)(?=^### |\Z)", verbs, re.MULTILINE | re.DOTALL))
     assert {name.split()[0] for name in sections} == set(names_of_verbs())

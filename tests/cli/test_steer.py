@@ -129,7 +129,11 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
     assert (said.code, said.err) == (0, "")
     assert said.out.startswith("bioloid_torso: 50 Hz, ")
     (shown,) = re.findall(r"    dxlrun list\n\n```\n(.*?)```", PAGE, re.DOTALL)
-    assert said.out.split("\n", 1)[1].split() == shown.split("\n", 1)[1].split()
+    printed = " ".join(said.out.partition("\n")[2].split())
+    for piece in shown.partition("\n")[2].removesuffix("...\n").split("\n...\n"):  # the page leaves rows out
+        assert piece.split()
+        before, found, printed = printed.partition(" ".join(piece.split()))
+        assert found, before
 
 
 def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) -> None:
@@ -549,9 +553,3 @@ def test_the_commands_of_the_page_work_in_their_order(
     assert running() == ()
     assert stage.ended() == 0
     assert "bioloid_torso: " in stage.said
-
-
-def test_the_page_has_every_method_of_the_client() -> None:
-    rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `"))
-    methods = {name for name in dir(RemoteRobot) if not name.startswith("_")} - {"close", "name"}
-    assert methods <= set(re.findall(r"`(\w+)\(", rows))
