@@ -1,0 +1,139 @@
+"""Build hook: generates and compiles the ROS 2 message packages that have no wheels, from interfaces/."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sysconfig
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+USED = re.compile(
+    r"__rosidl_(generator_c|generator_py|typesupport_c|typesupport_fastrtps_c)|librosidl|librcutils|fastcdr"
+)
+"""Libraries of other packages. Only the serialization of rmw_fastrtps and rmw_zenoh is built."""
+NEEDED = "the compilers gcc and g++ and Python's headers (sudo apt install build-essential python3-dev)"
+
+
+class Interfaces(BuildHookInterface[Any]):
+    """Adds a Python package for each directory of interfaces/, and what ROS's own tools find it by."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Generate and compile what is older than its definitions."""
+        if self.target_name != "wheel":
+            return
+        root = Path(self.root)
+        made = root / "build"
+        build_data.update(infer_tag=True, pure_python=False)
+        included = build_data["force_include_editable" if version == "editable" else "force_include"]
+        for source in sorted((root / "interfaces").iterdir()):
+            package, share = made / "packages" / source.name, made / "share"
+            newest = max(path.stat().st_mtime for path in (*source.glob("*/*"), Path(__file__)))
+            library = (
+                package / f"{source.name}_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
+            )
+            if not library.exists() or library.stat().st_mtime < newest:
+                shutil.rmtree(package, ignore_errors=True)
+                make(source, made / "sources" / source.name, package, library)
+                _describe(source, share)
+            included[str(package)] = source.name
+        build_data["shared_data"][str(made / "share")] = "share"
+
+
+def make(source: Path, place: Path, package: Path, library: Path) -> None:
+    """Generate the sources of a message package in `place`, compile them, and leave its modules in `package`.
+
+    One library has all that is written in C: the messages, how they are serialized, how they become objects
+    of Python. Those of the packages that it uses are linked.
+    """
+    import rosidl_cli
+    from rosidl_cli.command.hash.api import generate_type_hashes
+    from rosidl_cli.command.translate.api import translate
+    from rosidl_generator_c.cli import GenerateC
+    from rosidl_generator_py.cli import GeneratePython
+    from rosidl_typesupport_c.cli import GenerateCTypesupport
+    from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
+
+    prefix = Path(rosidl_cli.__file__).parents[4]
+    os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # where the generators look for their templates
+    shutil.rmtree(place, ignore_errors=True)
+    name, out, includes = source.name, place / source.name, [str(prefix / "share")]
+    files = [f"{source}:{path.relative_to(source)}" for path in sorted(source.glob("*/*"))]
+    form = {"package_name": name, "include_paths": includes}
+    written = [
+        *map(Path, translate(interface_files=files, output_format="idl", output_path=place / "idl", **form))
+    ]
+    idl = [str(path) for path in written]
+    hashes = [*map(Path, generate_type_hashes(interface_files=idl, output_path=out, **form))]
+    for folder in {path.parent.name for path in written}:  # types of two folders may have the same name
+        own = [[str(path) for path in found if path.parent.name == folder] for found in (written, hashes)]
+        GenerateC("c").generate(name, own[0], includes, out, own[1])
+    GeneratePython("py", typesupport_implementations=["rosidl_typesupport_c"]).generate(
+        name, idl, includes, out
+    )
+    GenerateFastRTPSCTypesupport("fastrtps_c").generate(name, idl, includes, out)
+    only = ["rosidl_typesupport_fastrtps_c"]
+    GenerateCTypesupport("c", typesupport_implementations=only).generate(name, idl, includes, out)
+    _compile(source.name, place, prefix, library)
+    shutil.copytree(
+        out,
+        package,
+        dirs_exist_ok=True,
+        ignore=lambda folder, names: [
+            name
+            for name in names
+            if not name.endswith(".py") and not (Path(folder) / name / "__init__.py").exists()
+        ],
+    )
+
+
+def _compile(name: str, place: Path, prefix: Path, library: Path) -> None:
+    """Compile and link all sources of a package."""
+    include = sysconfig.get_paths()["include"]
+    if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
+        raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")
+    import numpy as np
+
+    headers = prefix / "include"
+    folders = [place, Path(include), Path(np.get_include()), headers, *headers.iterdir()]
+    flags = ["-O1", "-fPIC", "-w", f'-DROS_PACKAGE_NAME="{name}"', *(f"-I{folder}" for folder in folders)]
+    whole = place / "whole.cpp"  # a fourth of the time of one by one: each reads the same long headers
+    whole.write_text("".join(f'#include "{path}"\n' for path in sorted(place.rglob("*.cpp"))))
+
+    def compiled(source: Path) -> str:
+        result = f"{source}.o"
+        _run("g++" if source is whole else "gcc", *flags, "-c", str(source), "-o", result)
+        return result
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        objects = [*pool.map(compiled, (whole, *sorted(place.rglob("*.c"))))]
+    used = [path.name for path in sorted((prefix / "lib").glob("lib*.so")) if USED.search(path.name)]
+    library.parent.mkdir(parents=True, exist_ok=True)
+    linked = ["-Wl,--as-needed", f"-L{prefix / 'lib'}", *(f"-l:{one}" for one in used)]
+    _run("g++", "-shared", "-s", "-o", str(library), *objects, *linked)
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}\n{done.stderr}")
+
+
+def _describe(source: Path, share: Path) -> None:
+    """Leave the definitions, and the index by which tools such as `ros2 interface` find them."""
+    names = [f"{path.parent.name}/{path.name}" for path in sorted(source.glob("*/*"))]
+    for name in names:
+        copy = share / source.name / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source / name, copy)
+    for kind, text in (("packages", ""), ("rosidl_interfaces", "\n".join(names))):
+        index = share / "ament_index/resource_index" / kind / source.name
+        index.parent.mkdir(parents=True, exist_ok=True)
+        index.write_text(text)

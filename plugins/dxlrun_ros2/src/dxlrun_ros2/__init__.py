@@ -1,0 +1,1 @@
+"""A running dxlrun robot in ROS 2, under the names of ros2_control."""

@@ -1,0 +1,69 @@
+"""`dxlrun-ros2`: a running robot in ROS 2."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+
+from rclpy.utilities import remove_ros_args
+
+from dxlrun import DxlrunError, RemoteRobot, connect, running
+from dxlrun_ros2.bridge import Bridge
+from dxlrun_ros2.published_run import CLIENT
+
+NICENESS = 10
+"""As the gateway's: ROS gets the processor time that the robot leaves."""
+RETRY_S = 0.2
+
+
+def main() -> int:
+    """Bridge one run of the robot after the other, until Ctrl-C or SIGTERM."""
+    parser = argparse.ArgumentParser(
+        "dxlrun-ros2", description="A running robot in ROS 2, under the names of ros2_control."
+    )
+    parser.add_argument(
+        "robot", nargs="?", help="its name, where several run; NAME@HOST:PORT of another computer"
+    )
+    parser.add_argument(
+        "--lease",
+        type=float,
+        default=0.5,
+        help="s; a publisher that is silent for longer lets its joints be held",
+    )
+    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
+    if not 0.01 <= arguments.lease <= 60:
+        parser.error(f"--lease {arguments.lease:g}: give 0.01 to 60 s")
+    if arguments.robot is None and len(found := running()) > 1:
+        parser.error(f"several robots run: {', '.join(found)}; name one")
+    with suppress(OSError):
+        os.nice(NICENESS)
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    name: str | None = arguments.robot
+    said = ""
+    while not stopped.is_set():
+        try:
+            with connect(name, CLIENT) as robot:
+                name, said = robot.name, ""
+                _bridge(robot, arguments.lease, stopped)
+        except DxlrunError as error:
+            if str(error) != said:
+                said = str(error)
+                print(f"{said}; waiting", file=sys.stderr, flush=True)
+            stopped.wait(RETRY_S)
+    return 0
+
+
+def _bridge(robot: RemoteRobot, lease: float, stopped: threading.Event) -> None:
+    """Bridge one run of a robot. Raises DxlrunError."""
+    bridge = Bridge(robot, lease)
+    try:
+        print(f"{robot.name} is in ROS 2; Ctrl-C ends this, not the robot.", flush=True)
+        bridge.spin(stopped)
+    finally:
+        bridge.close()

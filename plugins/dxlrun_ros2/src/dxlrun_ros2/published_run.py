@@ -1,0 +1,115 @@
+"""Published run: the messages of a running robot as topics of ROS 2, their bytes as the log has them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from importlib import import_module
+
+import msgspec
+import numpy as np
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_rosout_default
+
+from dxlrun import DxlrunError, RemoteRobot, TopicMessage, connect
+from dxlrun.channels.events import Event
+from dxlrun.log import schemas
+from dxlrun.log.run_messages import RunMessages
+from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.messages.definition import MessageType
+
+CLIENT = "dxlrun-ros2"
+STATE = QoSProfile(depth=1)
+"""As broadcasters of ros2_control have it: reliable, the newest message, nothing for late subscribers."""
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+QUALITIES = {
+    schemas.FRAMES_TOPIC: QoSProfile(depth=100),
+    schemas.ROSOUT_TOPIC: qos_profile_rosout_default,
+}
+GLOBAL = {schemas.FRAMES_TOPIC, schemas.STILL_FRAMES_TOPIC, schemas.ROSOUT_TOPIC, schemas.DIAGNOSTICS_TOPIC}
+"""Topics that ROS 2 has once, whatever the namespace."""
+_OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
+"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
+
+
+class PublishedRun(RunMessages):
+    """Publishes one run until it ends: all that the log has, where this environment has its type."""
+
+    def __init__(self, node: Node, robot: RemoteRobot) -> None:
+        """Open the topics that every run has. Raises DxlrunError."""
+        super().__init__(robot.log_header())
+        self.robot, self._node = robot.name, node
+        self.ended = threading.Event()
+        self.why = ""
+        self.seen: set[Callable[[np.void], None]] = set()
+        """Called with the record of each cycle."""
+        self._publishers_of: list[Publisher | None] = []
+        self._opened: dict[tuple[str, MessageType], int] = {}
+        self._heard: set[str] = set()
+        self._lock = threading.Lock()
+        self._open_channels()
+
+    def _channel(self, topic: str, message: MessageType, *, latched: bool = False) -> int:
+        quality = LATCHED if latched else QUALITIES.get(topic, STATE)
+        name = topic if topic in GLOBAL else topic.removeprefix("/")
+        kind = message_class(message.name)
+        opened = None if kind is None else self._node.create_publisher(kind, name, quality)
+        self._publishers_of.append(opened)
+        self._opened[topic, message] = len(self._publishers_of) - 1
+        return len(self._publishers_of) - 1
+
+    def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
+        if (publisher := self._publishers_of[channel]) is not None:
+            publisher.publish(data)
+
+    def hear(self, robot: RemoteRobot) -> None:
+        """Begin to listen to the topics that were opened since. Raises DxlrunError."""
+        found = {one.name for one in robot.topics() if one.type != _OF_EACH_CYCLE}
+        if new := found - self._heard - {schemas.JOINT_STATES_TOPIC}:
+            self._heard |= new
+            threading.Thread(target=self._listen, args=(new,), daemon=True).start()
+
+    def _listen(self, topics: set[str]) -> None:
+        """Publish the messages of topics until the run ends."""
+        try:
+            with connect(self.robot, CLIENT) as robot:
+                for message in robot.listen(*topics):
+                    with self._lock:
+                        self._take(message)
+            self.why = f"the run of {self.robot} has ended"
+        except DxlrunError as error:
+            self.why = str(error)
+        except Exception as error:  # the last resort: without it the topics would fall silent
+            if not self.ended.is_set():
+                self.why = f"{type(error).__name__}: {error}"
+        self.ended.set()
+
+    def _take(self, message: TopicMessage) -> None:
+        if message.topic == schemas.CYCLE_TOPIC:
+            data = message.data[len(ENCAPSULATION) :]
+            self.cycle(data)
+            if self.seen:
+                record = np.frombuffer(data, dtype=self._layout.dtype)[0]
+                for see in tuple(self.seen):
+                    see(record)
+        elif message.topic == schemas.EVENT_TOPIC:
+            fields = message.message
+            numbers = [fields[name] for name in ("t_ns", "code", "severity")]
+            t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
+            source, sentence, more = (str(fields[name]) for name in ("source", "text", "data"))
+            self.event(Event(t_ns, code, severity, source, sentence, more.encode()))
+        else:
+            key = message.topic, MessageType(message.type, message.definition)
+            channel = self._opened.get(key)
+            self._add(self._channel(*key) if channel is None else channel, message.time_ns, message.data)
+
+
+def message_class(name: str) -> type | None:
+    """Return the class of a message, `nav_msgs/msg/Odometry`; None where this environment has none."""
+    package, folder, kind = name.split("/")
+    try:
+        found = getattr(import_module(f"{package}.{folder}"), kind, None)
+    except ImportError:
+        return None
+    return found if isinstance(found, type) else None
