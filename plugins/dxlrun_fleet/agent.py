@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-import gc
 import os
 import subprocess
 import sys
@@ -22,7 +21,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
-from dxlrun.remote.network.handshakes import Handshakes, Secured
+from dxlrun.remote.network.listener import Listener
 from dxlrun.remote.requests.table import Role
 from dxlrun.remote.server import Connection
 from dxlrun_fleet.fleet_file import Agent
@@ -30,7 +29,6 @@ from dxlrun_fleet.fleet_file import Agent
 START = "/robots/"
 """Before the name of a robot: POST starts it, GET asks whether it runs; 200: it does."""
 _MOST_TOLD = 4096
-_MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
@@ -81,7 +79,6 @@ class Starter:
 
 async def serve(agent: Agent, directory: Path) -> None:
     """Serve until the process ends. Raises InputError for certificates that are refused, and OSError."""
-    gc.set_threshold(700, 10, 10)  # the command line's is higher; a TLS connection leaves 256 kB in a circle
     config = uvicorn.Config(
         Starter(agent, directory),
         http=Connection,
@@ -95,5 +92,6 @@ async def serve(agent: Agent, directory: Path) -> None:
         h11_max_incomplete_event_size=16384,
     )
     config.load()
-    Handshakes(Secured.at(agent.address), partial(Connection, config, ServerState(), {})).begin()
+    listener = Listener.secured(agent.address)
+    await listener.serve(partial(Connection, config, ServerState(), {"listener": listener}))
     await asyncio.Event().wait()

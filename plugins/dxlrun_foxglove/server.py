@@ -1,7 +1,7 @@
 """Server of live viewers, with a guard at its door.
 
 A viewer shows the token of the address; where it says which web page it belongs to (Origin, as every browser
-does), that page is one that was named. All that has no token yet has five seconds, and there is room for few.
+does), that page is one that was named. What has no token yet has five seconds, and room for few.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import logging
 import secrets
 import ssl
 import traceback
-from asyncio import BaseTransport
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from typing import Any, ClassVar
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -26,14 +25,13 @@ from websockets.http11 import Request, Response
 from websockets.typing import Origin, Subprotocol
 
 from dxlrun import DxlrunError, InputError
+from dxlrun.remote.network.listener import Listener
 from dxlrun_foxglove import protocol
 from dxlrun_foxglove.protocol import ERROR, Call, Subscription, Words, status, text
 from dxlrun_foxglove.viewed_run import ENCODING, HALT, ViewedRun, advertised, advertised_services
 from dxlrun_foxglove.viewer import MOST_REQUESTS, Channel, Viewer
 
 MOST_VIEWERS = 8
-MOST_HALF_OPEN = 64
-"""Connections without a token yet; of more the oldest is closed."""
 OPENING_S = 5.0
 PING_S = 10.0
 """Between two pings; a viewer that answers none for twice as long is gone."""
@@ -61,15 +59,14 @@ class FoxgloveServer:
         """Listen. Raises OSError."""
         workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)  # none waits for another's
         asyncio.get_running_loop().set_default_executor(workers)
+        self._listener = Listener(host, port)
         more: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": OPENING_S} if tls else {}
         return await serve(
             self._served,
-            host,
-            port,
+            sock=self._listener,
             origins=self._origins,
             subprotocols=[Subprotocol(one) for one in protocol.SUBPROTOCOLS],
             process_request=self._let_in,
-            create_connection=Visitor,
             compression=None,
             server_header=None,
             open_timeout=OPENING_S,
@@ -96,7 +93,7 @@ class FoxgloveServer:
 
     async def _served(self, connection: ServerConnection) -> None:
         """Serve a viewer until it leaves, or the run ends."""
-        Visitor.half_open.pop(connection, None)
+        self._listener.admit(connection.remote_address)
         viewer = Viewer(connection)
         self._viewers.add(viewer)
         sending = asyncio.create_task(viewer.send())
@@ -237,23 +234,3 @@ def _subscribe(viewer: Viewer, one: Subscription, channel: Channel | None) -> No
     known[one.channel_id] = one.id
     if channel.latched and channel.newest is not None:
         viewer.show(channel, *channel.newest)
-
-
-class Visitor(ServerConnection):
-    """A connection; one that shows no token soon makes room for others."""
-
-    half_open: ClassVar[dict[ServerConnection, None]] = {}
-
-    def connection_made(self, transport: BaseTransport) -> None:
-        """Make room among those without a token."""
-        if len(self.half_open) >= MOST_HALF_OPEN:
-            oldest = next(iter(self.half_open))
-            del self.half_open[oldest]
-            oldest.transport.abort()
-        self.half_open[self] = None
-        super().connection_made(transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Leave the room."""
-        self.half_open.pop(self, None)
-        super().connection_lost(exc)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import ssl
 import subprocess
@@ -15,8 +16,8 @@ from tests.foxglove.served import PAGE, Served
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
 from dxlrun import InputError
+from dxlrun.remote.network.listener import MOST_UNPROVED
 from dxlrun_foxglove.command import tls_of
-from dxlrun_foxglove.server import MOST_HALF_OPEN, Visitor
 
 
 def refused(url: str, origin: str | None = None, subprotocol: str = "foxglove.websocket.v1") -> int:
@@ -58,32 +59,46 @@ def test_another_protocol_is_refused(serve: Callable[..., Served]) -> None:
     assert refused(serve().url, subprotocol="chat") == 400
 
 
-def test_half_open_connections_make_room_for_a_viewer(serve: Callable[..., Served]) -> None:
-    served = serve()
+@pytest.mark.parametrize("with_tls", [False, True])
+def test_half_open_connections_make_room_for_a_viewer(
+    serve: Callable[..., Served], certificate: tuple[Path, Path], with_tls: bool
+) -> None:
+    served = serve(tls=tls_of(*certificate) if with_tls else None)
+    known = ssl.create_default_context(cafile=certificate[0]) if with_tls else None
+    before = len(os.listdir("/proc/self/fd"))
     with ExitStack() as opened:
         many = [
             opened.enter_context(socket.create_connection(("127.0.0.1", served.port)))
-            for _ in range(MOST_HALF_OPEN + 20)
+            for _ in range(2 * MOST_UNPROVED)
         ]
         for one in many[::2]:
-            one.sendall(b"GET / HTTP/1.1\r\n")
-        with ForeignViewer(served.url) as viewer, pytest.raises(ConnectionClosed):
+            with suppress(ConnectionError):  # ended already
+                one.sendall(b"\x16\x03" if with_tls else b"GET / HTTP/1.1\r\n")
+        with ForeignViewer(served.url, tls=known) as viewer, pytest.raises(ConnectionClosed):
             viewer.take()
-        assert len(Visitor.half_open) <= MOST_HALF_OPEN
+        assert len(os.listdir("/proc/self/fd")) < before + len(many) + MOST_UNPROVED + 10
         many[0].settimeout(30)
         with suppress(ConnectionResetError):  # closed either way
             assert many[0].recv(1) == b""
 
 
-def test_with_a_certificate_there_is_nothing_without_tls(
-    serve: Callable[..., Served], tmp_path: Path
-) -> None:
-    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Certificate and key of 127.0.0.1."""
+    place = tmp_path_factory.mktemp("tls")
+    cert, key = place / "cert.pem", place / "key.pem"
     words = (
         "openssl req -x509 -nodes -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -days 1 -subj /CN=robot"
     )
     made = [*words.split(), "-addext", "subjectAltName=IP:127.0.0.1", "-out", cert, "-keyout", key]
     subprocess.run(made, check=True, capture_output=True)
+    return cert, key
+
+
+def test_with_a_certificate_there_is_nothing_without_tls(
+    serve: Callable[..., Served], certificate: tuple[Path, Path]
+) -> None:
+    cert, key = certificate
     served = serve(tls=tls_of(cert, key))
     known = ssl.create_default_context(cafile=cert)
     with ForeignViewer(served.url, tls=known) as viewer, pytest.raises(ConnectionClosed):

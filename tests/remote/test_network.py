@@ -18,7 +18,7 @@ from dxlrun.errors import DxlrunError, InputError
 from dxlrun.remote.client import RemoteRobot, connect
 from dxlrun.remote.network.certificates import client_context, keys_place, server_context
 from dxlrun.remote.network.commander import LEASE_S
-from dxlrun.remote.network.handshakes import MOST_HANDSHAKES, Secured
+from dxlrun.remote.network.listener import MOST_UNPROVED, Listener
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests.table import REQUESTS, Role
 from dxlrun.remote.sockets import Address, address_of
@@ -57,10 +57,8 @@ class NetDoor(Door):
         super().__init__(desk, path)
         self.made, self.patch = made, monkeypatch
         self.be("")
-        listener = socket.create_server(("127.0.0.1", 0), backlog=256)
-        listener.setblocking(False)
-        self.address = Address("pair", *listener.getsockname())
-        self.network = Secured(listener, server_context("pair"))
+        self.network = Listener("127.0.0.1", 0, server_context("pair"))
+        self.address = Address("pair", *self.network.getsockname())
 
     def be(self, name):
         """Have the settings of a client from now on."""
@@ -82,7 +80,7 @@ class NetDoor(Door):
 def net(desk, tmp_path, made, monkeypatch):
     found = NetDoor(desk, tmp_path / "s.sock", made, monkeypatch)
     yield found
-    found.network[0].close()
+    found.network.close()
 
 
 def asked(context, address):
@@ -248,7 +246,7 @@ def test_half_open_connections_keep_no_client_out_and_are_closed(net):
         return left
 
     before = len(os.listdir("/proc/self/fd"))
-    assert net.while_served(act) < before + MOST_HANDSHAKES + 30
+    assert net.while_served(act) < before + MOST_UNPROVED + 30
     assert {command.kind for command in net.desk.taken} == {"stop"}
     assert len(net.desk.taken) == HALF_OPEN // 50
 

@@ -120,7 +120,7 @@ def run(
 
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
     """Raise InputError where clients of other computers could not be served."""
-    from dxlrun.remote.network.handshakes import Secured
+    from dxlrun.remote.network.listener import Listener
     from dxlrun.remote.sockets import address_of
 
     address = address_of(text, plan.robot)
@@ -129,7 +129,7 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
             "--listen needs the gateway of a run in real time: leave out --no-gateway, --virtual"
         )
     try:
-        Secured.at(address).listener.close()
+        Listener.secured(address).close()
     except OSError as error:
         raise InputError(f"nothing can listen at {address.host}:{address.port}: {error}") from error
 

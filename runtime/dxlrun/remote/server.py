@@ -38,7 +38,7 @@ from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.network.certificates import Certificate, counts
 from dxlrun.remote.network.commander import Client
-from dxlrun.remote.network.handshakes import Handshakes, Secured
+from dxlrun.remote.network.listener import Listener
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.table import Role
 from dxlrun.remote.sockets import address_of, listen
@@ -69,7 +69,7 @@ def main() -> None:
         plugins = load_plugins(files=plan.included)
         preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
-        network = Secured.at(address_of(job.listen, plan.robot)) if job.listen else None
+        network = Listener.secured(address_of(job.listen, plan.robot)) if job.listen else None
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))
@@ -93,7 +93,7 @@ async def serve(
     gateway: GatewayApp,
     listener: socket.socket,
     control: socket.socket,
-    network: Secured | None = None,
+    network: Listener | None = None,
 ) -> None:
     """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
     config = uvicorn.Config(
@@ -114,7 +114,7 @@ async def serve(
     server = _Server(config)
     config.load()
     if network is not None:
-        Handshakes(network, partial(Connection, config, server.server_state, {})).begin()
+        await network.serve(partial(Connection, config, server.server_state, {"listener": network}))
 
     def end(*_: object) -> None:
         server.should_exit = True
@@ -151,6 +151,8 @@ class Connection(H11Protocol):
     ) -> None:
         """Begin, unless the client is another user's; close another connection when there are too many."""
         super().connection_made(transport)
+        if listener := self.app_state.get("listener"):
+            listener.admit(transport.get_extra_info("peername"))
         self.last_byte_s = self.loop.time()
         self._timer = self.loop.call_later(SILENCE_S, self._check)
         self._certificate = _certificate(transport)

@@ -1,0 +1,72 @@
+"""Listener: a TCP port on which half-open connections cost neither memory nor files.
+
+Whatever connects is unproved until the server admits it: its certificate was checked, it has shown a token.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import socket
+import ssl
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+
+from dxlrun.remote.network.certificates import server_context
+from dxlrun.remote.sockets import Address
+
+MOST_UNPROVED = 64
+"""Connections at once; one more ends the oldest of the computer that has most."""
+HANDSHAKE_S = 5.0
+
+
+class Listener(socket.socket):
+    """A listening TCP socket, of which a server of asyncio accepts connections."""
+
+    def __init__(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> None:
+        """Raises OSError."""
+        super().__init__(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        self.tls = tls
+        self._unproved: dict[tuple[str, int], socket.socket] = {}
+        self._accepted = 0
+        try:
+            self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.bind((host, port))
+            self.listen(MOST_UNPROVED)
+        except BaseException:
+            self.close()
+            raise
+        self.setblocking(False)
+        gc.freeze()  # so that a collection takes 0.1 ms
+
+    @classmethod
+    def secured(cls, address: Address) -> Listener:
+        """Return where clients connect by mutual TLS; raises InputError and OSError."""
+        return cls(address.host, address.port, server_context(address.name))
+
+    async def serve(self, make: Callable[[], asyncio.Protocol]) -> None:
+        """Make a protocol for each connection from now on, with TLS once its certificate was checked."""
+        await asyncio.get_running_loop().create_server(
+            make, sock=self, ssl=self.tls, ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=HANDSHAKE_S
+        )
+
+    def accept(self) -> tuple[socket.socket, tuple[str, int]]:
+        """Take a connection, and end another one where there are too many."""
+        end, peer = super().accept()
+        self._accepted += 1
+        if not self._accepted % MOST_UNPROVED:
+            gc.collect()  # asyncio leaves 256 kB of each TLS connection in a reference cycle
+        if len(self._unproved) >= MOST_UNPROVED:
+            self._unproved = {key: one for key, one in self._unproved.items() if one.fileno() >= 0}
+        if len(self._unproved) >= MOST_UNPROVED:
+            ((most, _),) = Counter(host for host, _ in self._unproved).most_common(1)
+            oldest = next(one for one in self._unproved if one[0] == most)
+            with suppress(OSError):  # it is gone already
+                self._unproved.pop(oldest).shutdown(socket.SHUT_RDWR)
+        self._unproved[peer[0], peer[1]] = end
+        return end, peer
+
+    def admit(self, peer: tuple[str, int]) -> None:
+        """Count a connection no longer, by the address of its other end (of IPv6 with more behind it)."""
+        self._unproved.pop((peer[0], peer[1]), None)
