@@ -17,7 +17,7 @@ class Served:
     def __init__(self, source: Source, *, control: bool = False) -> None:
         self.listener = listening("127.0.0.1", 0)
         self.port = self.listener.getsockname()[1]
-        self.page = Page(source, hosts=hosts_of("127.0.0.1", self.port), control=control)
+        self.page = Page(source, self.listener, hosts=hosts_of("127.0.0.1", self.port), control=control)
         self.server = server_of(self.page)
         self._thread = threading.Thread(target=self.server.run, kwargs={"sockets": [self.listener]})
         self._thread.start()

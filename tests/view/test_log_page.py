@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import socket
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from tests.view.served import Served
 
 import dxlrun_view.recorded as module
 from dxlrun import LogError, open_log
+from dxlrun.remote.network.listener import MOST_UNPROVED
 from dxlrun_view.recorded import RecordedRobot
 from dxlrun_view.server import mesh_file
 
@@ -99,6 +102,14 @@ def test_nonsense_is_refused_in_a_sentence(recorded: RecordedRobot, serve: Serve
         status, answer = served.ask(path, body)
         assert status == 409
         assert json.loads(answer)["refused"]
+
+
+def test_idle_connections_do_not_keep_the_browser_out(recorded: RecordedRobot, serve: Serve) -> None:
+    served = serve(recorded)
+    with ExitStack() as opened:
+        for _ in range(3 * MOST_UNPROVED):
+            opened.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+        assert served.look()["moment"]
 
 
 def test_only_meshes_of_the_urdf_are_given_away(

@@ -26,6 +26,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun import DxlrunError, InputError
+from dxlrun.remote.network.listener import Listener
 from dxlrun_view.actions import Action, act
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.shown import LiveEvent, Shown, Source
@@ -93,9 +94,11 @@ Handler = Callable[[Request], Awaitable[Response]]
 class Page:
     """The page of a robot or a log."""
 
-    def __init__(self, source: Source, *, hosts: tuple[str, ...], control: bool = False) -> None:
+    def __init__(
+        self, source: Source, listener: Listener, *, hosts: tuple[str, ...], control: bool = False
+    ) -> None:
         """`hosts`: names of this server with its port, as browsers send them."""
-        self.source, self.control = source, control
+        self.source, self.control, self._listener = source, control, listener
         self.token = secrets.token_urlsafe(16)
         self._hosts = frozenset(hosts)
 
@@ -122,6 +125,8 @@ class Page:
             given = request.headers.get(HEADER, "")
             if token and not secrets.compare_digest(given.encode(), self.token.encode()):
                 return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")
+            if token and request.client:
+                self._listener.admit(request.client)
             try:
                 response = await handler(request)
             except DxlrunError as error:
@@ -219,21 +224,16 @@ def hosts_of(address: str, port: int) -> tuple[str, ...]:
     return tuple(f"{name}:{port}" for name in dict.fromkeys([*names, address]))
 
 
-def listening(address: str, port: int | None) -> socket.socket:
+def listening(address: str, port: int | None) -> Listener:
     """Return a listening socket; without a port the usual one, or if that is taken any. Raises InputError."""
-    listener = socket.socket()
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((address, PORT if port is None else port))
-        listener.listen(64)
+        return Listener(address, PORT if port is None else port)
     except OSError as error:
-        listener.close()
         if port is None:
             return listening(address, 0)
         other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
         why = f"{address}:{port} cannot be listened on: {error.strerror or error}"
         raise InputError(f"{why}; give another {other}") from error
-    return listener
 
 
 class Server(uvicorn.Server):
@@ -257,7 +257,6 @@ def server_of(page: Page) -> Server:
         proxy_headers=False,
         server_header=False,
         timeout_graceful_shutdown=1,
-        limit_concurrency=64,
     )
     return Server(config)
 

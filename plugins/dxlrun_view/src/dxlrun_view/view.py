@@ -57,7 +57,7 @@ def view(
     try:
         with listening(listen, port) as listener:
             address, taken = listener.getsockname()
-            page = Page(source, hosts=hosts_of(listen, taken), control=control)
+            page = Page(source, listener, hosts=hosts_of(listen, taken), control=control)
             url = f"http://{'127.0.0.1' if address == ANY else address}:{taken}/?token={page.token}"
             server = server_of(page)
 
