@@ -75,6 +75,17 @@ def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late():
     assert looks[-1] > LEAST_TIMEOUT_NS
 
 
+def test_what_makes_the_timeout_shorter_is_seen_behind_the_beat_before_it(page, monkeypatch):
+    stored, loaded = [], []
+    monkeypatch.setattr(heartbeat, "store", lambda words, *word: stored.append((*word, page.beats)))
+    monkeypatch.setattr(heartbeat, "load", lambda words, index: loaded.append(index) or words[index])
+    page.cycle(1, 0)
+    page.beat()
+    page.may_take(20 * MS)
+    assert stored == [(2, 1, 1), (5, 20 * MS, 2)]  # word, value, and the beats that are seen with it
+    assert (page.cycles, page.cycle_ns, loaded) == (0, 0, [2, 5])
+
+
 # Why it stood still
 
 

@@ -3,7 +3,8 @@
 A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
 store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
 clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
-visible behind what was shown before it.
+visible behind what was shown before it, and what makes the guardian's timeout shorter behind the beat before
+it: a guardian that saw it without that beat would take what the loop did in the longer time for a standstill.
 """
 
 from __future__ import annotations
@@ -79,13 +80,17 @@ class Heartbeat:
         self._words[_BEATS] = self._beats
 
     def cycle(self, cycle: int, skipped: int) -> None:
-        """Show how many cycles ran, and how many periods were skipped."""
-        self._words[_CYCLE] = cycle
+        """Show how many cycles ran, and how many periods were skipped; the first one is a beat."""
         self._words[_SKIPPED] = skipped
+        if cycle == 1:  # from here on the guardian waits for less
+            self.beat()
+            store(self._words, _CYCLE, cycle)
+        else:
+            self._words[_CYCLE] = cycle
 
     def may_take(self, cycle_ns: int) -> None:
         """Show how long a cycle may take from now on, ns: the period, or more while the loop is paused."""
-        self._words[_CYCLE_NS] = cycle_ns
+        store(self._words, _CYCLE_NS, cycle_ns)
 
     def enter(self, phase: Phase) -> None:
         """Show that a phase begins."""
@@ -131,12 +136,12 @@ class Heartbeat:
     @property
     def cycles(self) -> int:
         """Number of cycles that ran."""
-        return self._words[_CYCLE]
+        return load(self._words, _CYCLE)
 
     @property
     def cycle_ns(self) -> int:
         """How long a cycle may take, ns; 0 before the loop has set it."""
-        return self._words[_CYCLE_NS]
+        return load(self._words, _CYCLE_NS)
 
     @property
     def skipped(self) -> int:

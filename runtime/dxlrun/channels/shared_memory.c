@@ -82,11 +82,14 @@ int64_t dxl_append(Word *ring, uint64_t capacity, uint64_t longest, uint32_t kin
     if (size > longest)
         return -1;
     uint64_t position = LOAD(&ring[HEAD], relaxed), end = position + entry_size(size);
+    uint64_t intent = LOAD(&ring[INTENT], relaxed);
+    if (intent < end || intent > position + entry_size(longest))
+        intent = end; /* else a writer died here, in a longer record */
     uint32_t number = (uint32_t)LOAD(&ring[NUMBER], relaxed);
     uint64_t header[ENTRY_HEADER] = {position + 1, number | size << 32, kind};
     Word *entry = entry_at(ring, capacity, position);
     header[2] |= (uint64_t)crc_of(header, payload, size) << 32;
-    STORE(&ring[INTENT], end, relaxed);
+    STORE(&ring[INTENT], intent, relaxed);
     FENCE(release); /* a reader of what is overwritten now sees the intent before the first word changes */
     for (int i = 0; i < ENTRY_HEADER; i++)
         STORE(entry++, header[i], relaxed);
@@ -109,6 +112,7 @@ void dxl_commit(Word *ring, uint64_t capacity, uint64_t longest, volatile uint64
     if (desk[USED]) {
         const uint8_t *batch = (const uint8_t *)(uintptr_t)(desk + EARLIER);
         int64_t position = dxl_append(ring, capacity, longest, PACKETS, batch, 16 + desk[USED]);
+        atomic_signal_fence(memory_order_seq_cst); /* behind the head: where this process dies between, `salvage` sees it */
         desk[USED] = 0; /* first: nothing is found twice where this process dies here */
         desk[BATCH_POSITION] = (uint64_t)position;
     }

@@ -9,7 +9,8 @@
  * exhaustively, each state once. The checksum is left out: nothing may depend on it.
  *
  * A record may be delivered only as it was appended and in order, and declared lost only when the reader has seen
- * that it is overwritten; when all is seen at last, each was delivered or declared. The writer may die at any store.
+ * that it is overwritten; when all is seen at last, each was delivered or declared. The writer may die at any store,
+ * and another one go on behind it, with records of no payload.
  */
 #include <stdint.h>
 #include <stdio.h>
@@ -95,7 +96,7 @@ static void fence(Order order)
 #include SOURCE
 
 static uint64_t capacity, longest, start[16], size[16], published;
-static int records, wrong;
+static int records, wrong, died, nameless; /* a record that has a number and nothing else: its writer died */
 static State states[MOST_STATES];
 static int32_t hashed[1 << 20];
 static int state_count;
@@ -106,10 +107,10 @@ static uint64_t payload_of(uint64_t number, uint64_t word) { return (number + 1)
 static void fail(const char *what, int64_t found, const State *from, const uint64_t *reader)
 {
     if (!wrong++)
-        printf("%s: answered %lld at position %llu, record %llu; then at %llu, record %llu; the writer died at store %d\n",
+        printf("%s: answered %lld at position %llu, record %llu; then at %llu, record %llu; a writer died at store %d\n",
                what, (long long)found, (unsigned long long)from->reader[POSITION],
                (unsigned long long)from->reader[PASSED], (unsigned long long)reader[POSITION],
-               (unsigned long long)reader[PASSED], last_store);
+               (unsigned long long)reader[PASSED], died);
 }
 
 /* Checks what a call returned; `in_order`: it reads all records. */
@@ -122,7 +123,7 @@ static void check(int64_t found, const State *from, const uint64_t *reader, cons
         if (reader[PASSED] - from->reader[PASSED] != reader[LOST])
             fail("a wrong count", found, from, reader);
         for (uint64_t lost = from->reader[PASSED]; lost < reader[PASSED] && lost < (uint64_t)records; lost++)
-            if (values[INTENT][length < 0 ? newest[INTENT] : view.seen[INTENT]] <= start[lost] + capacity)
+            if ((int)lost != nameless && values[INTENT][length < 0 ? newest[INTENT] : view.seen[INTENT]] <= start[lost] + capacity)
                 fail("lost without need", found, from, reader);
     }
     if (found < 0)
@@ -190,41 +191,71 @@ static void explore(Call *call, int in_order)
     }
 }
 
-/* ring_model CAPACITY WORDS...: a ring of so many words, and how many words each record's payload has. */
-int main(int count, char **given)
+static void append(int from, int is_second)
 {
     uint64_t payload[MOST_WORDS];
-    long states_in_all = 0;
-    capacity = 8 * strtoull(given[1], NULL, 10);
-    records = count - 2;
-    for (int i = 0; i < records; i++) {
-        size[i] = 8 * strtoull(given[2 + i], NULL, 10);
-        start[i + 1] = start[i] + entry_size(size[i]);
-        longest = size[i] > longest ? size[i] : longest;
+    for (int number = from; number < records && stores < last_store; number++) {
+        size[number] = is_second ? 0 : size[number];
+        start[number + 1] = start[number] + entry_size(size[number]);
+        for (uint64_t i = 0; i < size[number] / 8; i++)
+            payload[i] = payload_of((uint64_t)number, i);
+        dxl_append(memory, capacity, longest, 1, (const uint8_t *)payload, size[number]);
     }
+}
+
+/* One writer that dies at a store, or none; then another one, or none. Returns how many states were explored. */
+static long run(int dies_at, int goes_on)
+{
+    long states_in_all = 0;
+    memset(newest, 0, sizeof newest);
+    memset(values, 0, sizeof values);
+    memset(shown, 0, sizeof shown);
+    memset(&writer, 0, sizeof writer);
+    memset(&fenced, 0, sizeof fenced);
+    stores = 0;
+    nameless = -1;
+    last_store = died = dies_at;
+    writing = 1;
+    append(0, 0);
+    for (published = 0; start[published] < values[HEAD][newest[HEAD]];)
+        published++;
+    if (goes_on) {
+        last_store = 1 << 30;
+        memset(&fenced, 0, sizeof fenced); /* it has seen all that the first one stored */
+        if (values[NUMBER][newest[NUMBER]] > published) {
+            nameless = (int)published++;
+            start[published] = start[nameless];
+        }
+        append((int)published, 1);
+        published = (uint64_t)records;
+    }
+    writing = 0;
+    if (values[HEAD][newest[HEAD]] != start[published])
+        wrong++, printf("the head is not behind the last record\n");
+    explore(dxl_read_next, 1);
+    states_in_all += state_count;
+    explore(dxl_read_newest, 0);
+    return states_in_all + state_count;
+}
+
+/* ring_model WRITERS CAPACITY WORDS...: how many writers there are, one after the other died; a ring of so many words,
+ * and how many words each record's payload has. */
+int main(int count, char **given)
+{
+    long states_in_all = 0;
+    int writers = atoi(given[1]);
+    capacity = 8 * strtoull(given[2], NULL, 10);
+    records = count - 3;
     int all_stores = 1 << 30;
     for (int dies_at = 1 << 30; dies_at >= 0 && !wrong; dies_at = (dies_at > all_stores ? all_stores : dies_at) - 1) {
-        memset(newest, 0, sizeof newest);
-        memset(values, 0, sizeof values);
-        memset(shown, 0, sizeof shown);
-        memset(&writer, 0, sizeof writer);
-        memset(&fenced, 0, sizeof fenced);
-        stores = 0;
-        last_store = dies_at;
-        writing = 1;
-        for (int number = 0; number < records && stores < last_store; number++) {
-            for (uint64_t i = 0; i < size[number] / 8; i++)
-                payload[i] = payload_of((uint64_t)number, i);
-            dxl_append(memory, capacity, longest, 1, (const uint8_t *)payload, size[number]);
+        for (int goes_on = 0; goes_on < writers && !wrong; goes_on++) {
+            for (int i = 0; i < records; i++) {
+                size[i] = 8 * strtoull(given[3 + i], NULL, 10);
+                longest = size[i] > longest ? size[i] : longest;
+            }
+            states_in_all += run(dies_at, goes_on);
+            all_stores = dies_at == 1 << 30 ? stores : all_stores;
         }
-        all_stores = dies_at == 1 << 30 ? stores : all_stores;
-        writing = 0;
-        for (published = 0; start[published] < values[HEAD][newest[HEAD]];)
-            published++;
-        explore(dxl_read_next, 1);
-        states_in_all += state_count;
-        explore(dxl_read_newest, 0);
-        states_in_all += state_count;
     }
     printf("%ld states, %ld executions, %ld loads, %d stores\n", states_in_all, executions, loads, all_stores);
     return wrong != 0;

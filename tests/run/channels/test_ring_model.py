@@ -7,13 +7,14 @@ from pathlib import Path
 from dxlrun.channels.shared_memory import SOURCE
 
 MODEL = Path(__file__).with_name("ring_model.c")
-RINGS = [  # words of the ring, and of each record's payload
-    "8 1 1 1",  # two records and a third one; each entry has three words more
-    "4 1 1 1",  # the ring has one record
-    "9 1 2 0",
-    "5 2 1 2",
-    "7 0 1 2 1",
-    "8 1 1 1 1",
+RINGS = [  # writers, words of the ring, and of each record's payload
+    "2 8 1 1 1",  # two records and a third one; each entry has three words more
+    "1 4 1 1 1",  # the ring has one record
+    "2 9 1 2 0",
+    "2 6 0 0 3",  # the second writer's record is shorter than the one that the first died in
+    "1 5 2 1 2",
+    "1 7 0 1 2 1",
+    "1 8 1 1 1 1",
 ]
 BROKEN = {
     "the head is not released": ("STORE(&ring[HEAD], end, release)", "STORE(&ring[HEAD], end, relaxed)"),
@@ -33,6 +34,8 @@ BROKEN = {
         "uint64_t head = LOAD(&ring[HEAD], relaxed), latest",
     ),
     "the newest may be ahead of the head": ("if (latest < head && ", "if ("),
+    "the intent goes back": ("STORE(&ring[INTENT], intent,", "STORE(&ring[INTENT], end,"),
+    "nothing is published": ("    STORE(&ring[HEAD], end, release); ", "    "),
 }
 
 

@@ -12,6 +12,7 @@
 #include <errno.h>
 #include <math.h>
 #include <poll.h>
+#include <stdatomic.h>
 #include <stdint.h>
 #include <string.h>
 #include <time.h>
@@ -265,7 +266,8 @@ static void put_record(Kernel *k, const Line *l, int32_t kind, int32_t id, int64
     memcpy(to + 8, &first, 8);
     memcpy(to + 16, &last, 8);
     memcpy(to + RECORD_HEADER, data, (size_t)size);
-    *(volatile uint64_t *)k->used += (uint64_t)(RECORD_HEADER + size); /* last: a process may die here */
+    atomic_signal_fence(memory_order_release); /* last: a process may die here */
+    *(volatile uint64_t *)k->used += (uint64_t)(RECORD_HEADER + size);
 }
 
 /* Checksums: e-Manual, Protocol 1.0 (checksum) and 2.0 (CRC-16, polynomial 8005, not reflected, from 0) */
