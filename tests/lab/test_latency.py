@@ -28,6 +28,7 @@ from dxlrun_analysis.latency import latency_log, tables
 from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
 from dxlrun_analysis.latency.page import page
 from dxlrun_analysis.latency.statistics import Block, figures, interval, mode_us, t_quantile
+from dxlrun_lab.latency import wake_ups
 from dxlrun_lab.latency.buffer import Buffer, Place
 from dxlrun_lab.latency.measurement import compiled_yardstick
 from dxlrun_lab.latency.wake_ups import measure
@@ -95,6 +96,19 @@ def test_the_buffer_can_be_read_while_it_is_filled():
     assert buffer.wake_ups().tolist() == [[10, 12], [20, 29]]
     assert [buffer.worst_ns(0, 2), buffer.worst_ns(0, 1), buffer.worst_ns(2, 3)] == [9, 2, 1]
     buffer.close()
+
+
+def test_a_wake_up_is_published_when_both_its_times_are_there(monkeypatch):
+    published = []
+    monkeypatch.setattr(
+        wake_ups, "store", lambda words, *word: published.append((*word, words[8:12].tolist()))
+    )
+    measured([100, 0])
+    first, second = PERIOD + 5_000, 2 * PERIOD + 5_000
+    assert published == [
+        (Place.DONE, 1, [first, first + 100, 0, 0]),
+        (Place.DONE, 2, [first, first + 100, second, second]),
+    ]
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

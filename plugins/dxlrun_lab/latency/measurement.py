@@ -21,6 +21,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.channels.process import memory_file, start, whole
+from dxlrun.channels.shared_memory import load
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Grant
 from dxlrun.errors import InputError, ProcessFault
@@ -187,7 +188,7 @@ class _Process:
         limit_s = _STANDSTILL_S + 2 * self._period_ns / 1e9
         try:
             while not self._ended(_LOOK_S):
-                done = words[Place.DONE]
+                done = load(words, Place.DONE)
                 idle_s = 0.0 if done > seen else idle_s + _LOOK_S
                 if idle_s > limit_s:
                     raise ProcessFault(f"{self._condition.label} measured nothing for {idle_s:.0f} s")

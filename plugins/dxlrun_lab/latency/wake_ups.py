@@ -16,6 +16,7 @@ import time
 
 import msgspec
 
+from dxlrun.channels.shared_memory import store
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Pacing
@@ -58,7 +59,7 @@ def measure(clock: Clock, schedule: Schedule, iterations: int, buffer: Buffer) -
         words[place] = deadline_ns
         words[place + 1] = woken_ns
         place += 2
-        words[done] = number
+        store(words, done, number)  # both times are seen before it
         if words[stop]:
             return
         schedule.advance(schedule.following(clock.now_ns(), "skip"))

@@ -48,7 +48,8 @@ int main(int argc, char **argv)
             ;
         words[WAKE_UPS + 2 * done + 1] = now_ns(CLOCK_MONOTONIC);
         words[WAKE_UPS + 2 * done] = deadline_ns;
-        words[DONE] = ++done;
+        done++;
+        __atomic_store_n(&words[DONE], done, __ATOMIC_RELEASE); /* both times are seen before it */
     }
     if (iterations) {
         words[CPU_NS] = now_ns(CLOCK_PROCESS_CPUTIME_ID) - cpu_ns;
