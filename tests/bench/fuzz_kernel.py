@@ -8,13 +8,16 @@ servo, events. A stream is the bytes of one line after one read.
 
     python tests/bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
     python tests/bench/fuzz_kernel.py 200000 --processes 2 --sanitized
+    python tests/bench/fuzz_kernel.py 100000 --digests
 
+The last one writes a line for each robot, with the SHA-256 of all that it showed: the same on every machine.
 CI runs a seeded sample of it (tests/dynamixel/test_kernel.py).
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import os
 import random
@@ -23,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from operator import itemgetter
@@ -483,8 +486,13 @@ def difference(found, expected, where):
     return "\n".join(lines)
 
 
-def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
-    """Compare so many streams; raises AssertionError where kernel and parser differ."""
+def campaign(
+    streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS), digest: Callable[[str], object] = str
+) -> Tally:
+    """Compare so many streams; raises AssertionError where kernel and parser differ.
+
+    `digest` gets a line for each robot: its seed, the streams until then, and a digest of all that it showed.
+    """
     rng, tally = random.Random(seed), Tally()
     kernel.LIBRARY = Path(os.environ.get(LIBRARY, kernel.LIBRARY))
     while tally.streams < streams:
@@ -493,6 +501,7 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
         ours, theirs = Side(plans), Side(plans, by_parser=True)
         goals = np.full_like(ours.goals.values, math.nan)
         standing: dict[int, int] = {}
+        shown = hashlib.sha256()
         for number in range(CYCLES):
             if number % 12 == 9:
                 where, servo, seed_of_change = rng.randrange(count), rng.randrange(len(IDS)), rng.random()
@@ -516,11 +525,13 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
             theirs.answer(replies)
             found, expected = ours.read(), theirs.read()
             assert found == expected, difference(found, expected, where)
+            shown.update(repr(found).encode())
             lost = [bus.failure is not None for bus in ours.hardware._buses]
             tally.streams += sum(len(mine) for mine, gone in zip(replies, lost, strict=True) if not gone)
             tally.cycles += 1
         tally.by_kernel += ours.ended
         tally.interrupted += ours.began - ours.ended
+        digest(f"{seed} {tally.streams} {count} {name} {shown.hexdigest()}\n")
     return tally
 
 
@@ -550,15 +561,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--sanitized", action="store_true", help="with AddressSanitizer and UBSan of gcc")
+    parser.add_argument("--digests", action="store_true", help="write what each robot showed")
     chosen = parser.parse_args()
     if chosen.processes == 1 and not chosen.sanitized:
         began = time.monotonic()
-        tally = campaign(chosen.streams, chosen.seed)
+        digest = sys.stdout.write if chosen.digests else str
+        tally = campaign(chosen.streams, chosen.seed, digest=digest)
         sys.stdout.write(f"seed {chosen.seed}: {tally}, {time.monotonic() - began:.0f} s\n")
         return
     share = -(-chosen.streams // chosen.processes)
     seeds = range(chosen.seed, chosen.seed + chosen.processes)
-    command = [sys.executable, __file__, str(share), "--seed"]
+    command = [sys.executable, __file__, str(share), *["--digests"] * chosen.digests, "--seed"]
     with tempfile.TemporaryDirectory() as folder:
         environment = sanitized(folder) if chosen.sanitized else None
         children = [subprocess.Popen([*command, str(seed)], env=environment) for seed in seeds]
