@@ -57,8 +57,10 @@ TESTS = {
     "README.md": ("tests/test_readme.py",),
     "analyze.md": ("tests/cli/test_docs.py",),
     "architecture.md": ("tests/cli/test_docs.py",),
+    "arm.md": ("tests/cli/test_tutorial.py",),
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
+    "controller.md": ("tests/cli/test_tutorial.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
     "devices.md": ("tests/cli/test_device_tools.py",),
     "experiments.md": (
@@ -69,6 +71,7 @@ TESTS = {
     ),
     "by-hand.md": ("tests/hand/test_terminal.py",),
     "frames.md": ("tests/cli/test_frames.py",),
+    "humanoid.md": ("tests/cli/test_tutorial.py",),
     "logs.md": (
         "tests/analysis/season/test_logs.py",
         "tests/analysis/export/test_tables.py",
