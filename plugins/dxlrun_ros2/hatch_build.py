@@ -13,10 +13,10 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-USED = re.compile(
-    r"__rosidl_(generator_c|generator_py|typesupport_c|typesupport_fastrtps_c)|librosidl|librcutils|fastcdr"
-)
-"""Libraries of other packages. Only the serialization of rmw_fastrtps and rmw_zenoh is built."""
+USED = re.compile(r"__rosidl_(generator|typesupport_\w*c\b)|librosidl|librcutils|librcpputils|fastcdr")
+"""Libraries of other packages."""
+SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
+"""What middleware asks a type for; each is looked for in a library of its own."""
 NEEDED = "the compilers gcc and g++ and Python's headers (sudo apt install build-essential python3-dev)"
 
 
@@ -41,18 +41,16 @@ class Interfaces(BuildHookInterface[Any]):
             )
             if not library.exists() or library.stat().st_mtime < newest:
                 shutil.rmtree(package, ignore_errors=True)
-                make(source, made / "sources" / source.name, package, library)
+                make(source, made / "sources" / source.name, library, made / "lib")
                 _describe(source, share)
             included[str(package)] = source.name
-        build_data["shared_data"][str(made / "share")] = "share"
+        for folder in ("lib", "share"):
+            build_data["shared_data"][str(made / folder)] = folder
 
 
-def make(source: Path, place: Path, package: Path, library: Path) -> None:
-    """Generate the sources of a message package in `place`, compile them, and leave its modules in `package`.
-
-    One library has all that is written in C: the messages, how they are serialized, how they become objects
-    of Python. Those of the packages that it uses are linked.
-    """
+def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
+    """Generate the sources of a message package in `place`, compile them, and leave them where they are
+    installed from: the module `library` with the package around it, and what it needs in `libraries`."""
     import rosidl_cli
     from rosidl_cli.command.hash.api import generate_type_hashes
     from rosidl_cli.command.translate.api import translate
@@ -60,6 +58,7 @@ def make(source: Path, place: Path, package: Path, library: Path) -> None:
     from rosidl_generator_py.cli import GeneratePython
     from rosidl_typesupport_c.cli import GenerateCTypesupport
     from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
+    from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
 
     prefix = Path(rosidl_cli.__file__).parents[4]
     os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # where the generators look for their templates
@@ -79,30 +78,25 @@ def make(source: Path, place: Path, package: Path, library: Path) -> None:
         name, idl, includes, out
     )
     GenerateFastRTPSCTypesupport("fastrtps_c").generate(name, idl, includes, out)
-    only = ["rosidl_typesupport_fastrtps_c"]
-    GenerateCTypesupport("c", typesupport_implementations=only).generate(name, idl, includes, out)
-    _compile(source.name, place, prefix, library)
-    shutil.copytree(
-        out,
-        package,
-        dirs_exist_ok=True,
-        ignore=lambda folder, names: [
-            name
-            for name in names
-            if not name.endswith(".py") and not (Path(folder) / name / "__init__.py").exists()
-        ],
-    )
+    described = place / "described" / name  # files of the same names
+    GenerateIntrospectionCTypesupport("introspection_c").generate(name, idl, includes, described)
+    GenerateCTypesupport("c", typesupport_implementations=list(SUPPORTS)).generate(name, idl, includes, out)
+    _compile(source.name, place, prefix, library, libraries)
+    for path in out.rglob("*.py"):
+        copy = library.parent / path.relative_to(out)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
 
 
-def _compile(name: str, place: Path, prefix: Path, library: Path) -> None:
-    """Compile and link all sources of a package."""
+def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Path) -> None:
+    """Compile the sources of a package; link what is of Python, and what is not."""
     include = sysconfig.get_paths()["include"]
     if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
         raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")
     import numpy as np
 
     headers = prefix / "include"
-    folders = [place, Path(include), Path(np.get_include()), headers, *headers.iterdir()]
+    folders = [place, place / "described", Path(include), Path(np.get_include()), headers, *headers.iterdir()]
     flags = ["-O1", "-fPIC", "-w", f'-DROS_PACKAGE_NAME="{name}"', *(f"-I{folder}" for folder in folders)]
     whole = place / "whole.cpp"  # a fourth of the time of one by one: each reads the same long headers
     whole.write_text("".join(f'#include "{path}"\n' for path in sorted(place.rglob("*.cpp"))))
@@ -113,11 +107,17 @@ def _compile(name: str, place: Path, prefix: Path, library: Path) -> None:
         return result
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        objects = [*pool.map(compiled, (whole, *sorted(place.rglob("*.c"))))]
+        sources = sorted(place.rglob("*.c"))
+        plain = [*pool.map(compiled, [whole, *(path for path in sources if path.name[0] != "_")])]
+        of_python = [*pool.map(compiled, [path for path in sources if path.name[0] == "_"])]
     used = [path.name for path in sorted((prefix / "lib").glob("lib*.so")) if USED.search(path.name)]
-    library.parent.mkdir(parents=True, exist_ok=True)
-    linked = ["-Wl,--as-needed", f"-L{prefix / 'lib'}", *(f"-l:{one}" for one in used)]
-    _run("g++", "-shared", "-s", "-o", str(library), *objects, *linked)
+    linked = ["-Wl,--as-needed", f"-L{prefix / 'lib'}", f"-L{libraries}", *(f"-l:{one}" for one in used)]
+    first, other = (f"lib{name}__{one}.so" for one in SUPPORTS)
+    for folder in (libraries, library.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    _run("g++", "-shared", "-s", "-o", str(libraries / first), *plain, *linked)
+    shutil.copyfile(libraries / first, libraries / other)
+    _run("g++", "-shared", "-s", "-o", str(library), *of_python, f"-L{libraries}", f"-l:{first}", *linked)
 
 
 def _run(*command: str) -> None:

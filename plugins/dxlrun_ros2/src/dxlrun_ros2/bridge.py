@@ -10,13 +10,18 @@ from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
 
 from dxlrun import RemoteRobot
+from dxlrun_ros2.controller_node import ControllerNode, offer, offer_torque
+from dxlrun_ros2.manager import Manager, info_of
 from dxlrun_ros2.published_run import PublishedRun
+from dxlrun_ros2.set_points import SetPoints
 
 LOOK_S = 1.0
 """Between two looks for topics and controllers that are new."""
-THREADS = 8
+THREADS = 32
+"""A goal has one until it ends; they are started when they are needed."""
 LAST_S = 0.3
 """At the end, for the results of goals."""
 
@@ -32,14 +37,24 @@ class Bridge:
         self._executor = MultiThreadedExecutor(THREADS, context=self._context)
         self._nodes: dict[str, Node] = {}
         try:
-            self.run = PublishedRun(self.node("dxlrun"), robot)
+            own = self.node("dxlrun")
+            self.run = PublishedRun(own, robot)
+            offer(own, robot.name, Trigger, "~/halt", lambda connected, _: connected.halt())
+            offer_torque(own, robot.name, "all", "~")
+            loads = {
+                "allow_undeclared_parameters": True,
+                "automatically_declare_parameters_from_overrides": True,
+            }
+            Manager(self.node("controller_manager", **loads), robot.name)
+            self._points = SetPoints(robot.name, lease)
+            self._controllers: dict[str, ControllerNode] = {}
         except BaseException:
             self.close()
             raise
 
-    def node(self, name: str) -> Node:
+    def node(self, name: str, **more: bool) -> Node:
         """Return a new node of the bridge."""
-        node = Node(name, context=self._context)
+        node = Node(name, context=self._context, **more)
         self._nodes[name] = node
         self._executor.add_node(node)
         return node
@@ -51,6 +66,7 @@ class Bridge:
             if time.monotonic() > looked + LOOK_S:
                 looked = time.monotonic()
                 self.run.hear(self._robot)
+                self._look()
             self._executor.spin_once(0.1)
         self.run.ended.set()
         until = time.monotonic() + LAST_S
@@ -58,6 +74,22 @@ class Bridge:
             self._executor.spin_once(0.05)
         if not stopped.is_set():
             print(self.run.why, flush=True)
+
+    def _look(self) -> None:
+        """Open a node for each new controller, and close those that are unloaded. Raises DxlrunError."""
+        found = {one.name: one for one in info_of(self._robot).controllers}
+        for name in [name for name in self._controllers if name not in found]:
+            self._controllers.pop(name).close()
+            node = self._nodes.pop(name)
+            self._executor.remove_node(node)
+            node.destroy_node()
+        for name, one in found.items():
+            if name not in self._controllers:
+                node = self.node(name)
+                self._controllers[name] = ControllerNode(node, self._robot, self.run, one, self._points)
+        while self.run.changed:
+            if (name := self.run.changed.pop()) in self._controllers:
+                self._controllers[name].refresh(self._robot)
 
     def close(self) -> None:
         """End all nodes."""

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_rosout_default
 
-from dxlrun import DxlrunError, RemoteRobot, TopicMessage, connect
-from dxlrun.channels.events import Event
+from dxlrun import DxlrunError, Floats, RemoteRobot, TopicMessage, connect
+from dxlrun.channels.events import Event, EventCode
 from dxlrun.log import schemas
 from dxlrun.log.run_messages import RunMessages
 from dxlrun.messages.cdr import ENCAPSULATION
@@ -44,6 +45,10 @@ class PublishedRun(RunMessages):
         self.why = ""
         self.seen: set[Callable[[np.void], None]] = set()
         """Called with the record of each cycle."""
+        self.newest: np.void | None = None
+        """Record of the newest cycle."""
+        self.changed: set[str] = set()
+        """Controllers whose parameters were changed."""
         self._publishers_of: list[Publisher | None] = []
         self._opened: dict[tuple[str, MessageType], int] = {}
         self._heard: set[str] = set()
@@ -89,20 +94,43 @@ class PublishedRun(RunMessages):
         if message.topic == schemas.CYCLE_TOPIC:
             data = message.data[len(ENCAPSULATION) :]
             self.cycle(data)
-            if self.seen:
-                record = np.frombuffer(data, dtype=self._layout.dtype)[0]
-                for see in tuple(self.seen):
-                    see(record)
+            self.newest = np.frombuffer(data, dtype=self._layout.dtype)[0]
+            for see in tuple(self.seen):
+                see(self.newest)
         elif message.topic == schemas.EVENT_TOPIC:
             fields = message.message
             numbers = [fields[name] for name in ("t_ns", "code", "severity")]
             t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
             source, sentence, more = (str(fields[name]) for name in ("source", "text", "data"))
             self.event(Event(t_ns, code, severity, source, sentence, more.encode()))
+            if code == EventCode.PARAMETERS:
+                self.changed.add(source)
         else:
             key = message.topic, MessageType(message.type, message.definition)
             channel = self._opened.get(key)
             self._add(self._channel(*key) if channel is None else channel, message.time_ns, message.data)
+
+    # The newest cycle
+
+    def active(self, controller: str) -> bool:
+        """Return whether a controller is active."""
+        names = [one.name for one in self.header.controllers]
+        if self.newest is None or controller not in names:
+            return True  # loaded since, or too early: the robot itself will tell
+        return bool(int(self.newest["active"]) >> names.index(controller) & 1)
+
+    def rows(self, joints: Sequence[str]) -> NDArray[np.int_]:
+        """Return the rows of joints in a record."""
+        return np.array([self.header.joints.index(joint) for joint in joints], int)
+
+    @property
+    def desired(self) -> Floats:
+        """Where each joint is sent, or is where it is sent nowhere; NaN: not known. Shape (joints,)."""
+        if self.newest is None:
+            return np.full(len(self.header.joints), np.nan)
+        goal, position = self.newest["goal_position"], self.newest["position"]
+        found: Floats = np.where(np.isfinite(goal), goal, position)
+        return found
 
 
 def message_class(name: str) -> type | None:

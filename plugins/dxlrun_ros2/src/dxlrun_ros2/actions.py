@@ -1,0 +1,316 @@
+"""Actions: FollowJointTrajectory and GripperCommand as goals of a running robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+from control_msgs.action import FollowJointTrajectory, GripperCommand
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
+from dxlrun import DxlrunError, Floats, GoalState, Refused, RemoteGoal, RemoteRobot, connect
+from dxlrun.remote.requests.replies import ControllerInfo
+from dxlrun_controllers.laws.spline import SplineSample
+from dxlrun_ros2.published_run import CLIENT, PublishedRun
+from dxlrun_ros2.trajectories import (
+    Result,
+    Tolerances,
+    Wanted,
+    WrongTrajectory,
+    point,
+    seconds_of,
+    tolerances,
+    wanted,
+)
+
+FEEDBACK_S = 0.05
+GOAL_TIME_S = 1.0
+"""How long after its end a goal with tolerances may still come inside them, where it does not say."""
+CLIENT_S = 1.0
+"""A goal none of whose clients is left for so long is cancelled."""
+_FAR_S = 10.0
+_AT_ONCE = 3
+"""Periods."""
+Seen: TypeAlias = tuple[int, float, Floats, Floats]
+"""Time (ns since 1970) and time of the goal (s), desired and measured positions and velocities."""
+
+
+class Action:
+    """An action of a controller: each goal is one of the robot, from its acceptance to its end."""
+
+    def __init__(
+        self, node: Node, run: PublishedRun, controller: ControllerInfo, name: str, kind: type
+    ) -> None:
+        self.node, self.run, self.controller = node, run, controller
+        self._server = ActionServer(
+            node,
+            kind,
+            name,
+            self._execute,
+            goal_callback=self._answer,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+        self._clients = f"{name}/_action/send_goal"
+
+    def check(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> None:
+        """Raise DxlrunError for a goal that is not accepted."""
+
+    def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
+        """Execute a goal, end its handle, and return its result. Raises DxlrunError."""
+        raise NotImplementedError
+
+    def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
+        """Return the result of a goal that failed."""
+        raise NotImplementedError
+
+    def _answer(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> GoalResponse:
+        try:
+            self.check(request)
+            if not self.run.active(self.controller.name):
+                raise Refused(f"{self.controller.name} is not active")
+        except DxlrunError as error:
+            self.node.get_logger().error(f"goal rejected: {error}")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _execute(self, handle: ServerGoalHandle) -> object:
+        try:
+            with connect(self.run.robot, f"{CLIENT} action") as robot:
+                return self.execute(handle, robot)
+        except DxlrunError as error:
+            self.node.get_logger().error(str(error))
+            handle.abort()
+            return self.failed(str(error))
+
+    def wait(
+        self, handle: ServerGoalHandle, robot: RemoteRobot, goal: RemoteGoal, look: Callable[[GoalState], str]
+    ) -> tuple[GoalState, str]:
+        """Return how a goal ended, and why the bridge cancelled it; empty: it did not.
+
+        `look` gets its state meanwhile, and returns a reason to cancel it. A client that cancels, or
+        is gone, lets the joints come to rest; the goal ends when they are.
+        """
+        why, cancelled, seen = "", False, time.monotonic()
+        while (state := robot.goal_state(goal.number, FEEDBACK_S)).status == "running":
+            if self.run.ended.is_set():
+                raise DxlrunError(self.run.why or "the bridge ends")
+            why = why or look(state)
+            if self.node.count_clients(self._clients):
+                seen = time.monotonic()
+            elif time.monotonic() > seen + CLIENT_S:
+                why = why or "no client of the action is left"
+            if (why or handle.is_cancel_requested) and not cancelled:
+                cancelled = True
+                try:
+                    goal.cancel()
+                except Refused as refused:
+                    if refused.code not in ("goal_ended", "cancelled_already"):
+                        raise
+        return state, why
+
+
+class FollowTrajectory(Action):
+    """control_msgs/FollowJointTrajectory of a trajectory controller, also for some of its joints."""
+
+    def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
+        super().__init__(
+            node, run, controller, f"{controller.name}/follow_joint_trajectory", FollowJointTrajectory
+        )
+
+    def check(self, request: FollowJointTrajectory.Goal) -> None:
+        """Raise WrongTrajectory for a goal that is not accepted."""
+        if request.multi_dof_trajectory.points:
+            raise WrongTrajectory(Result.INVALID_JOINTS, "it has no joints with several degrees of freedom")
+        for given in (request.path_tolerance, request.goal_tolerance):
+            tolerances(given, self.controller.joints)
+        if request.trajectory.points:
+            self._wanted(request)
+
+    def _wanted(self, request: FollowJointTrajectory.Goal) -> Wanted:
+        now = self.node.get_clock().now().nanoseconds * 1e-9
+        return wanted(request.trajectory, self.controller.joints, now)
+
+    def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
+        """Return the result of a goal that failed."""
+        return Result(error_code=code, error_string=why)
+
+    def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
+        """Follow a trajectory; without points stop in place."""
+        request = handle.request
+        if not request.trajectory.points:
+            state, _ = self.wait(handle, robot, stopped(robot, self.run, self.controller), lambda _: "")
+            handle.succeed()
+            return Result(error_string=f"stopped in place: {state.status}")
+        plan = self._wanted(request)
+        watch = Watch(self.run, plan, tolerances(request.path_tolerance, plan.joints))
+        self.run.seen.add(watch.see)
+        try:
+            goal = robot.send(self.controller.name, "trajectory", plan.command()).goal
+            if goal is None:
+                raise DxlrunError(f"{self.controller.name} takes no trajectory as a goal")
+
+            def look(state: GoalState) -> str:
+                watch.begin(state)
+                if watch.newest is not None:
+                    handle.publish_feedback(watch.feedback(watch.newest))
+                return watch.violated
+
+            state, why = self.wait(handle, robot, goal, look)
+            if why:
+                handle.abort()
+                return self.failed(
+                    why, Result.PATH_TOLERANCE_VIOLATED if watch.violated else Result.INVALID_GOAL
+                )
+            if state.status == "cancelled" and handle.is_cancel_requested:
+                handle.canceled()
+                return Result(error_string="cancelled, the joints are at rest")
+            if state.reached and not (why := self._off(handle, watch)):
+                handle.succeed()
+                return Result(error_code=Result.SUCCESSFUL, error_string=state.text)
+            handle.abort()
+            return self.failed(why or state.text or state.status, self._code(state))
+        finally:
+            self.run.seen.discard(watch.see)
+
+    def _code(self, state: GoalState) -> int:
+        """Return the code of control_msgs for a goal that did not end well."""
+        if state.reached or state.status == "missed":
+            return int(Result.GOAL_TOLERANCE_VIOLATED)
+        # what cannot be followed from its beginning on ends at once
+        began = (state.seconds or 0.0) > _AT_ONCE * self.run.header.period_ns * 1e-9
+        left = state.status == "aborted" and state.error is not None and began
+        return int(Result.PATH_TOLERANCE_VIOLATED if left else Result.INVALID_GOAL)
+
+    def _off(self, handle: ServerGoalHandle, watch: Watch) -> str:
+        """Wait until the joints are inside the tolerances of a goal; return which is not in its time."""
+        request = handle.request
+        most = tolerances(request.goal_tolerance, watch.plan.joints)
+        until = time.monotonic() + (seconds_of(request.goal_time_tolerance) or GOAL_TIME_S)
+        while (why := watch.off(most)) and time.monotonic() < until and not handle.is_cancel_requested:
+            time.sleep(FEEDBACK_S)
+        return why
+
+
+def stopped(robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo) -> RemoteGoal:
+    """Let the joints of a trajectory controller come to rest; return the goal that ends when they are."""
+    try:
+        if goal := robot.cancel(controller.name).goal:
+            return goal
+    except Refused as refused:
+        if refused.code not in ("no_goal", "cancelled_already"):
+            raise
+    # of a stream of chunks: a goal takes over with the velocity of now, and is cancelled at once
+    rows = run.rows(controller.joints)
+    place = [{"time": _FAR_S, "positions": run.desired[rows].tolist()}]
+    goal = robot.send(controller.name, "trajectory", {"points": place}).goal
+    if goal is None:
+        raise DxlrunError(f"{controller.name} takes no trajectory as a goal")
+    goal.cancel()
+    return goal
+
+
+class Watch:
+    """Desired and measured state of joints on a trajectory, in each cycle of a run."""
+
+    def __init__(self, run: PublishedRun, plan: Wanted, path: Tolerances) -> None:
+        self.plan, self._path = plan, path
+        self._rows = run.rows(plan.joints)
+        self._spline = plan.spline(run.desired[self._rows])
+        self._sample = SplineSample(len(plan.joints))
+        self._begin_ns: int | None = None
+        self._offset_ns = run.header.epoch_offset_ns
+        self.newest: Seen | None = None
+        self.violated = ""
+
+    def begin(self, state: GoalState) -> None:
+        """Count the time from the acceptance of the goal."""
+        self._begin_ns = round(state.accepted * 1e9)
+
+    def see(self, record: np.void) -> None:
+        """Take a cycle."""
+        if self._begin_ns is None:
+            return
+        t_ns = int(record["read_ns"])
+        seconds = (t_ns - self._begin_ns) * 1e-9
+        self._spline.sample(seconds, self._sample)
+        actual = np.array([record["position"][self._rows], record["velocity"][self._rows]])
+        self.newest = t_ns + self._offset_ns, seconds, self._sample.rows[:2].copy(), actual
+        if not self.violated and seconds <= self._spline.duration_s:
+            self.violated = self._path.violated(self.plan.joints, self._sample.rows[:2] - actual)
+
+    def off(self, most: Tolerances) -> str:
+        """Return which joint is farther from the end of the trajectory than its tolerance."""
+        if self.newest is None:
+            return ""
+        return most.violated(self.plan.joints, self.plan.points[-1, :2] * [[1.0], [0.0]] - self.newest[3])
+
+    def feedback(self, newest: Seen) -> FollowJointTrajectory.Feedback:
+        """Return the feedback of a cycle."""
+        wall_ns, seconds, desired, actual = newest
+        message = FollowJointTrajectory.Feedback(joint_names=list(self.plan.joints))
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(wall_ns, 1_000_000_000)
+        message.desired, message.actual = point(desired, seconds), point(actual, seconds)
+        message.error, message.index = point(desired - actual, seconds), self.plan.index(seconds)
+        return message
+
+
+class Gripper(Action):
+    """control_msgs/GripperCommand of a gripper_controller: the position of its joint, rad or m."""
+
+    def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
+        super().__init__(node, run, controller, f"{controller.name}/gripper_cmd", GripperCommand)
+
+    def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
+        """Return the result of a goal that failed."""
+        return self._report(GripperCommand.Result())
+
+    def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
+        """Close or open the gripper; it is reached too where it holds something."""
+        command = handle.request.command
+        wish: dict[str, object] = {"position": command.position}
+        if command.max_effort > 0:
+            wish["effort"] = command.max_effort
+        goal = robot.send(self.controller.name, "grip", wish).goal
+        if goal is None:
+            raise DxlrunError(f"{self.controller.name} takes no grip as a goal")
+        state, why = self.wait(
+            handle,
+            robot,
+            goal,
+            lambda _: handle.publish_feedback(self._report(GripperCommand.Feedback())) or "",
+        )
+        result = self._report(GripperCommand.Result())
+        result.stalled = state.reached and self._stalled(robot, state)
+        result.reached_goal = state.reached and not result.stalled
+        if state.reached:
+            handle.succeed()
+        elif state.status == "cancelled" and handle.is_cancel_requested:
+            handle.canceled()
+        else:
+            self.node.get_logger().error(why or state.text or state.status)
+            handle.abort()
+        return result
+
+    def _report(
+        self, message: GripperCommand.Feedback | GripperCommand.Result
+    ) -> GripperCommand.Feedback | GripperCommand.Result:
+        row = self.run.rows(self.controller.joints[:1])[0]
+        if (record := self.run.newest) is not None:
+            message.position, message.effort = float(record["position"][row]), float(record["effort"][row])
+        return message
+
+    def _stalled(self, robot: RemoteRobot, state: GoalState) -> bool:
+        """Return whether the gripper stood still short of its goal, by its topic after the end."""
+        until = time.monotonic() + GOAL_TIME_S
+        while time.monotonic() < until:
+            found = robot.newest(f"/{self.controller.name}/state")
+            if found is not None and found.time_ns * 1e-9 >= (state.ended or 0.0):
+                return bool(found.message["stalled"])
+            time.sleep(FEEDBACK_S)
+        return False

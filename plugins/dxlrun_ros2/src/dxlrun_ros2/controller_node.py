@@ -1,0 +1,201 @@
+"""Controller node: a controller of the robot as ros2_control has it: topics, actions, parameters, torque."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from control_msgs.msg import JointTrajectoryControllerState
+from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from dxlrun import DxlrunError, InputError, RemoteRobot, connect
+from dxlrun.remote.client import Executed
+from dxlrun.remote.requests.replies import ControllerInfo
+from dxlrun_ros2.actions import FollowTrajectory, Gripper, stopped
+from dxlrun_ros2.published_run import CLIENT, STATE, PublishedRun
+from dxlrun_ros2.set_points import SetPoints
+from dxlrun_ros2.trajectories import point, wanted
+
+GROUP = ("positions", "posvel", "poseffort", "velocities", "efforts", "pwm")
+"""Commands of one number a joint and field."""
+STATE_NS = 20_000_000
+"""Between two messages of controller_state."""
+
+
+class ControllerNode:
+    """One controller; what it offers follows from the commands that it takes."""
+
+    def __init__(
+        self, node: Node, robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo, points: SetPoints
+    ) -> None:
+        """Raises DxlrunError."""
+        self.node, self._run, self._controller, self._points = node, run, controller, points
+        name, takes = controller.name, controller.takes
+        if "trajectory" in takes:
+            self._action: object = FollowTrajectory(node, run, controller)
+            points.subscribe(node, JointTrajectory, f"{name}/joint_trajectory", self._trajectory)
+            topic = f"{name}/controller_state"
+            self._state = node.create_publisher(JointTrajectoryControllerState, topic, STATE)
+            self._state_ns = 0
+            run.seen.add(self._show)
+        if "grip" in takes:
+            self._action = Gripper(node, run, controller)
+        if "velocity" in takes:
+            points.subscribe(node, TwistStamped, f"{name}/cmd_vel", self._stamped)
+            points.subscribe(node, Twist, f"{name}/cmd_vel_unstamped", self._twist)
+        if kinds := [kind for kind in GROUP if kind in takes]:
+            self._kind = kinds[0]
+            points.subscribe(node, Float64MultiArray, f"{name}/commands", self._command)
+        self._live: dict[str, object] = {}
+        self._declare(robot)
+        if controller.command:
+            offer_torque(node, run.robot, controller.name, name)
+
+    def close(self) -> None:
+        """Leave the run's cycles alone."""
+        self._run.seen.discard(getattr(self, "_show", None))
+
+    # Topics
+
+    def _trajectory(self, message: JointTrajectory, robot: RemoteRobot) -> None:
+        """Follow the newest trajectory of a publisher; without points stop in place."""
+        name = self._controller.name
+        if not message.points:
+            stopped(robot, self._run, self._controller)
+            return
+        plan = wanted(message, self._controller.joints, self.node.get_clock().now().nanoseconds * 1e-9)
+        if "chunk" in self._controller.takes:
+            self._points.send(robot, name, "chunk", plan.chunk(time.monotonic()), plan.seconds)
+        else:
+            robot.send(name, "trajectory", plan.command())
+
+    def _command(self, message: Float64MultiArray, robot: RemoteRobot) -> None:
+        fields = fields_of(self._controller, self._kind)
+        if len(message.data) != len(fields) * len(self._controller.joints):
+            many = f"{len(message.data)} numbers for {' and '.join(fields)}"
+            raise InputError(f"{many} of {len(self._controller.joints)} joints")
+        values = np.split(np.array(message.data), len(fields))
+        self._points.send(robot, self._controller.name, self._kind, dict(zip(fields, values, strict=True)))
+
+    def _stamped(self, message: TwistStamped, robot: RemoteRobot) -> None:
+        self._twist(message.twist, robot)
+
+    def _twist(self, twist: Twist, robot: RemoteRobot) -> None:
+        command = {"linear": twist.linear.x, "angular": twist.angular.z}
+        self._points.send(robot, self._controller.name, "velocity", command)
+
+    def _show(self, record: np.void) -> None:
+        """Publish the state of a trajectory controller, if a subscriber wants it."""
+        t_ns = int(record["read_ns"])
+        if t_ns < self._state_ns + STATE_NS or not self._state.get_subscription_count():
+            return
+        self._state_ns, rows = t_ns, self._run.rows(self._controller.joints)
+        desired = np.array([record["goal_position"][rows], record["goal_velocity"][rows]])
+        actual = np.array([record["position"][rows], record["velocity"][rows]])
+        message = JointTrajectoryControllerState(
+            joint_names=list(self._controller.joints), speed_scaling_factor=1.0
+        )
+        stamp = t_ns + self._run.header.epoch_offset_ns
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+        message.reference, message.output = point(desired, 0.0), point(desired, 0.0)
+        message.feedback, message.error = point(actual, 0.0), point(desired - actual, 0.0)
+        self._state.publish(message)
+
+    # Parameters
+
+    def _declare(self, robot: RemoteRobot) -> None:
+        """Declare the parameters of the robot file; those that are live can be set."""
+        for one in robot.parameter_table(self._controller.name):
+            value = list(one.value) if isinstance(one.value, tuple) else one.value
+            if not _is_parameter(value):
+                continue
+            about = ParameterDescriptor(
+                description=one.description,
+                additional_constraints=one.range,
+                read_only=not one.live,
+                dynamic_typing=True,
+            )
+            self.node.declare_parameter(one.name, value, about)
+            if one.live:
+                self._live[one.name] = value
+        if not self.node.has_parameter("joints"):
+            self.node.declare_parameter(
+                "joints", list(self._controller.joints), ParameterDescriptor(read_only=True)
+            )
+        interfaces = list(self._controller.command)
+        self.node.declare_parameter(
+            "command_interfaces", interfaces, ParameterDescriptor(read_only=True, dynamic_typing=True)
+        )
+        self.node.add_on_set_parameters_callback(self._set)
+
+    def refresh(self, robot: RemoteRobot) -> None:
+        """Take over what another client has changed."""
+        now = {one.name: one.value for one in robot.parameter_table(self._controller.name) if one.live}
+        changed = [name for name, value in now.items() if self._live.get(name) != value]
+        self._live |= now
+        self.node.set_parameters([Parameter(name, value=now[name]) for name in changed])
+
+    def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        values = {one.name: one.value for one in parameters if self._live.get(one.name) != one.value}
+        if values and values.keys() <= self._live.keys():
+            try:
+                with connect(self._run.robot, CLIENT) as robot:
+                    robot.set_parameters(self._controller.name, values)
+            except DxlrunError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            self._live |= values
+        return SetParametersResult(successful=True)
+
+
+def fields_of(controller: ControllerInfo, kind: str) -> tuple[str, ...]:
+    """Return the fields of a command, each an array with a number for each joint."""
+    schema = controller.takes[kind]
+    properties = schema.get("properties", {}) if isinstance(schema, dict) else {}
+    return tuple(properties)
+
+
+def offer_torque(node: Node, robot: str, joints: str, place: str) -> None:
+    """Offer torque and reboot of joints as services; their controllers are deactivated where needed."""
+
+    def switch(connected: RemoteRobot, request: SetBool.Request) -> Executed:
+        return connected.torque(joints, request.data, release=not request.data)
+
+    def reboot(connected: RemoteRobot, request: Trigger.Request) -> Executed:
+        return connected.reboot(joints, release=True)
+
+    for kind, name, ask in ((SetBool, "torque", switch), (Trigger, "reboot", reboot)):
+        offer(node, robot, kind, f"{place}/{name}", ask)
+
+
+def offer(
+    node: Node, robot: str, kind: type, name: str, ask: Callable[[RemoteRobot, SetBool.Request], Executed]
+) -> None:
+    """Offer a service of std_srvs that asks something of the robot; `ask` gets it connected."""
+
+    def asked(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        try:
+            with connect(robot, CLIENT) as connected:
+                done = ask(connected, request)
+            response.success = True
+            left = f"; deactivated: {', '.join(done.deactivated)}" if done.deactivated else ""
+            response.message = f"done in cycle {done.cycle}{left}"
+        except DxlrunError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    node.create_service(kind, name, asked, callback_group=ReentrantCallbackGroup())
+
+
+def _is_parameter(value: object) -> bool:
+    """Return whether ROS 2 has a type for a value."""
+    if isinstance(value, list):
+        return len({type(one) for one in value}) == 1 and isinstance(value[0], bool | int | float | str)
+    return isinstance(value, bool | int | float | str)

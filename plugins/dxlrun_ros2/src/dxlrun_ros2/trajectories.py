@@ -1,0 +1,167 @@
+"""Trajectories of ROS 2 as dxlrun takes them: checked, sampled by the controllers' splines, compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTolerance
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from dxlrun import Floats, InputError
+from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, SplineSample, Trajectory, flatten
+
+Result = FollowJointTrajectory.Result
+
+
+class WrongTrajectory(InputError):
+    """A trajectory that is not taken, with the code of control_msgs/FollowJointTrajectory."""
+
+    def __init__(self, code: int, why: str) -> None:
+        super().__init__(why)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a trajectory wants of its joints: rad, rad/s, rad/s^2, s."""
+
+    joints: tuple[str, ...]
+    times: Floats
+    """s after the start, growing; shape (points,)"""
+    points: Floats
+    """Position, velocity, acceleration; shape (points, 3, joints)"""
+    orders: tuple[int, ...]
+    """How many coefficients each point has, by what is given of it."""
+    start_in: float
+    """s"""
+
+    @property
+    def seconds(self) -> float:
+        """Until its last point."""
+        return self.start_in + float(self.times[-1])
+
+    def command(self) -> dict[str, object]:
+        """Return the goal `trajectory` of a joint_trajectory_controller."""
+        return {"points": self._points(0.0), "joints": list(self.joints), "start_in": self.start_in}
+
+    def chunk(self, now: float) -> dict[str, object]:
+        """Return the command `chunk`; `now`: of any clock that goes on, s."""
+        return {"points": self._points(now + self.start_in), "joints": list(self.joints), "now": now}
+
+    def _points(self, begin: float) -> list[dict[str, object]]:
+        rows = []
+        for time, point, order in zip(self.times.tolist(), self.points.tolist(), self.orders, strict=True):
+            row: dict[str, object] = {"time": begin + time, "positions": point[0]}
+            if order >= CUBIC:
+                row["velocities"] = point[1]
+            if order == QUINTIC:
+                row["accelerations"] = point[2]
+            rows.append(row)
+        return rows
+
+    def spline(self, begin: Floats) -> Trajectory:
+        """Return what its controller plays, from joints that rest at `begin`."""
+        spline, now = Trajectory(len(self.joints)), SplineSample(len(self.joints))
+        now.rest_at(begin)
+        spline.load(flatten(self.orders, self.times, self.points, self.start_in), now)
+        return spline
+
+    def index(self, seconds: float) -> int:
+        """Return the point that is next at a time after the goal's beginning."""
+        return min(int(np.searchsorted(self.times + self.start_in, seconds)), len(self.times) - 1)
+
+
+def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wanted:
+    """Return what a trajectory wants of some of a controller's joints; `now`: s of the clock of its stamp.
+
+    A first point at time 0 is where the joints are already, so it is left out where others follow. Raises
+    WrongTrajectory.
+    """
+    named = tuple(message.joint_names)
+    if unknown := [name for name in named if name not in joints]:
+        raise WrongTrajectory(
+            Result.INVALID_JOINTS, f"{', '.join(unknown)}: not among its joints, {', '.join(joints)}"
+        )
+    if not named or len({*named}) < len(named):
+        raise WrongTrajectory(Result.INVALID_JOINTS, "joint_names must name each joint once, at least one")
+    points, times = np.zeros((len(message.points), 3, len(named))), np.zeros(len(message.points))
+    orders = []
+    for index, point in enumerate(message.points):
+        times[index] = seconds_of(point.time_from_start)
+        given = (point.positions, point.velocities, point.accelerations)
+        for row, (what, values) in enumerate(
+            zip(("positions", "velocities", "accelerations"), given, strict=True)
+        ):
+            if len(values) not in ((len(named),) if row == 0 else (0, len(named))):
+                raise _invalid(f"point {index + 1} has {len(values)} {what} for {len(named)} joints")
+            points[index, row] = values if len(values) else 0.0
+        orders.append(LINEAR if not given[1] else QUINTIC if given[2] else CUBIC)
+    if not np.isfinite(points).all():
+        raise _invalid("it has numbers that are not finite")
+    if (np.diff(times, prepend=-1e-12) <= 0).any():
+        raise _invalid("time_from_start must be at least 0, and grow from point to point")
+    stamp = seconds_of(message.header.stamp)
+    start_in = stamp - now if stamp else 0.0
+    if start_in < 0:
+        times, start_in = times + start_in, 0.0
+    ahead = times > 0
+    if not ahead.any():
+        if stamp:
+            raise WrongTrajectory(Result.OLD_HEADER_TIMESTAMP, "all its points are in the past")
+        ahead[-1] = True
+    chosen = tuple(order for order, is_ahead in zip(orders, ahead, strict=True) if is_ahead)
+    return Wanted(named, times[ahead], points[ahead], chosen, start_in)
+
+
+def _invalid(why: str) -> WrongTrajectory:
+    return WrongTrajectory(Result.INVALID_GOAL, why)
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far joints may be off: rad and rad/s, infinite: not checked; shape (joints,)."""
+
+    position: Floats
+    velocity: Floats
+
+    def violated(self, joints: Sequence[str], error: Floats) -> str:
+        """Return which joint is off by how much, of errors of shape (2, joints); empty: none is."""
+        for what, most, off in zip(
+            ("position", "velocity"), (self.position, self.velocity), error, strict=True
+        ):
+            beyond = np.abs(off) - most
+            row = int(np.nanargmax(np.where(np.isfinite(off), beyond, -np.inf)))
+            if beyond[row] > 0:
+                return f"{joints[row]} is off by {abs(off[row]):.4g} in {what}, {most[row]:.4g} is allowed"
+        return ""
+
+
+def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> Tolerances:
+    """Return the tolerances of a goal; 0 and below: not checked here. Raises WrongTrajectory."""
+    rows: Mapping[str, JointTolerance] = {one.name: one for one in given}
+    if unknown := [name for name in rows if name not in joints]:
+        raise WrongTrajectory(
+            Result.INVALID_JOINTS, f"a tolerance names {', '.join(unknown)}, which is not moved"
+        )
+    found = np.full((2, len(joints)), np.inf)
+    for row, name in enumerate(joints):
+        if name in rows:
+            values = np.array([rows[name].position, rows[name].velocity])
+            found[:, row] = np.where(values > 0, values, np.inf)
+    return Tolerances(*found)
+
+
+def point(rows: Floats, seconds: float) -> JointTrajectoryPoint:
+    """Return a point of a message, of positions and velocities of joints, shape (2, joints)."""
+    message = JointTrajectoryPoint(positions=rows[0].tolist(), velocities=rows[1].tolist())
+    message.time_from_start = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+    return message
+
+
+def seconds_of(message: Time | Duration) -> float:
+    """Return a time or a duration in s."""
+    return float(message.sec) + float(message.nanosec) * 1e-9
