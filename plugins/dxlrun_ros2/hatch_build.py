@@ -44,8 +44,9 @@ class Interfaces(BuildHookInterface[Any]):
                 make(source, made / "sources" / source.name, library, made / "lib")
                 _describe(source, share)
             included[str(package)] = source.name
-        for folder in ("lib", "share"):
-            build_data["shared_data"][str(made / folder)] = folder
+        build_data["shared_data"][str(made / "share")] = "share"
+        for path in (made / "lib").iterdir():  # one by one: of a folder what .gitignore names is left out
+            build_data["shared_data"][str(path)] = f"lib/{path.name}"
 
 
 def make(source: Path, place: Path, library: Path, libraries: Path) -> None:

@@ -81,7 +81,7 @@ class Action:
 
     def _execute(self, handle: ServerGoalHandle) -> object:
         try:
-            with connect(self.run.robot, f"{CLIENT} action") as robot:
+            with connect(self.run.address, f"{CLIENT} action") as robot:
                 return self.execute(handle, robot)
         except DxlrunError as error:
             self.node.get_logger().error(str(error))

@@ -29,25 +29,25 @@ LAST_S = 0.3
 class Bridge:
     """One run in ROS 2, in a context of its own: what a run had is gone with it."""
 
-    def __init__(self, robot: RemoteRobot, lease: float) -> None:
-        """Open nodes and topics. Raises DxlrunError."""
+    def __init__(self, robot: RemoteRobot, address: str, lease: float) -> None:
+        """Open nodes and topics; `address`: what the robot is connected to by. Raises DxlrunError."""
         self._robot = robot
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._executor = MultiThreadedExecutor(THREADS, context=self._context)
         self._nodes: dict[str, Node] = {}
+        self._controllers: dict[str, ControllerNode] = {}
+        self._points = SetPoints(address, lease)
         try:
             own = self.node("dxlrun")
-            self.run = PublishedRun(own, robot)
-            offer(own, robot.name, Trigger, "~/halt", lambda connected, _: connected.halt())
-            offer_torque(own, robot.name, "all", "~")
+            self.run = PublishedRun(own, robot, address)
+            offer(own, address, Trigger, "~/halt", lambda connected, _: connected.halt())
+            offer_torque(own, address, "all", "~")
             loads = {
                 "allow_undeclared_parameters": True,
                 "automatically_declare_parameters_from_overrides": True,
             }
-            Manager(self.node("controller_manager", **loads), robot.name)
-            self._points = SetPoints(robot.name, lease)
-            self._controllers: dict[str, ControllerNode] = {}
+            Manager(self.node("controller_manager", **loads), address)
         except BaseException:
             self.close()
             raise
@@ -67,13 +67,19 @@ class Bridge:
                 looked = time.monotonic()
                 self.run.hear(self._robot)
                 self._look()
-            self._executor.spin_once(0.1)
+            self._serve(0.1)
         self.run.ended.set()
         until = time.monotonic() + LAST_S
         while time.monotonic() < until:
-            self._executor.spin_once(0.05)
+            self._serve(0.05)
         if not stopped.is_set():
             print(self.run.why, flush=True)
+
+    def _serve(self, timeout_s: float) -> None:
+        try:
+            self._executor.spin_once(timeout_s)
+        except Exception as error:  # the last resort: one request that goes wrong ends nothing else
+            self._nodes["dxlrun"].get_logger().error(f"{type(error).__name__}: {error}")
 
     def _look(self) -> None:
         """Open a node for each new controller, and close those that are unloaded. Raises DxlrunError."""
@@ -93,6 +99,7 @@ class Bridge:
 
     def close(self) -> None:
         """End all nodes."""
+        self._points.close()
         self._executor.shutdown(timeout_sec=1.0)
         for node in self._nodes.values():
             node.destroy_node()

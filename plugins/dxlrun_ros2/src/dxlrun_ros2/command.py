@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from rclpy.utilities import remove_ros_args
 
-from dxlrun import DxlrunError, RemoteRobot, connect, running
+from dxlrun import DxlrunError, connect, running
 from dxlrun_ros2.bridge import Bridge
 from dxlrun_ros2.published_run import CLIENT
 
@@ -44,13 +44,13 @@ def main() -> int:
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
-    name: str | None = arguments.robot
+    address: str | None = arguments.robot
     said = ""
     while not stopped.is_set():
         try:
-            with connect(name, CLIENT) as robot:
-                name, said = robot.name, ""
-                _bridge(robot, arguments.lease, stopped)
+            with connect(address, CLIENT) as robot:
+                address, said = address or robot.name, ""
+                _bridge(Bridge(robot, address, arguments.lease), robot.name, stopped)
         except DxlrunError as error:
             if str(error) != said:
                 said = str(error)
@@ -59,11 +59,10 @@ def main() -> int:
     return 0
 
 
-def _bridge(robot: RemoteRobot, lease: float, stopped: threading.Event) -> None:
-    """Bridge one run of a robot. Raises DxlrunError."""
-    bridge = Bridge(robot, lease)
+def _bridge(bridge: Bridge, name: str, stopped: threading.Event) -> None:
+    """Serve one run of a robot. Raises DxlrunError."""
     try:
-        print(f"{robot.name} is in ROS 2; Ctrl-C ends this, not the robot.", flush=True)
+        print(f"{name} is in ROS 2; Ctrl-C ends this, not the robot.", flush=True)
         bridge.spin(stopped)
     finally:
         bridge.close()

@@ -21,7 +21,7 @@ from dxlrun.remote.client import Executed
 from dxlrun.remote.requests.replies import ControllerInfo
 from dxlrun_ros2.actions import FollowTrajectory, Gripper, stopped
 from dxlrun_ros2.published_run import CLIENT, STATE, PublishedRun
-from dxlrun_ros2.set_points import SetPoints
+from dxlrun_ros2.set_points import LONGEST_S, SetPoints
 from dxlrun_ros2.trajectories import point, wanted
 
 GROUP = ("positions", "posvel", "poseffort", "velocities", "efforts", "pwm")
@@ -57,7 +57,7 @@ class ControllerNode:
         self._live: dict[str, object] = {}
         self._declare(robot)
         if controller.command:
-            offer_torque(node, run.robot, controller.name, name)
+            offer_torque(node, run.address, controller.name, name)
 
     def close(self) -> None:
         """Leave the run's cycles alone."""
@@ -72,7 +72,7 @@ class ControllerNode:
             stopped(robot, self._run, self._controller)
             return
         plan = wanted(message, self._controller.joints, self.node.get_clock().now().nanoseconds * 1e-9)
-        if "chunk" in self._controller.takes:
+        if "chunk" in self._controller.takes and self._points.lease + plan.seconds <= LONGEST_S:
             self._points.send(robot, name, "chunk", plan.chunk(time.monotonic()), plan.seconds)
         else:
             robot.send(name, "trajectory", plan.command())
@@ -147,7 +147,7 @@ class ControllerNode:
         values = {one.name: one.value for one in parameters if self._live.get(one.name) != one.value}
         if values and values.keys() <= self._live.keys():
             try:
-                with connect(self._run.robot, CLIENT) as robot:
+                with connect(self._run.address, CLIENT) as robot:
                     robot.set_parameters(self._controller.name, values)
             except DxlrunError as error:
                 return SetParametersResult(successful=False, reason=str(error))

@@ -56,8 +56,8 @@ AnyResponse = TypeVar("AnyResponse")
 class Manager:
     """The services of ros2_control's controller_manager, for a running robot."""
 
-    def __init__(self, node: Node, robot: str) -> None:
-        self._node, self._robot = node, robot
+    def __init__(self, node: Node, address: str) -> None:
+        self._node, self._address = node, address
         group = ReentrantCallbackGroup()
         for kind, name, answer in (
             (ListControllers, "list_controllers", self._list),
@@ -79,7 +79,7 @@ class Manager:
     ) -> AnyResponse:
         """Answer a request; one that is refused is not ok, and the log of ROS has the reason."""
         try:
-            with connect(self._robot, CLIENT) as robot:
+            with connect(self._address, CLIENT) as robot:
                 answer(robot, request, response)
                 if hasattr(response, "ok"):
                     response.ok = True

@@ -30,6 +30,8 @@ QUALITIES = {
 }
 GLOBAL = {schemas.FRAMES_TOPIC, schemas.STILL_FRAMES_TOPIC, schemas.ROSOUT_TOPIC, schemas.DIAGNOSTICS_TOPIC}
 """Topics that ROS 2 has once, whatever the namespace."""
+LOGGED = (schemas.CYCLE, schemas.COMMAND, schemas.EVENT, schemas.BUS_PACKETS, schemas.MACHINE)
+"""Messages that only the log has."""
 _OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
 """Type of the gateway's own topics, which the log has not: /cycle has their values."""
 
@@ -37,10 +39,10 @@ _OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
 class PublishedRun(RunMessages):
     """Publishes one run until it ends: all that the log has, where this environment has its type."""
 
-    def __init__(self, node: Node, robot: RemoteRobot) -> None:
-        """Open the topics that every run has. Raises DxlrunError."""
+    def __init__(self, node: Node, robot: RemoteRobot, address: str) -> None:
+        """Open the topics of every run; `address`: what the robot is connected to by. Raises DxlrunError."""
         super().__init__(robot.log_header())
-        self.robot, self._node = robot.name, node
+        self.address, self._node = address, node
         self.ended = threading.Event()
         self.why = ""
         self.seen: set[Callable[[np.void], None]] = set()
@@ -59,6 +61,8 @@ class PublishedRun(RunMessages):
         quality = LATCHED if latched else QUALITIES.get(topic, STATE)
         name = topic if topic in GLOBAL else topic.removeprefix("/")
         kind = message_class(message.name)
+        if kind is None and message not in LOGGED:
+            self._node.get_logger().warning(f"{topic} is not published: {message.name} is not installed here")
         opened = None if kind is None else self._node.create_publisher(kind, name, quality)
         self._publishers_of.append(opened)
         self._opened[topic, message] = len(self._publishers_of) - 1
@@ -78,11 +82,11 @@ class PublishedRun(RunMessages):
     def _listen(self, topics: set[str]) -> None:
         """Publish the messages of topics until the run ends."""
         try:
-            with connect(self.robot, CLIENT) as robot:
+            with connect(self.address, CLIENT) as robot:
                 for message in robot.listen(*topics):
                     with self._lock:
                         self._take(message)
-            self.why = f"the run of {self.robot} has ended"
+            self.why = f"the run of {self.header.robot} has ended"
         except DxlrunError as error:
             self.why = str(error)
         except Exception as error:  # the last resort: without it the topics would fall silent

@@ -14,6 +14,8 @@ from dxlrun.remote.sockets import SocketLink
 from dxlrun_ros2.published_run import CLIENT
 
 Message = TypeVar("Message")
+LONGEST_S = 60.0
+"""Of a lease, s."""
 QUIET_S = 2.0
 """Between two warnings of a topic."""
 
@@ -21,14 +23,20 @@ QUIET_S = 2.0
 class SetPoints:
     """One connection for the streams of all publishers; the log names the node of each."""
 
-    def __init__(self, robot: str, lease: float) -> None:
+    def __init__(self, address: str, lease: float) -> None:
         """`lease`: for how long a set-point counts, s."""
         self.lease = lease
-        self._name = robot
+        self._address = address
         self._robot: RemoteRobot | None = None
         self._lock = threading.Lock()
         self._nodes: dict[bytes, str] = {}
         """Names of publishers' nodes by what the middleware identifies them with."""
+
+    def close(self) -> None:
+        """Close the connection; the leases run out."""
+        with self._lock:
+            if self._robot is not None:
+                self._robot.close()
 
     def subscribe(
         self, node: Node, kind: type, topic: str, take: Callable[[Message, RemoteRobot], None]
@@ -56,11 +64,11 @@ class SetPoints:
         more_s: float = 0.0,
     ) -> None:
         """Leave a set-point of the publisher that is being served; it counts for the lease and `more_s`."""
-        robot.stream(controller, kind, min(60.0, self.lease + more_s)).send(command)
+        robot.stream(controller, kind, self.lease + more_s).send(command)
 
     def _connected(self) -> RemoteRobot:
         if self._robot is None:
-            self._robot = connect(self._name, CLIENT)
+            self._robot = connect(self._address, CLIENT)
         return self._robot
 
     def _publisher(self, node: Node, topic: str, info: MessageInfo) -> str:
