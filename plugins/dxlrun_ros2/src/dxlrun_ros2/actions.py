@@ -16,7 +16,8 @@ from rclpy.node import Node
 from dxlrun import DxlrunError, Floats, GoalState, Refused, RemoteGoal, RemoteRobot, connect
 from dxlrun.remote.requests.replies import ControllerInfo
 from dxlrun_controllers.laws.spline import SplineSample
-from dxlrun_ros2.published_run import CLIENT, PublishedRun
+from dxlrun_ros2 import CLIENT
+from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.trajectories import (
     Result,
     Tolerances,

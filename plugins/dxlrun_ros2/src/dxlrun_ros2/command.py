@@ -8,20 +8,21 @@ import signal
 import sys
 import threading
 from contextlib import suppress
-
-from rclpy.utilities import remove_ros_args
+from typing import TYPE_CHECKING
 
 from dxlrun import DxlrunError, connect, running
-from dxlrun_ros2.bridge import Bridge
-from dxlrun_ros2.published_run import CLIENT
+from dxlrun_ros2 import CLIENT
+
+if TYPE_CHECKING:
+    from dxlrun_ros2.bridge import Bridge
 
 NICENESS = 10
 """As the gateway's: ROS gets the processor time that the robot leaves."""
 RETRY_S = 0.2
 
 
-def main() -> int:
-    """Bridge one run of the robot after the other, until Ctrl-C or SIGTERM."""
+def arguments(words: list[str]) -> argparse.Namespace:
+    """Return what the command line has, without what is for ROS."""
     parser = argparse.ArgumentParser(
         "dxlrun-ros2", description="A running robot in ROS 2, under the names of ros2_control."
     )
@@ -32,25 +33,35 @@ def main() -> int:
         "--lease",
         type=float,
         default=0.5,
-        help="s; a publisher that is silent for longer lets its joints be held",
+        help="s; the joints of a publisher that is silent for longer are held",
     )
-    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    if not 0.01 <= arguments.lease <= 60:
-        parser.error(f"--lease {arguments.lease:g}: give 0.01 to 60 s")
-    if arguments.robot is None and len(found := running()) > 1:
-        parser.error(f"several robots run: {', '.join(found)}; name one")
+    found = parser.parse_args(words)
+    if not 0.01 <= found.lease <= 60:
+        parser.error(f"--lease {found.lease:g}: give 0.01 to 60 s")
+    if found.robot is None and len(names := running()) > 1:
+        parser.error(f"several robots run: {', '.join(names)}; name one")
+    return found
+
+
+def main() -> int:
+    """Bridge one run of the robot after the other, until Ctrl-C or SIGTERM."""
+    from rclpy.utilities import remove_ros_args
+
+    from dxlrun_ros2.bridge import Bridge
+
+    given = arguments(remove_ros_args(sys.argv)[1:])
     with suppress(OSError):
         os.nice(NICENESS)
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
-    address: str | None = arguments.robot
+    address: str | None = given.robot
     said = ""
     while not stopped.is_set():
         try:
             with connect(address, CLIENT) as robot:
                 address, said = address or robot.name, ""
-                _bridge(Bridge(robot, address, arguments.lease), robot.name, stopped)
+                _bridge(Bridge(robot, address, given.lease), robot.name, stopped)
         except DxlrunError as error:
             if str(error) != said:
                 said = str(error)

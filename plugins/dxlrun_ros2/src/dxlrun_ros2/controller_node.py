@@ -19,8 +19,9 @@ from trajectory_msgs.msg import JointTrajectory
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
 from dxlrun.remote.client import Executed
 from dxlrun.remote.requests.replies import ControllerInfo
+from dxlrun_ros2 import CLIENT
 from dxlrun_ros2.actions import FollowTrajectory, Gripper, stopped
-from dxlrun_ros2.published_run import CLIENT, STATE, PublishedRun
+from dxlrun_ros2.published_run import STATE, PublishedRun
 from dxlrun_ros2.set_points import LONGEST_S, SetPoints
 from dxlrun_ros2.trajectories import point, wanted
 

@@ -32,7 +32,7 @@ from rclpy.node import Node
 
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
 from dxlrun.remote.requests.replies import ControllerInfo, RobotInfo
-from dxlrun_ros2.published_run import CLIENT
+from dxlrun_ros2 import CLIENT
 
 TYPES = {
     "diff_drive_controller": "diff_drive_controller/DiffDriveController",

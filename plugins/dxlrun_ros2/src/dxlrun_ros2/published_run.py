@@ -19,8 +19,8 @@ from dxlrun.log import schemas
 from dxlrun.log.run_messages import RunMessages
 from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.messages.definition import MessageType
+from dxlrun_ros2 import CLIENT
 
-CLIENT = "dxlrun-ros2"
 STATE = QoSProfile(depth=1)
 """As broadcasters of ros2_control have it: reliable, the newest message, nothing for late subscribers."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -11,7 +11,7 @@ from rclpy.subscription import MessageInfo
 
 from dxlrun import DxlrunError, RemoteRobot, connect
 from dxlrun.remote.sockets import SocketLink
-from dxlrun_ros2.published_run import CLIENT
+from dxlrun_ros2 import CLIENT
 
 Message = TypeVar("Message")
 LONGEST_S = 60.0
