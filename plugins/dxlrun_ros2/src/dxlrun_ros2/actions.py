@@ -168,12 +168,12 @@ class FollowTrajectory(Action):
                 return self.failed(
                     why, Result.PATH_TOLERANCE_VIOLATED if watch.violated else Result.INVALID_GOAL
                 )
-            if state.status == "cancelled" and handle.is_cancel_requested:
-                handle.canceled()
-                return Result(error_string="cancelled, the joints are at rest")
             if state.reached and not (why := self._off(handle, watch)):
                 handle.succeed()
-                return Result(error_code=Result.SUCCESSFUL, error_string=state.text)
+                return Result(error_string=state.text)
+            if handle.is_cancel_requested:
+                handle.canceled()
+                return Result(error_string=f"{state.status}, the joints are at rest")
             handle.abort()
             return self.failed(why or state.text or state.status, self._code(state))
         finally:

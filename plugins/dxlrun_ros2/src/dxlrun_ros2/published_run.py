@@ -140,6 +140,7 @@ class PublishedRun(RunMessages):
 def message_class(name: str) -> type | None:
     """Return the class of a message, `nav_msgs/msg/Odometry`; None where this environment has none."""
     package, folder, kind = name.split("/")
+    package = "dxlrun_msgs" if package == "dxlrun" else package  # that is a package of Python already
     try:
         found = getattr(import_module(f"{package}.{folder}"), kind, None)
     except ImportError:
