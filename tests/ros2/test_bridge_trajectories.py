@@ -1,0 +1,120 @@
+"""Trajectories of ROS 2 as the bridge takes them: judged in the Python of a ROS environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from typing import Any
+
+import pytest
+
+PYTHON = os.environ.get("DXLRUN_ROS2_PYTHON", "")
+pytestmark = pytest.mark.skipif(
+    not PYTHON, reason="DXLRUN_ROS2_PYTHON names no Python that has rclpy and dxlrun_ros2"
+)
+BEGIN = """
+import json, sys
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from control_msgs.msg import JointTolerance
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from dxlrun_ros2.trajectories import WrongTrajectory, tolerances, wanted
+
+def at(seconds, **values):
+    duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+    return JointTrajectoryPoint(time_from_start=duration, **values)
+
+def trajectory(joints, *points, stamp=0):
+    found = JointTrajectory(joint_names=joints, points=points)
+    found.header.stamp = Time(sec=stamp)
+    return found
+
+def code(call):
+    try:
+        return call()
+    except WrongTrajectory as error:
+        return [error.code, str(error)]
+
+JOINTS = ("pan", "tilt", "roll")
+"""
+
+
+def result_of(code: str) -> Any:
+    """Run code in the environment of ROS; return what it prints as JSON."""
+    ran = subprocess.run(
+        [PYTHON, "-c", BEGIN + code], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_a_trajectory_becomes_the_goal_of_some_joints() -> None:
+    goal, chunk = result_of("""
+points = [at(0, positions=[9, 9]), at(0.5, positions=[1, 2], velocities=[3, 4])]
+points.append(at(1, positions=[5, 6], velocities=[0, 0], accelerations=[0, 1]))
+plan = wanted(trajectory(["roll", "pan"], *points), JOINTS, 100.0)
+print(json.dumps([plan.command(), plan.chunk(50.0)]))""")
+    first = {"time": 0.5, "positions": [1, 2], "velocities": [3, 4]}
+    last = {"time": 1.0, "positions": [5, 6], "velocities": [0, 0], "accelerations": [0, 1]}
+    assert goal == {"points": [first, last], "joints": ["roll", "pan"], "start_in": 0.0}
+    assert chunk["now"] == 50.0
+    assert [point["time"] for point in chunk["points"]] == [50.5, 51.0]
+
+
+def test_a_stamp_says_when_it_begins() -> None:
+    ahead, late, past = result_of("""
+points = [at(1, positions=[0.1]), at(3, positions=[0.2])]
+plans = [wanted(trajectory(["pan"], *points, stamp=100), JOINTS, now) for now in (98.0, 102.0)]
+print(json.dumps([[one.start_in, *one.times.tolist()] for one in plans]
+    + [code(lambda: wanted(trajectory(["pan"], *points, stamp=100), JOINTS, 104.0))]))""")
+    assert ahead == [2.0, 1.0, 3.0]
+    assert late == [0.0, 1.0]
+    assert past == [-3, "all its points are in the past"]
+
+
+WRONG = {
+    'trajectory(["nose"], at(1, positions=[0]))': (-2, "nose: not among its joints, pan, tilt, roll"),
+    'trajectory(["pan", "pan"], at(1, positions=[0, 0]))': (-2, "each joint once"),
+    "trajectory([], at(1, positions=[]))": (-2, "at least one"),
+    'trajectory(["pan"], at(1, positions=[0, 1]))': (-1, "point 1 has 2 positions for 1 joints"),
+    'trajectory(["pan"], at(1, velocities=[0]))': (-1, "point 1 has 0 positions"),
+    'trajectory(["pan"], at(1, positions=[0], accelerations=[0, 1]))': (-1, "2 accelerations"),
+    'trajectory(["pan"], at(1, positions=[float("nan")]))': (-1, "not finite"),
+    'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': (-1, "grow from point to point"),
+    'trajectory(["pan"], at(-1, positions=[0]))': (-1, "at least 0"),
+}
+
+
+def test_what_is_wrong_is_refused_with_its_code() -> None:
+    calls = ", ".join(f"code(lambda: wanted({wrong}, JOINTS, 1.0))" for wrong in WRONG)
+    for found, (code, why) in zip(result_of(f"print(json.dumps([{calls}]))"), WRONG.values(), strict=True):
+        assert found[0] == code
+        assert why in found[1]
+
+
+def test_tolerances_name_the_joint_that_is_farthest_beyond() -> None:
+    within, position, velocity, unchecked, unknown = result_of("""
+given = [JointTolerance(name="pan", position=0.1), JointTolerance(name="tilt", position=0.2, velocity=0.5)]
+most = tolerances(given, JOINTS)
+errors = [([0.1, 0.2, 9], [0, 0.5, 0]), ([0.3, -0.5, 9], [9, 0, 0]), ([0, 0, 0], [0, -0.6, 0])]
+errors += [([np.nan] * 3, [0, 0, 0])]
+print(json.dumps([most.violated(JOINTS, np.array(one, float)) for one in errors]
+    + [code(lambda: tolerances(given, ("pan",)))]))""")
+    assert within == unchecked == ""
+    assert position == "tilt is off by 0.5 in position, 0.2 is allowed"
+    assert velocity == "tilt is off by 0.6 in velocity, 0.5 is allowed"
+    assert unknown == [-2, "a tolerance names tilt, which is not moved"]
+
+
+def test_the_desired_state_is_that_of_the_controllers_spline() -> None:
+    """A quintic way from rest to rest is half done in half of its time, and at 30/16 of the mean velocity."""
+    position, velocity, index = result_of("""
+from dxlrun_controllers.laws.spline import SplineSample
+plan = wanted(trajectory(["pan"], at(2, positions=[1], velocities=[0], accelerations=[0])), JOINTS, 1.0)
+sample = SplineSample(1)
+plan.spline(np.zeros(1)).sample(1.0, sample)
+print(json.dumps([*sample.position, *sample.velocity, plan.index(5.0)]))""")
+    assert position == pytest.approx(0.5)
+    assert velocity == pytest.approx(30 / 16 / 2)
+    assert index == 0
