@@ -144,26 +144,27 @@ def test_the_socket_of_a_gateway_that_was_killed_is_removed(make_run, started, h
     assert len(run.remarks) == 1
 
 
-@pytest.mark.parametrize("kind", ["held", "refused", "simulated", "not wanted"])
-def test_a_robot_on_a_real_port_begins_when_the_gateway_answers(plan, started, heartbeat, kind):
-    """And ends where there is none: nothing could stop it."""
-    given = plan("") if kind == "simulated" else real(plan(""))
+@pytest.mark.parametrize("kind", ["held", "refused", "simulated", "not wanted", "listens", "listens not"])
+def test_a_robot_that_must_be_reached_begins_when_the_gateway_answers(plan, started, heartbeat, kind):
+    """On a real port, or where clients of other computers are to; it ends where there is none."""
+    given = plan("") if kind in {"simulated", "listens", "listens not"} else real(plan(""))
     memory = create_memory(given)
-    options = RunOptions(record=False, gateway=kind != "not wanted")
+    listen = "lab3:7660" if kind in {"listens", "listens not"} else ""
+    options = RunOptions(record=False, gateway=kind != "not wanted", listen=listen)
     run = supervisor._Run(given, options, memory, Console(file=io.StringIO()))
     run.hold()
     inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
-    held = kind in {"held", "refused"}
+    held = kind in {"held", "refused", "listens", "listens not"}
     assert [(one.kind, one.origin) for one in inbox.take()] == [("pause", "loop")] * held
     run.guardian = SimpleNamespace(channel=SimpleNamespace(send=(sent := []).append))
-    if kind == "refused":
+    if refused := kind in {"refused", "listens not"}:
         started.ready[0] = Gateway(Failed("no place"))
     for _ in range(2):
         run._look_after_gateway(heartbeat)
-    assert sent == [Stop()] * (kind == "refused")
+    assert sent == [Stop()] * refused
+    fix = "without --listen it would" if listen else "--no-gateway runs without"
     assert run.sentences == (
-        ["the gateway did not start (no place), so the robot did not move; --no-gateway runs without"]
-        * len(sent)
+        [f"the gateway did not start (no place), so the robot did not move; {fix}"] * len(sent)
     )
     descriptors = Descriptors(*(getattr(memory, one.name) for one in fields(Descriptors)))
     Link(given, descriptors).let_begin()

@@ -168,7 +168,7 @@ class _Run:
 
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
-        self.held = self.steerable and not self.plan.simulated
+        self.held = self.steerable and (not self.plan.simulated or bool(self.options.listen))
 
     def count_signal(self) -> None:
         """Take a signal."""
@@ -301,7 +301,8 @@ class _Run:
         """Report that the run cannot be steered any more, and start no other gateway; end one that waits."""
         self.steerable = False
         if self.held and self.guardian is not None:
-            self.sentences.append(f"the gateway {what}, so the robot did not move; --no-gateway runs without")
+            fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
+            self.sentences.append(f"the gateway {what}, so the robot did not move; {fix}")
             self.guardian.channel.send(Stop())
         else:
             self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
