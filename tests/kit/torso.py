@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.wire import commands, taken_apart
 
 from dxlrun import running
 from dxlrun.simulation.bus.ledger import read_ledger
@@ -22,8 +23,9 @@ BROADCAST = 254
 class Run:
     """A torso in a process of its own."""
 
-    def __init__(self, place: Path, *, record: bool = False) -> None:
-        self.place, self.record = place, record
+    def __init__(self, place: Path, *words: str, record: bool = False) -> None:
+        """`words`: more words of its command line."""
+        self.place, self.record, self.words = place, record, words
         self.ledger = place / "ledger.jsonl"
         self.process: subprocess.Popen[bytes] | None = None
         shutil.copytree(ROBOTS, place / "robots")
@@ -40,8 +42,7 @@ class Run:
             *(() if self.record else ("--no-record",)),
             "--ledger",
             str(self.ledger),
-            "--duration",
-            "300",
+            *(self.words or ("--duration", "300")),
         ]
         with (self.place / "said").open("wb") as said:
             self.process = subprocess.Popen(
@@ -56,6 +57,10 @@ class Run:
             self.process.wait(DEADLINE_S)
             self.process = None
             self.ledger.unlink()
+
+    def commands(self) -> set[tuple[int, int, bytes]]:
+        """Return servo, address and bytes of all that was written to its servos, each once."""
+        return commands([*taken_apart(read_ledger(self.ledger), 1.0)], 1.0)
 
     @property
     def limp(self) -> bool:

@@ -6,7 +6,7 @@ Addresses and units too are those of FACTS, from the e-Manual, and not the runti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from tests.kit.packets import crc
@@ -89,13 +89,25 @@ def data_of(reply: bytes, protocol: float) -> bytes:
 def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Instruction]:
     """Take apart all that the host sent; whatever is no legal instruction fails."""
     known = {servo.servo_id for servo in bus.servos}
+    for sent in taken_apart(entries, bus.protocol):
+        assert sent.instruction in HOST_SAYS, sent
+        assert sent.servo_id in known | {BROADCAST}, sent
+        yield sent
+
+
+def taken_apart(entries: Iterable[LedgerEntry], protocol: float) -> Iterator[Instruction]:
+    """Yield each packet of the host."""
     for entry in entries:
         data = entry.data if entry.direction == "in" else b""
         while data:
-            servo_id, instruction, parameters, data = _first(data, bus.protocol)
-            assert instruction in HOST_SAYS, entry
-            assert servo_id in known | {BROADCAST}, entry
+            servo_id, instruction, parameters, data = _first(data, protocol)
             yield Instruction(entry.t_ns, servo_id, instruction, parameters)
+
+
+def commands(sent: Collection[Instruction], protocol: float) -> set[tuple[int, int, bytes]]:
+    """Return servo, address and bytes of all that was written, each once; a reboot writes nothing at 0."""
+    found = {one for each in sent for one in writes(each, protocol)}
+    return found | {(one.servo_id, 0, b"") for one in sent if one.instruction == REBOOT}
 
 
 def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import os
-import random
 import socket
 import ssl
 from contextlib import suppress
@@ -25,9 +24,7 @@ from dxlrun.remote.sockets import Address, address_of
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
-FRAMES = int(os.environ.get("DXLRUN_NETWORK_FRAMES", "300"))
 HALF_OPEN = int(os.environ.get("DXLRUN_NETWORK_HALF_OPEN", "150"))
-SWITCH = b'POST /switch HTTP/1.1\r\nHost: x\r\nContent-Length: 33\r\n\r\n{"activate":[],"deactivate":["x"]}'
 
 
 @pytest.fixture(scope="module")
@@ -249,37 +246,6 @@ def test_half_open_connections_keep_no_client_out_and_are_closed(net):
     assert net.while_served(act) < before + MOST_UNPROVED + 30
     assert {command.kind for command in net.desk.taken} == {"stop"}
     assert len(net.desk.taken) == HALF_OPEN // 50
-
-
-@pytest.mark.campaign
-def test_rubbish_on_the_port_and_inside_tls_is_no_command(net):
-    chance = random.Random(int(os.environ.get("DXLRUN_NETWORK_SEED", "1")))
-    words = [STOP[:9], SWITCH, b"GET /robot HTTP/1.1\r\n\r\n", b"\r\n\r\n", b"Content-Length: 99999999\r\n"]
-
-    def frame():
-        data = bytearray(b"".join(chance.choices(words, k=chance.randrange(1, 4))))
-        for _ in range(chance.randrange(1, 9)):
-            data[chance.randrange(len(data))] = chance.randrange(256)
-        return bytes(data) if chance.randrange(3) else chance.randbytes(chance.randrange(1, 200))
-
-    net.be("observe")
-    context = client_context()
-    net.be("")
-
-    def act():
-        sent = 0
-        while sent < FRAMES:
-            with suppress(OSError), socket.create_connection(net.address[1:]) as end:
-                secured = context.wrap_socket(end, server_hostname="pair") if chance.randrange(2) else end
-                with secured:
-                    for _ in range(chance.randrange(1, 200)):
-                        sent += 1
-                        secured.sendall(frame())
-        with net.robot("command") as robot:
-            robot.stop(wait=False)
-
-    net.while_served(act)
-    assert [command.kind for command in net.desk.taken] == ["stop"]
 
 
 def test_addresses(monkeypatch, tmp_path):

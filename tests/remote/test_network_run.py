@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import os
 import re
 import shlex
 import shutil
@@ -10,19 +11,26 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import until
+from tests.kit.fuzzed_http import Said, fuzz, half_open, memory, process_of
 from tests.kit.pages import page_text
+from tests.kit.torso import Run
+from tests.kit.wire import commands, taken_apart
 
 import dxlrun
 from dxlrun.cli import main
 from dxlrun.errors import Refused
-from dxlrun.remote.network.certificates import client_context
+from dxlrun.remote.network.certificates import client_context, keys_place
+from dxlrun.remote.network.network_link import NetworkLink
 from dxlrun.remote.requests.table import EXAMPLES, REQUESTS, Role
+from dxlrun.remote.sockets import Address, SocketLink, sockets
 from dxlrun.simulation.bus.ledger import read_ledger
 
-pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
+authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROOT = Path(__file__).parents[2]
@@ -37,6 +45,9 @@ BODIES = {
     "/joints/head_yaw_joint/registers/cw_compliance_slope": b'{"value": 128}',
     "/rate": b'{"rate": 25}',
 }
+FRAMES = int(os.environ.get("DXLRUN_NETWORK_FRAMES", "300"))
+SEED = int(os.environ.get("DXLRUN_NETWORK_SEED", "1"))
+HALF_OPEN = int(os.environ.get("DXLRUN_NETWORK_HALF_OPEN", "150"))
 NAMES = {"name": "head", "kind": "posvel", "item": "cw_compliance_slope", "number": "1"}
 
 
@@ -123,11 +134,10 @@ def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_descri
             run.terminate()
             out, err = run.communicate(timeout=60)
     assert b"Traceback" not in out + err
-    asked = [one for one in read_ledger(here / "wire.jsonl") if one.direction == "in"]
-    before = {one.data for one in asked if one.t_ns < began}
-    during = {one.data for one in asked if began <= one.t_ns < ended}
-    assert during <= before
-    assert {one.data for one in asked if one.t_ns >= ended} - before
+    sent = [*taken_apart(read_ledger(here / "wire.jsonl"), 1.0)]
+    before = commands([one for one in sent if one.t_ns < began], 1.0)
+    assert commands([one for one in sent if began <= one.t_ns < ended], 1.0) <= before
+    assert commands([one for one in sent if one.t_ns >= ended], 1.0) - before
 
 
 def sweep(computers):
@@ -200,6 +210,64 @@ def described(computers):
                 assert ask("GET", path)[0] == 200, path
             elif "command" not in roles:
                 assert ask(method.upper(), path.replace("{", "").replace("}", ""))[0] == 403, path
+
+
+@pytest.mark.campaign
+def test_of_fuzzed_requests_no_command_comes_and_no_memory_is_kept(tmp_path, monkeypatch):
+    """An observer by TLS asks for all that it may not; of this user's own socket no request that commands."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = Address(f"{NAME}_imu", *free.getsockname())
+    authority.issue(address.name, None, 30, keys_place())
+    authority.issue("olga", Role.OBSERVE, 30, keys_place())
+    run = Run(tmp_path, "--listen", str(address))
+    try:
+        run.start()
+        gateway = process_of(run.process.pid, "dxlrun.remote")
+        with dxlrun.connect(address.name) as robot:
+            first = robot.info()["cycles"]
+            until(lambda: robot.info()["cycles"] > first + 20)
+        before = run.commands()
+        for link in (NetworkLink(address, ""), SocketLink(sockets()[address.name], "")):
+            kept, sent = [], []
+            for count in (FRAMES // 10, FRAMES):
+                sent.append(fuzz(link._connected, seeds(link), count, SEED + len(sent)))
+                with half_open(partial(reached, link), HALF_OPEN):
+                    assert link.exchange("GET", "/robot", None)[0] == 200
+                link.close()
+                kept.append(memory(gateway))
+            print(type(link).__name__, *sent, kept, "MB")
+            assert sent[1].answers > 0.5 * sent[1].frames
+            assert kept[1] < kept[0] + 20.0
+            assert run.commands() == before
+        with dxlrun.connect(address.name) as robot:
+            robot.stop()
+        assert run.commands() > before
+    finally:
+        run.end()
+
+
+def seeds(link):
+    """Return the requests of the table but streams and long ones; of the Unix socket none that commands."""
+    found = []
+    for one in REQUESTS:
+        path = re.sub(r"\{(\w+)(:path)?\}", lambda word: NAMES[word[1]], one.path)
+        if path in {"/stream", "/frames", "/log-header", "/openapi.json"}:
+            continue
+        if isinstance(link, NetworkLink) or one.role is Role.OBSERVE:
+            body = BODIES.get(path, EXAMPLES.get(one.body, "{}").encode())
+            found.append(Said(one.method, path, body if one.method == "POST" else b""))
+    return found
+
+
+def reached(link):
+    """Return a connection to where a link goes, and no more."""
+    if isinstance(link, NetworkLink):
+        return socket.create_connection(link._address[1:])
+    end = socket.socket(socket.AF_UNIX)
+    end.connect(str(link._path))
+    return end
 
 
 def test_keys_write_over_nothing_that_is_anothers(computers):
