@@ -68,6 +68,8 @@ def foxglove(
     """
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")
+    if cert is None and key is not None:
+        raise InputError(f"--key {key}: add its certificate, --cert FILE")
     if listen != LOOPBACK and cert is None:
         raise InputError(
             f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
@@ -93,7 +95,9 @@ async def _serve(served: FoxgloveServer, listen: str, port: int | None, tls: ssl
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
     async with await _listening(served, listen, port, tls) as server:
         host, taken = next(iter(server.sockets)).getsockname()[:2]
-        url = f"{'wss' if tls else 'ws'}://{host}:{taken}/?token={served.token}"
+        url = (
+            f"{'wss' if tls else 'ws'}://{f'[{host}]' if ':' in host else host}:{taken}/?token={served.token}"
+        )
         app = f"{APP}/~/view?ds=foxglove-websocket&ds.url={quote(url, safe='')}"
         show(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends this, not the robot.")
         await ended.wait()

@@ -19,6 +19,8 @@ def test_the_network_is_served_with_tls_alone() -> None:
     for address in ("10.0.0.1", "192.168.1.2", "::", "localhost"):
         with pytest.raises(InputError, match=r"only 127\.0\.0\.1 is served without TLS; add --cert"):
             foxglove(listen=address)
+    with pytest.raises(InputError, match=r"--key key\.pem: add its certificate"):
+        foxglove(key=Path("key.pem"))
 
 
 def test_a_robot_has_to_run() -> None:

@@ -112,6 +112,17 @@ def test_a_client_looks_listens_and_commands_as_on_the_robots_own_computer(net):
     assert json.loads(net.desk.taken[0].data) == {"client": "client admin", "instead": "this computer"}
 
 
+def test_a_robot_has_the_name_by_which_it_can_be_connected_again(net):
+    """That in its certificate may be another robot's on this computer, or of the file."""
+    net.be("admin")
+    (keys_place().parent / "robots.yaml").write_text(f"robots: {{second: '{net.address}'}}")
+    for name in ("second", str(net.address)):
+        with connect(name) as robot:
+            assert robot.name == name
+            assert robot.link.__class__ is NetworkLink
+    (keys_place().parent / "robots.yaml").unlink()
+
+
 def test_each_role_may_what_the_table_has_and_the_loop_gets_nothing_else(desk):
     for role in Role:
         for request in REQUESTS:

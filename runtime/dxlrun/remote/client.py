@@ -101,7 +101,7 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     if robot is not None and robot not in found:
         address = address_of(robot) if "@" in robot else known_robots().get(robot)
         if address is not None:
-            return RemoteRobot(address.name, NetworkLink(address, client))
+            return RemoteRobot(robot, NetworkLink(address, client))
     names = ", ".join(sorted(found))
     if robot is None:
         if not found:
