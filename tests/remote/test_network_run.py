@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from tests.kit.awaited import until
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.fuzzed_http import Said, fuzz, half_open, memory, process_of
 from tests.kit.pages import page_text
 from tests.kit.torso import Run
@@ -31,6 +31,7 @@ from dxlrun.remote.sockets import Address, SocketLink, sockets
 from dxlrun.simulation.bus.ledger import read_ledger
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
+pytestmark = pytest.mark.timeout(600 if "DXLRUN_NETWORK_FRAMES" not in os.environ else 0)
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROOT = Path(__file__).parents[2]
@@ -120,10 +121,7 @@ def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_descri
         [DXLRUN, *start[1:], "--ledger", "wire.jsonl"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as run:
         try:
-            until = time.monotonic() + 60
-            while NAME not in dxlrun.running():
-                assert time.monotonic() < until
-                time.sleep(0.02)
+            until(lambda: NAME in dxlrun.running())
             computers.at("olga")
             began, ended = sweep(computers)
             computers.at("anna")
@@ -132,7 +130,7 @@ def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_descri
             commanded(computers)
         finally:
             run.terminate()
-            out, err = run.communicate(timeout=60)
+            out, err = run.communicate(timeout=DEADLINE_S)
     assert b"Traceback" not in out + err
     sent = [*taken_apart(read_ledger(here / "wire.jsonl"), 1.0)]
     before = commands([one for one in sent if one.t_ns < began], 1.0)
@@ -143,18 +141,16 @@ def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_descri
 def sweep(computers):
     """Ask all that an observer may not, and all that it may; return when that began and ended."""
     with dxlrun.connect(NAME, "sweep") as robot:
-        until = robot.info()["cycles"] + 50
-        while robot.info()["cycles"] < until:
-            time.sleep(0.01)
+        first = robot.info()["cycles"]
+        until(lambda: robot.info()["cycles"] > first + 50)
         began = time.monotonic_ns()
         for request, status, answer in ways(robot):
             if request.role is Role.OBSERVE:
                 assert status in (200, 404), request
             else:
                 assert (status, json.loads(answer)["code"]) == (403, "not_allowed"), request
-        until = robot.info()["cycles"] + 5
-        while robot.info()["cycles"] < until:
-            time.sleep(0.01)
+        last = robot.info()["cycles"]
+        until(lambda: robot.info()["cycles"] > last + 5)
         return began, time.monotonic_ns()
 
 
