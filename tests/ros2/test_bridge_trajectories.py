@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-PYTHON = os.environ.get("DXLRUN_ROS2_PYTHON", "")
+PYTHON = os.getenv("DXLRUN_ROS2_PYTHON", "")
 pytestmark = pytest.mark.skipif(
     not PYTHON, reason="DXLRUN_ROS2_PYTHON names no Python that has rclpy and dxlrun_ros2"
 )

@@ -22,7 +22,7 @@ LOOK_S = 1.0
 """Between two looks for topics and controllers that are new."""
 THREADS = 32
 """A goal has one until it ends; they are started when they are needed."""
-LAST_S = 0.3
+LAST_S = 1.0
 """At the end, for the results of goals."""
 
 

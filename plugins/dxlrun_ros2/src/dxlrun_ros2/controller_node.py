@@ -127,14 +127,11 @@ class ControllerNode:
             self.node.declare_parameter(one.name, value, about)
             if one.live:
                 self._live[one.name] = value
-        if not self.node.has_parameter("joints"):
-            self.node.declare_parameter(
-                "joints", list(self._controller.joints), ParameterDescriptor(read_only=True)
-            )
-        interfaces = list(self._controller.command)
-        self.node.declare_parameter(
-            "command_interfaces", interfaces, ParameterDescriptor(read_only=True, dynamic_typing=True)
-        )
+        also = {"joints": self._controller.joints, "command_interfaces": self._controller.command}
+        for name, values in also.items():
+            if not self.node.has_parameter(name):
+                about = ParameterDescriptor(read_only=True, dynamic_typing=True)
+                self.node.declare_parameter(name, list(values), about)
         self.node.add_on_set_parameters_callback(self._set)
 
     def refresh(self, robot: RemoteRobot) -> None:

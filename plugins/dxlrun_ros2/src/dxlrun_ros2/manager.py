@@ -58,6 +58,8 @@ class Manager:
 
     def __init__(self, node: Node, address: str) -> None:
         self._node, self._address = node, address
+        self._unloaded: dict[str, dict[str, object]] = {}
+        """Entries of controllers that were unloaded here, to load them again."""
         group = ReentrantCallbackGroup()
         for kind, name, answer in (
             (ListControllers, "list_controllers", self._list),
@@ -142,9 +144,10 @@ class Manager:
     def _unload(
         self, robot: RemoteRobot, request: UnloadController.Request, _: UnloadController.Response
     ) -> None:
-        _known(robot, request.name)
+        entry = _written(_known(robot, request.name), robot)
         with _paused(robot):
             robot.unload(request.name)
+        self._unloaded[request.name] = entry
 
     def _configure(
         self, robot: RemoteRobot, request: ConfigureController.Request, _: ConfigureController.Response
@@ -156,13 +159,13 @@ class Manager:
         """Return what this node's parameters NAME.* have for a controller, or the files NAME.params_file."""
         given = {key: one.value for key, one in self._node.get_parameters_by_prefix(name).items()}
         files = given.pop("params_file", [])
-        entry: dict[str, object] = {}
+        entry = dict(self._unloaded.get(name, {}))
         for path in [files] if isinstance(files, str) else files:
             entry |= _parameters(Path(path), name)
         entry |= given
         if "type" not in entry:
             raise InputError(
-                f"{name} is not in the robot file; set the parameter {name}.type of controller_manager, "
+                f"{name} has no type; set the parameter {name}.type of controller_manager, "
                 "or give a file of parameters"
             )
         for own, other in TYPES.items():
@@ -200,9 +203,28 @@ def ros_type(kind: str) -> str:
     return TYPES.get(kind, f"dxlrun/{kind}")
 
 
-def _known(robot: RemoteRobot, name: str) -> None:
-    if name not in (known := [one.name for one in info_of(robot).controllers]):
+def _known(robot: RemoteRobot, name: str) -> ControllerInfo:
+    """Return a controller by its name. Raises InputError."""
+    known = {one.name: one for one in info_of(robot).controllers}
+    if name not in known:
         raise InputError(f"there is no controller {name}; there are {', '.join(known)}")
+    return known[name]
+
+
+def _written(one: ControllerInfo, robot: RemoteRobot) -> dict[str, object]:
+    """Return a controller's entry as in the robot file, inactive."""
+    entry: dict[str, object] = {"type": one.type, "active": False}
+    entry |= {"into": list(one.into)} if one.into else {}
+    entry |= {"fallback": one.fallback} if one.fallback else {}
+    for parameter in robot.parameter_table(one.name):
+        *above, last = parameter.name.split(".")
+        place: dict[str, object] = entry
+        for key in above:
+            inner = place.setdefault(key, {})
+            place = inner if isinstance(inner, dict) else {}
+        if parameter.value is not None:
+            place[last] = parameter.value
+    return entry
 
 
 def _state(one: ControllerInfo, known: Sequence[ControllerInfo]) -> ControllerState:

@@ -123,6 +123,11 @@ class PublishedRun(RunMessages):
             return True  # loaded since, or too early: the robot itself will tell
         return bool(int(self.newest["active"]) >> names.index(controller) & 1)
 
+    @property
+    def time_s(self) -> float:
+        """When it was measured, on the run's clock; 0: there was none."""
+        return 0.0 if self.newest is None else int(self.newest["read_ns"]) * 1e-9
+
     def rows(self, joints: Sequence[str]) -> NDArray[np.int_]:
         """Return the rows of joints in a record."""
         return np.array([self.header.joints.index(joint) for joint in joints], int)
