@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,7 +23,7 @@ import msgspec
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.commands import Dxlrun
-from tests.kit.fuzzed_http import children, process_of
+from tests.kit.fuzzed_http import FRAMES, Said, children, process_of, stands
 from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code
@@ -220,6 +221,22 @@ def test_an_agent_asks_for_a_certificate_with_the_role_admin(
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "stranger"))
     authority.issue("stranger", Role.ADMIN, 30, keys_place())
     assert "certificate verify failed" in dxlrun("fleet", lab, "--start", "joint").err
+    assert not list(lab.parent.glob("*.out"))
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(600 if FRAMES <= 1000 else 0)
+def test_of_fuzzed_requests_without_the_role_admin_an_agent_starts_nothing(
+    lab: Path, agent: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    authority.issue("bert", Role.COMMAND, 30, tmp_path / "other" / "dxlrun" / "keys")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "other"))
+    address = read_fleet(lab).agents["lab3"].address
+    names = ("joint", "joint/", "../joint", "joint?robot=joint", "hung", "%6Aoint", "")
+    seeds = [Said(method, START + name, b"x") for name in names for method in ("POST", "GET", "DELETE")]
+    stands(
+        NetworkLink(address, "")._connected, partial(socket.create_connection, address[1:]), seeds, agent.pid
+    )
     assert not list(lab.parent.glob("*.out"))
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from tests.kit.awaited import DEADLINE_S, until
@@ -20,6 +22,28 @@ TORQUE_ENABLE, GOAL_POSITION = 24, 30
 BROADCAST = 254
 
 
+def copy_robots(place: Path) -> None:
+    """Copy the folder of robot files; of the torso a reply may be late, as on a busy machine."""
+    shutil.copytree(ROBOTS, place / "robots")
+    torso = place / "robots/bioloid_torso.yaml"
+    torso.write_text(torso.read_text().replace("latency: 1 ms", "latency: 20 ms"))
+
+
+def settled(ledger: Path, cycles: Callable[[], int], quiet: int) -> set[tuple[int, int, bytes]]:
+    """Wait until nothing new was written to servos for so many cycles; return what was written."""
+    found, since = written(ledger), cycles()
+    while cycles() < since + quiet:
+        time.sleep(0.1)
+        if (now := written(ledger)) != found:
+            found, since = now, cycles()
+    return found
+
+
+def written(ledger: Path) -> set[tuple[int, int, bytes]]:
+    """Return servo, address and bytes of all that was written to servos of Protocol 1.0, each once."""
+    return commands([*taken_apart(read_ledger(ledger), 1.0)], 1.0)
+
+
 class Run:
     """A torso in a process of its own."""
 
@@ -28,11 +52,7 @@ class Run:
         self.place, self.record, self.words = place, record, words
         self.ledger = place / "ledger.jsonl"
         self.process: subprocess.Popen[bytes] | None = None
-        shutil.copytree(ROBOTS, place / "robots")
-        torso = place / "robots/bioloid_torso.yaml"
-        torso.write_text(
-            torso.read_text().replace("latency: 1 ms", "latency: 20 ms")
-        )  # a busy machine is late
+        copy_robots(place)
 
     def start(self) -> None:
         code = "from dxlrun.cli import main; main()"
@@ -57,10 +77,6 @@ class Run:
             self.process.wait(DEADLINE_S)
             self.process = None
             self.ledger.unlink()
-
-    def commands(self) -> set[tuple[int, int, bytes]]:
-        """Return servo, address and bytes of all that was written to its servos, each once."""
-        return commands([*taken_apart(read_ledger(self.ledger), 1.0)], 1.0)
 
     @property
     def limp(self) -> bool:

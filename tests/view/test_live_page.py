@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import os
+import socket
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import pytest
 from tests.kit.awaited import until
-from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
+from tests.kit.fuzzed_http import Said, stands
+from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, settled, written
 from tests.view.served import Served
 
 from dxlrun_view.live import LiveRobot
+from dxlrun_view.server import HEADER
 
 Serve = Callable[..., Served]
 
@@ -51,6 +58,32 @@ def test_a_page_that_may_not_steer_only_stops(live: LiveRobot, serve: Serve, run
     status, answer = served.ask("/act", {"verb": "stop"})
     assert (status, b"limp" in answer) == (200, True)
     until(lambda: run.limp)
+
+
+@pytest.mark.campaign
+def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
+    live: LiveRobot, serve: Serve, run: Run
+) -> None:
+    served = serve(live, control=True)
+    with live.asking() as robot:
+        before = settled(run.ledger, lambda: robot.info()["cycles"], 20)
+    host, token = f"Host: 127.0.0.1:{served.port}\r\n", f"{HEADER}: {served.page.token}\r\n"
+    guards = (
+        host,
+        host + token.swapcase(),
+        f"{host}{token}Origin: http://evil.example\r\n",
+        f"Host: evil.example:{served.port}\r\n{token}",
+    )
+    clicks = ({"verb": "torque", "names": ["all"]}, {"verb": "stop"}, {"verb": "halt"})
+    seeds = [
+        Said(method, path, json.dumps(click).encode(), guard)
+        for guard in guards
+        for click in clicks
+        for method, path in (("POST", "/act"), ("POST", "/look"), ("GET", "/urdf"), ("GET", "/mesh?name=x"))
+    ]
+    reach = partial(socket.create_connection, ("127.0.0.1", served.port))
+    stands(reach, reach, seeds, os.getpid())
+    assert written(run.ledger) == before
 
 
 def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run: Run) -> None:
