@@ -142,7 +142,7 @@ def declarable(table: ControlTable) -> tuple[str, ...]:
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
     """Return why an item belongs to dxlrun and what to do instead; None where it does not."""
     if item.name.startswith("indirect_"):
-        return "dxlrun may lay the cycle's reads there", "take it out"
+        return "a reboot makes it mean something else", "take it out"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
             "both angle limits choose the mode, which dxlrun sets",
