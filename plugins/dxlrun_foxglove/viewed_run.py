@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 
 import msgspec
 
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
-from dxlrun.channels.events import Event, EventCode
 from dxlrun.channels.loop_requests import Switch, TorqueRequest
 from dxlrun.log import schemas
-from dxlrun.log.run_messages import RunMessages
-from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import TopicMessage
+from dxlrun.remote.live.live_messages import LiveMessages
 from dxlrun.remote.requests.replies import RobotInfo
 from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
@@ -26,8 +24,6 @@ RATE = 50.0
 """Hz: so often what has come meanwhile is taken; more costs the machine, and no screen shows it."""
 LOOK_S = 2.0
 """Between two looks for topics that were opened meanwhile."""
-_OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
-"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,7 +35,7 @@ SERVICES = (("/halt", Nothing), ("/switch", Switch), ("/torque", TorqueRequest))
 HALT = 0
 
 
-class ViewedRun(RunMessages):
+class ViewedRun(LiveMessages):
     """One run of a robot, as long as a viewer looks."""
 
     def __init__(self, name: str) -> None:
@@ -48,8 +44,6 @@ class ViewedRun(RunMessages):
             super().__init__(robot.log_header())
         self._name = name
         self.viewers: set[Viewer] = set()
-        self.on_changed: Callable[[str], object] = lambda controller: None
-        """Called when parameters of a controller have changed."""
         self._channels: list[Channel] = []
         self._open_channels()
 
@@ -87,42 +81,23 @@ class ViewedRun(RunMessages):
     def _topics(self) -> set[str]:
         """Return the topics that the log has too, or whose messages it makes others of."""
         with _robot(self._name) as robot:
-            topics = robot.topics()
-        return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.JOINT_STATES_TOPIC}
+            return self.heard(robot.topics())
 
     async def _listen(self, topics: set[str]) -> None:
         """Take the messages of topics until the run ends. Raises DxlrunError then, too."""
         with _robot(self._name) as robot:
             listen = partial(robot.listen, *topics, rate=RATE, newest=False)
             async for message in await asyncio.to_thread(listen):
-                self._take(message)
+                self.take(message)
         raise DxlrunError(f"the run of {self._name} has ended")
 
-    def _take(self, message: TopicMessage) -> None:
+    def take(self, message: TopicMessage) -> None:
+        """Pass a message on, and say what was lost before it."""
         if message.lost:
             lost = f"{message.lost} messages of {message.topic} were lost before they came here"
             for viewer in self.viewers:
                 viewer.reply(status(WARNING, lost))
-        if message.topic == schemas.CYCLE_TOPIC:
-            self.cycle(message.data[len(ENCAPSULATION) :])
-        elif message.topic == schemas.EVENT_TOPIC:
-            fields = message.message
-            numbers = [fields[name] for name in ("t_ns", "code", "severity")]
-            t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
-            source, sentence, data = (str(fields[name]) for name in ("source", "text", "data"))
-            self.event(Event(t_ns, code, severity, source, sentence, data.encode()))
-            if code == EventCode.PARAMETERS:
-                self.on_changed(source)
-        else:
-            self._add(self._loop_channel(message), message.time_ns, message.data)
-
-    def _loop_channel(self, message: TopicMessage) -> int:
-        """Return the channel of a controller's topic; of another type it is another one."""
-        kind = MessageType(message.type, message.definition)
-        for channel in self._channels:
-            if channel.topic == message.topic and channel.type == kind:
-                return channel.number
-        return self._channel(message.topic, kind)
+        super().take(message)
 
     # What viewers ask
 

@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -14,11 +13,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_rosout_default
 
 from dxlrun import DxlrunError, Floats, RemoteRobot, TopicMessage, connect
-from dxlrun.channels.events import Event, EventCode
 from dxlrun.log import schemas
-from dxlrun.log.run_messages import RunMessages
 from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.messages.definition import MessageType
+from dxlrun.remote.live.live_messages import LiveMessages
 from dxlrun_ros2 import CLIENT
 
 STATE = QoSProfile(depth=1)
@@ -32,11 +30,9 @@ GLOBAL = {schemas.FRAMES_TOPIC, schemas.STILL_FRAMES_TOPIC, schemas.ROSOUT_TOPIC
 """Topics that ROS 2 has once, whatever the namespace."""
 LOGGED = (schemas.CYCLE, schemas.COMMAND, schemas.EVENT, schemas.BUS_PACKETS, schemas.MACHINE)
 """Messages that only the log has."""
-_OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
-"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
 
 
-class PublishedRun(RunMessages):
+class PublishedRun(LiveMessages):
     """Publishes one run until it ends: all that the log has, where this environment has its type."""
 
     def __init__(self, node: Node, robot: RemoteRobot, address: str) -> None:
@@ -51,8 +47,8 @@ class PublishedRun(RunMessages):
         """Record of the newest cycle."""
         self.changed: set[str] = set()
         """Controllers whose parameters were changed."""
+        self.on_changed = self.changed.add
         self._publishers_of: list[Publisher | None] = []
-        self._opened: dict[tuple[str, MessageType], int] = {}
         self._heard: set[str] = set()
         self._lock = threading.Lock()
         self._open_channels()
@@ -65,7 +61,6 @@ class PublishedRun(RunMessages):
             self._node.get_logger().warning(f"{topic} is not published: {message.name} is not installed here")
         opened = None if kind is None else self._node.create_publisher(kind, name, quality)
         self._publishers_of.append(opened)
-        self._opened[topic, message] = len(self._publishers_of) - 1
         return len(self._publishers_of) - 1
 
     def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
@@ -74,8 +69,7 @@ class PublishedRun(RunMessages):
 
     def hear(self, robot: RemoteRobot) -> None:
         """Begin to listen to the topics that were opened since. Raises DxlrunError."""
-        found = {one.name for one in robot.topics() if one.type != _OF_EACH_CYCLE}
-        if new := found - self._heard - {schemas.JOINT_STATES_TOPIC}:
+        if new := self.heard(robot.topics()) - self._heard:
             self._heard |= new
             threading.Thread(target=self._listen, args=(new,), daemon=True).start()
 
@@ -85,7 +79,7 @@ class PublishedRun(RunMessages):
             with connect(self.address, CLIENT) as robot:
                 for message in robot.listen(*topics):
                     with self._lock:
-                        self._take(message)
+                        self.take(message)
             self.why = f"the run of {self.header.robot} has ended"
         except DxlrunError as error:
             self.why = str(error)
@@ -94,25 +88,13 @@ class PublishedRun(RunMessages):
                 self.why = f"{type(error).__name__}: {error}"
         self.ended.set()
 
-    def _take(self, message: TopicMessage) -> None:
+    def take(self, message: TopicMessage) -> None:
+        """Publish a message, and keep the newest record of a cycle."""
+        super().take(message)
         if message.topic == schemas.CYCLE_TOPIC:
-            data = message.data[len(ENCAPSULATION) :]
-            self.cycle(data)
-            self.newest = np.frombuffer(data, dtype=self._layout.dtype)[0]
+            self.newest = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
             for see in tuple(self.seen):
                 see(self.newest)
-        elif message.topic == schemas.EVENT_TOPIC:
-            fields = message.message
-            numbers = [fields[name] for name in ("t_ns", "code", "severity")]
-            t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
-            source, sentence, more = (str(fields[name]) for name in ("source", "text", "data"))
-            self.event(Event(t_ns, code, severity, source, sentence, more.encode()))
-            if code == EventCode.PARAMETERS:
-                self.changed.add(source)
-        else:
-            key = message.topic, MessageType(message.type, message.definition)
-            channel = self._opened.get(key)
-            self._add(self._channel(*key) if channel is None else channel, message.time_ns, message.data)
 
     # The newest cycle
 

@@ -1,0 +1,53 @@
+"""Live messages: those of the log's topics, made of what a running robot publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+import msgspec
+
+from dxlrun.channels.events import Event, EventCode
+from dxlrun.log import schemas
+from dxlrun.log.run_messages import RunMessages
+from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.messages.definition import MessageType
+from dxlrun.remote.live.listening import TopicMessage
+from dxlrun.remote.requests.replies import TopicState
+
+_OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
+"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
+
+
+class LiveMessages(RunMessages):
+    """Makes the messages of a run for a viewer on the other side of its gateway."""
+
+    def __init__(self, header: LogHeader) -> None:
+        super().__init__(header)
+        self._opened: dict[tuple[str, MessageType], int] = {}
+        """Channels by topic and type: a controller that is loaded anew may publish another type."""
+        self.on_changed: Callable[[str], object] = lambda controller: None
+        """Called when live parameters of a controller were changed."""
+
+    @staticmethod
+    def heard(topics: Collection[TopicState]) -> set[str]:
+        """Return the topics to listen to: those of the log, and those that others of it are made of."""
+        return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.JOINT_STATES_TOPIC}
+
+    def take(self, message: TopicMessage) -> None:
+        """Take a message of a topic of `heard`."""
+        if message.topic == schemas.CYCLE_TOPIC:
+            self.cycle(message.data[len(ENCAPSULATION) :])
+        elif message.topic == schemas.EVENT_TOPIC:
+            fields = message.message
+            numbers = [fields[name] for name in ("t_ns", "code", "severity")]
+            t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])
+            source, text, data = (str(fields[name]) for name in ("source", "text", "data"))
+            self.event(Event(t_ns, code, severity, source, text, data.encode()))
+            if code == EventCode.PARAMETERS:
+                self.on_changed(source)
+        else:
+            key = message.topic, MessageType(message.type, message.definition)
+            if key not in self._opened:
+                self._opened[key] = self._channel(*key)
+            self._add(self._opened[key], message.time_ns, message.data)
