@@ -409,7 +409,7 @@ def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
     variables = {
         name
         for path in SOURCES
-        if path.name.startswith(("test_", "conftest"))
+        if path.name.startswith(("test_", "conftest")) or path.parent.name == "kit"
         for name in re.findall(r"environ\.get\(\s*\"(DXLRUN_\w+)\"", path.read_text())
     }
     assert "DXLRUN_STORMS" in variables
