@@ -261,11 +261,17 @@ FAULTS = {
     "infinity": ("self.start + np.inf", "commanded pan/position = inf"),
     "what raises": (
         "self.start + self.amplitud",
-        "raised in update: AttributeError: 'Wave' object has no attribute",
+        "raised in update: AttributeError: 'Wave' object has no attribute 'amplitud' (wave.py:",
     ),
     "a field that is set": (
         "setattr(self, 'amplitude', 1.0)",
-        "raised in update: AttributeError: amplitude is a parameter, which only",
+        "raised in update: AttributeError: amplitude is a parameter, which only the robot file and clients"
+        " change (wave.py:",
+    ),
+    "a shape that numpy refuses": (
+        "self.start + np.linalg.inv(np.ones(3))",
+        "raised in update: LinAlgError: 1-dimensional array given. Array must be at least two-dimensional"
+        " (wave.py:",
     ),
 }
 

@@ -16,7 +16,10 @@ import threading
 import traceback
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import ClassVar, ParamSpec
+
+import numpy as np
 
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat
 from dxlrun.errors import ControllerFault, counted
@@ -123,13 +126,23 @@ class Activity:
         elif isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
             text = str(raised)
         else:
-            text = f"raised in {what}: {' '.join(f'{type(raised).__name__}: {raised}'.split())}"
+            error = " ".join(f"{type(raised).__name__}: {raised}".split())
+            text = f"raised in {what}: {error}{_line_of(raised)}"
         fault = ControllerFault(f"controller {self._names[place]} {text}")
         if raised is not None:
             fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
         return fault
 
 
+def _line_of(raised: BaseException | None) -> str:
+    """Return the line of the author's code that raised, in brackets, or that called what raised."""
+    frames = traceback.extract_tb(None if raised is None else raised.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_AUTHORS)]
+    return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
+
+
+_NOT_THE_AUTHORS = (str(Path(__file__).parents[2]), str(Path(np.__file__).parent))
+"""Folders of code that an author of a controller cannot correct: dxlrun's, and numpy's."""
 _STARTS = {
     "os.fork": "a child process",
     "os.forkpty": "a child process",
