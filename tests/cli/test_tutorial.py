@@ -64,8 +64,9 @@ class Reader:
             assert "http://127.0.0.1" in served.stdout.readline()
             served.kill()
         elif words[0].endswith(".yaml") and "--virtual" not in words:
-            self._started(*words)
-            until(lambda: " active" in self.dxlrun("list").out, line)
+            robot = self._started(*words)
+            until(lambda: robot.poll() is not None or " active" in self.dxlrun("list").out, line)
+            assert robot.poll() is None, robot.stdout and robot.stdout.read()
         else:
             said = self.dxlrun(*words, *(["--once"] if words == ["watch"] else []))
             assert said.code == code, line + said.out + said.err
