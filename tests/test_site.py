@@ -123,23 +123,41 @@ def address(built: Path) -> Iterator[str]:
         server.shutdown()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_no_page_scrolls_sideways(built: Path, address: str, tmp_path: Path) -> None:
+BAD = """Promise.all([...document.images].map(image => {
+  image.loading = "eager";
+  return image.decode().then(() => image.naturalWidth ? "" : image.src, () => image.src);
+})).then(found => found.filter(Boolean))"""
+"""In a page: the pictures that cannot be shown."""
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")
+def test_each_page_is_whole_in_chromium(built: Path, sources: Path, address: str, tmp_path: Path) -> None:
+    """At two widths: it does not scroll sideways, its pictures load, and it has its code blocks."""
     browser = Browser(tmp_path)
     pages = [
         str(path.relative_to(built)) for path in sorted(built.rglob("*.html")) if path.name != "404.html"
     ]
-    wide = {}
-    for width in (1280, 390):
+    wide, bad, codeless = {}, {}, []
+    for width in (1440, 390):
         for page in pages:
             browser.open(f"{address}/{page}", width)
             browser.until(f"document.readyState === 'complete' && location.pathname === '/{page}'")
             wide[page, width] = browser.value("document.documentElement.scrollWidth") - width
+            bad[page, width] = browser.value(BAD)
+            source = (sources / page).with_suffix(".md")
+            text = (source if source.exists() else source.with_name("README.md")).read_text()
+            if re.search(r"^(```|    \S)", text, re.MULTILINE) and not browser.value(
+                "document.querySelectorAll('article pre code').length"
+            ):
+                codeless.append(page)
     answers = [
         one["params"]["response"] for one in browser.events if one.get("method") == "Network.responseReceived"
     ]
     browser.close()
     assert {page: over for page, over in wide.items() if over > 0} == {}
+    assert {page: links for page, links in bad.items() if links} == {}
+    assert codeless == []
     assert len(answers) >= len(pages)
     assert [
         one["url"] for one in answers if one["status"] >= 400 or not one["url"].startswith((address, "data:"))

@@ -1,150 +1,355 @@
-"""The pictures of the README, made anew from a run: `python docs/pictures/make.py`.
+"""The pictures of the pages, made anew from the program: `python docs/pictures/make.py [NAME ...]`.
 
-The torso runs in real time on simulated servos, by the README's first command. `terminal.svg` is what that
-command and `dxlrun analyze` print on a terminal; `report.png` is the page that `--report` writes, its head
-and some of its plots, as Chromium shows it; without Chromium that picture is left out. Needs the extra
-`report`. `--into DIRECTORY` writes them elsewhere; other options are for the run.
+Each is named after its file. Those of a terminal are what commands print there; `report`, `arm_report`,
+`latency` and `characterize` are some plots of pages of `--report`, as Chromium shows them; the robots are on
+the page of `dxlrun view`, of a log or live; `drawn.py` draws the others. Needs the extra `report`, and leaves
+out what needs Chromium or `pip install ./plugins/dxlrun_view` where these are missing. All take some minutes,
+for robots run in real time; `--virtual` leaves out what only real time shows.
 """
 
 from __future__ import annotations
 
 import argparse
-import fcntl
+import base64
 import io
 import os
-import pty
 import re
 import shutil
-import struct
 import subprocess
 import sys
 import tempfile
-import termios
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
 from PIL import Image, ImageChops  # comes with bokeh
-from rich.console import Console
-from rich.terminal_theme import DIMMED_MONOKAI
-from rich.text import Text
 
 ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+from drawn import cycle, fall, processes  # noqa: E402  # beside this file
+from terminal import printed, terminal  # noqa: E402
+
 RUN = ("robots/bioloid_torso.yaml", "--play", "robots/motions/three_parts.yaml")
-COLUMNS, ROWS = 104, 50
 LEFT_OUT = re.compile("(\x1b\\[[0-9;]*m)*(Controllers|Servos)\\b")
-"""The terminal's picture ends above these tables of `dxlrun analyze`."""
-FIGURES = ("lateness", "steps", "joint-7")
-"""Plots of the page, by their names in it; joint-7 is head_yaw_joint."""
-WIDTH, HEIGHT = 1040, 2000
-"""Of the report's picture, px."""
+"""The README's terminal ends above these tables of `dxlrun analyze`."""
+WIDTH, HEIGHT = 1040, 2600
+"""Of a report's picture, px."""
 COLOURS = 48
-"""Of the report's picture, so that it is small."""
-
-TERMINAL = """<svg class="rich-terminal" viewBox="0 0 {width} {height}" xmlns="http://www.w3.org/2000/svg">
-<style>
-.{unique_id}-matrix {{ font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace;
-  font-size: {char_height}px; line-height: {line_height}px; font-variant-east-asian: full-width; }}
-{styles}
-</style>
-<defs><clipPath id="{unique_id}-clip-terminal">
-<rect x="0" y="0" width="{terminal_width}" height="{terminal_height}" />
-</clipPath>
-{lines}
-</defs>
-{chrome}
-<g transform="translate({terminal_x}, {terminal_y})" clip-path="url(#{unique_id}-clip-terminal)">
-{backgrounds}
-<g class="{unique_id}-matrix">
-{matrix}
-</g></g></svg>
+"""Of a PNG, so that it is small."""
+MISTAKES = """name: arm
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: ftdi}, return_delay_time: 0 us}
+loop: {rate: 1000}
+joints:
+  base: {bus: mian, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
+  elbow: {bus: main, id: 2, model: XL430-W205, reference: 180, direction: 1, limit: {velocity: 60 deg/s}}
+controllers:
+  arm: {type: joint_trajectory_controler, joints: [base, elbow]}
 """
-"""The template of rich without its web fonts, so that the picture loads nothing."""
 
 
-def printed(words: tuple[str, ...], directory: Path) -> list[str]:
-    """Return the lines that `dxlrun WORDS` leaves on a terminal, with their colours."""
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
-    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": str(COLUMNS)}
-    command = [sys.executable, "-c", "import sys; from dxlrun.cli import main; sys.exit(main())", *words]
-    process = subprocess.Popen(
-        command, cwd=directory, env=environment, stdin=theirs, stdout=theirs, stderr=theirs
-    )
-    os.close(theirs)
-    received = b""
-    while True:
+MOVE = "(time => { const at = document.querySelector('#time'); at.value = time; at.oninput(); })"
+"""In the page of `dxlrun view`: go to a time of a log."""
+
+
+class Shown(NamedTuple):
+    """A robot on the page of `dxlrun view`, at a time of the log of a motion."""
+
+    robot: str
+    motion: str
+    at_s: float
+    arguments: tuple[str, ...] = ()
+    size: tuple[int, int] = (1100, 680)
+    turned: int = 0
+    """How far the mouse turns the scene, px."""
+
+
+ROBOTS = {
+    "koch": Shown("koch", "koch_wave", 3.4, ("leader_arm:=true", "leader_torque:=on"), turned=60),
+    "poppy_ergo_jr": Shown("poppy_ergo_jr", "poppy_ergo_jr_dance", 4.4),
+    "open_manipulator_x": Shown("open_manipulator_x", "open_manipulator_x_wave", 3.0),
+    "op3": Shown("op3", "op3_squat", 4.1),
+    "wolfgang": Shown("wolfgang", "wolfgang_squat", 0.66, ("rate:=50",)),
+    "humanoid_20": Shown("humanoid_20", "humanoid_20_squat", 2.0, ("rate:=200",)),
+}
+
+
+class Maker:
+    """Makes pictures in a directory, from runs in another one."""
+
+    def __init__(self, into: Path, place: Path, *, virtual: bool) -> None:
+        self.into, self.place, self.virtual = into, place, virtual
+        (place / "robots").symlink_to(ROOT / "robots")
+        for title, text in re.findall(
+            r"^```yaml title=\"(.+?)\"\n(.*?)^```", (ROOT / "docs/tutorial/arm.md").read_text(), re.M | re.S
+        ):
+            (place / title).write_text(text)  # of two of a name the last one: the whole arm
+
+    def terminal(self, name: str, *commands: str, code: int = 0, columns: int = 104) -> None:
+        """Take a picture of commands, one after the other."""
+        told = [
+            (f"dxlrun {one}", printed(one.split(), self.place, code=code, columns=columns))
+            for one in commands
+        ]
+        (self.into / f"{name}.svg").write_text(terminal(told, columns))
+
+    @contextmanager
+    def running(self, *words: str) -> Iterator[None]:
+        """Run a robot or simulated servos meanwhile."""
+        code = "import sys; from dxlrun.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", code, *words]
+        with (self.place / "said").open("wb") as said:
+            process = subprocess.Popen(command, cwd=self.place, stdout=said, stderr=said)
         try:
-            received += os.read(ours, 65536)
-        except OSError:  # the last one to have the other end has closed it
-            break
-    os.close(ours)
-    if process.wait():
-        raise SystemExit(f"dxlrun {' '.join(words)} ended with {process.returncode}\n{received.decode()}")
-    lines: list[str] = []
-    for line in received.decode().split("\r\n"):
-        # a progress line is drawn over itself, and at last cleared
-        above, _, last = line.rpartition("\x1b[2K")
-        if "\x1b[1A" in above:
-            lines.pop()
-        lines.append(re.sub(r"\x1b\[\?25[lh]|\r", "", last))
-    return lines[:-1]
+            while not self._began(words):
+                if process.poll() is not None:
+                    raise SystemExit((self.place / "said").read_text())
+                time.sleep(0.5)
+            yield
+        finally:
+            process.terminate()
+            process.wait(60)
+
+    def _began(self, words: Sequence[str]) -> bool:
+        if words[0] == "sim":
+            return Path(words[-1]).exists()
+        return any(re.search(r"[ m]active", line) for line in printed(["list"], self.place))
+
+    def figures(self, name: str, page: Path, *plots: str) -> None:
+        """Take a picture of a page of `--report`: its head, and some plots one below the other."""
+        chromium = shutil.which("chromium")
+        if chromium is None:
+            return
+        shown = ", ".join(f"#{plot}" for plot in plots)
+        hidden = ".table, nav, #worst, #machine, #buses, #steering, #events, main p:not(.legend), footer"
+        hidden += ", section:not(.verdict, :has(figure))"
+        style = f"<style>figure:not({shown}), {hidden} {{ display: none }}</style>"
+        shortened, taken = self.place / "shown.html", self.place / "taken.png"
+        text = re.sub(r"(Linux \d+\.\d+)[^,<]*", r"\1", page.read_text())  # not which machine
+        shortened.write_text(text.replace("</head>", f"{style}</head>"))
+        words = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run"]
+        words += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+        words += [f"--user-data-dir={self.place / 'chromium'}", "--virtual-time-budget=30000"]
+        words += [f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={taken}", shortened.as_uri()]
+        subprocess.run([chromium, *words], check=True, capture_output=True, timeout=300)
+        with Image.open(taken) as picture:
+            opaque = picture.convert("RGB")
+            below = ImageChops.difference(opaque, Image.new("RGB", opaque.size, "white")).getbbox()
+            cut = opaque.crop((0, 0, WIDTH, min(HEIGHT, below[3] + 30) if below else HEIGHT))
+            cut.quantize(COLOURS).save(self.into / f"{name}.png", optimize=True)
+
+    # The pictures
+
+    def readme(self) -> None:
+        """Run the README's first command, and analyze it: `terminal` and `report`."""
+        more = ("--virtual",) if self.virtual else ()
+        ran = printed((*RUN, *more), self.place)
+        analyzed = printed(("analyze", "--report", "report.html"), self.place)
+        self.figures("report", self.place / "report.html", "lateness", "steps", "joint-7")  # head_yaw_joint
+        end = next(number for number, line in enumerate(analyzed) if LEFT_OUT.match(line))
+        commands = [(f"dxlrun {' '.join((*RUN, *more))}", ran), ("dxlrun analyze", [*analyzed[:end], "..."])]
+        (self.into / "terminal.svg").write_text(terminal(commands))
+
+    def check(self) -> None:
+        """Check the tutorial's arm."""
+        self.terminal("check", "check arm.yaml", columns=130)
+
+    def mistakes(self) -> None:
+        """Check a file with five mistakes."""
+        kept, file = (self.place / "arm.yaml").read_text(), self.place / "arm.yaml"
+        file.write_text(MISTAKES)
+        self.terminal("mistakes", "check arm.yaml", code=2)
+        file.write_text(kept)
+
+    def graph(self) -> None:
+        """Show the controllers of the torso."""
+        self.terminal("graph", "check robots/bioloid_torso.yaml --graph", columns=150)
+
+    def watch(self) -> None:
+        """Watch the tutorial's arm in its motion, with a priority that a busy machine respects."""
+        file = self.place / "arm.yaml"
+        kept, loop = file.read_text(), "scheduler: {policy: round_robin, priority: 31}"
+        file.write_text(kept.replace("{rate: 100}", f"{{rate: 100, {loop}}}"))
+        with self.running("arm.yaml"):
+            printed(("play", "wave", "--no-wait"), self.place)
+            time.sleep(2)
+            lines = printed(("watch", "--once"), self.place, columns=90)
+            printed(("stop",), self.place)
+        file.write_text(kept)
+        shown = [line.replace(f"{self.place}/", "") for line in lines]
+        (self.into / "watch.svg").write_text(terminal([("dxlrun watch --once", shown)], 90))
+
+    def arm_report(self) -> None:
+        """Play the tutorial's motion, and plot it."""
+        printed(("arm.yaml", "--virtual", "--play", "wave.yaml"), self.place)
+        printed(("analyze", "--report", "arm.html"), self.place)
+        self.figures("arm_report", self.place / "arm.html", "joint-2", "joint-2-error", "steps")
+
+    def scan(self) -> None:
+        """Look for four simulated servos."""
+        link = str(self.place / "servos")
+        with self.running("sim", "--servo", "XL430-W250:1-3", "--servo", "XM430-W350:4", "--link", link):
+            words = "scan /dev/ttyUSB0 --protocol 2.0 --baud 57600 --ids 1-9"
+            lines = printed(words.replace("/dev/ttyUSB0", link).split(), self.place)
+        shown = [line.replace(link, "/dev/ttyUSB0") for line in lines]
+        (self.into / "scan.svg").write_text(terminal([(f"dxlrun {words}", shown)], 84))
+
+    def doctor(self) -> None:
+        """Look at this machine."""
+        lines = [re.sub(r"(Linux \d+\.\d+)\S*", r"\1", line) for line in printed(("doctor",), self.place)]
+        (self.into / "doctor.svg").write_text(terminal([("dxlrun doctor", lines)]))
+
+    def latency(self) -> None:
+        """Measure how late this machine wakes a loop up."""
+        printed(("latency", "--count", "10000", "--period", "1ms", "--report", "latency.html"), self.place)
+        self.figures("latency", self.place / "latency.html", "latency-histogram", "lateness")
+
+    def lost(self) -> None:
+        """A servo that falls silent for a second, and what `dxlrun analyze` says of it."""
+        from dxlrun.simulation.faults.fault import parse_fault
+        from dxlrun.simulation.faults.script import FaultScript
+        from dxlrun.testing import simulated_robot
+
+        log = self.place / "arm.mcap"
+        play = [self.place / "wave.yaml"]
+        robot = simulated_robot(self.place / "arm.yaml", play=play, log=log)
+        FaultScript([parse_fault("silence servo=3 at=3s for=1s")]).attach(robot.buses)
+        robot.run()
+        lines = printed(("analyze", "arm.mcap"), self.place, code=1)
+        verdict = lines[: next(number for number, line in enumerate(lines) if not line.strip())]
+        (self.into / "lost.svg").write_text(terminal([("dxlrun analyze arm.mcap", [*verdict, "..."])]))
+
+    def characterize(self) -> None:
+        """Measure a simulated servo."""
+        words = "characterize robots/single_joint.yaml joint --virtual"
+        printed((*words.split(), "--report", "characterize.html"), self.place)
+        self.figures("characterize", self.place / "characterize.html", "joint-steps", "joint-moves")
+
+    def gains(self) -> None:
+        """Sweep two gains of an arm."""
+        words = (
+            "sweep robots/effort_arm.yaml --play robots/motions/effort_arm_lift.yaml --over gains.p=2..10x5"
+        )
+        printed((*words.split(), "--over", "gains.d=0.05..0.25x5", "--picture", "gains.svg"), self.place)
+        text = (self.place / "gains.svg").read_text()
+        text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
+        (self.into / "gains.svg").write_text(text)
+
+    def fall(self) -> None:
+        """Tip a torso over."""
+        words = ("robots/fall_reflex.yaml", "--virtual", "--play", "robots/motions/fall_reflex_tip.yaml")
+        printed(words, self.place)
+        (self.into / "fall.svg").write_text(fall(self._log))
+
+    def cycle(self) -> None:
+        """Look into a cycle of the torso."""
+        printed((*RUN, "--virtual", "--duration", "3"), self.place)
+        (self.into / "cycle.svg").write_text(cycle(self._log))
+
+    def processes(self) -> None:
+        """Draw the processes of a run."""
+        (self.into / "processes.svg").write_text(processes())
+
+    @property
+    def _log(self) -> Path:
+        """The newest log."""
+        return max((self.place / "logs").glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
+
+    def viewed(self, names: Sequence[str]) -> None:
+        """Take pictures of robots on the page."""
+        if (
+            shutil.which("chromium") is None
+            or not files("dxlrun_view").joinpath("page/build/page.js").is_file()
+        ):
+            return
+        from tests.kit.browser import Browser
+        from tests.view.served import Served
+
+        from dxlrun_view.live import LiveRobot
+        from dxlrun_view.recorded import RecordedRobot
+
+        with ExitStack() as stack:
+            drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run")
+            browser = Browser(self.place / "browser", *drawing)
+            stack.callback(browser.close)
+            for name in names:
+                if name not in ROBOTS:
+                    continue
+                shown = ROBOTS[name]
+                motion = ("--play", f"robots/motions/{shown.motion}.yaml")
+                printed((f"robots/{shown.robot}.yaml", *shown.arguments, "--virtual", *motion), self.place)
+                served = Served(RecordedRobot(self._log))
+                browser.open(served.address, *shown.size)
+                browser.until("window.looked > 3")
+                looked = browser.value(f"{MOVE}({shown.at_s}), window.looked")
+                browser.until(f"window.looked > {looked + 3}")
+                browser.click("#fit")
+                left, top, width, height = browser.place("#scene")
+                middle = (left + width / 2, top + height / 2)
+                browser.drag(middle, (middle[0] + shown.turned, middle[1]))
+                browser.until(f"window.looked > {looked + 8}")
+                self._kept(name, browser.picture())
+                served.close()
+            if "view" not in names or self.virtual:
+                return
+            with self.running("robots/bioloid_torso_imu.yaml"):
+                printed(("play", "three_parts", "--no-wait"), self.place)
+                served = Served(LiveRobot("bioloid_torso_imu"), control=True)
+                for name, width, height in (("view", 1280, 760), ("view_phone", 390, 760)):
+                    browser.open(served.address, width, height, dark=width < 600)
+                    browser.until("window.looked > 60")
+                    self._kept(name, browser.picture())
+                served.close()
+
+    def _kept(self, name: str, picture: str) -> None:
+        with Image.open(io.BytesIO(base64.b64decode(picture))) as shown:
+            shown.convert("RGB").quantize(COLOURS * 2).save(self.into / f"{name}.png", optimize=True)
 
 
-def terminal(commands: list[tuple[str, list[str]]]) -> str:
-    """Return the picture of commands and what they print."""
-    console = Console(
-        record=True, width=COLUMNS, file=io.StringIO(), force_terminal=True, legacy_windows=False
-    )
-    for command, lines in commands:
-        console.print(Text.assemble(("$ ", "bold green"), (command, "bold")))
-        for line in lines:
-            console.print(Text.from_ansi(line))
-        console.print()
-    return console.export_svg(
-        title="dxlrun", theme=DIMMED_MONOKAI, code_format=TERMINAL, unique_id="terminal"
-    )
-
-
-def report(page: str, directory: Path, target: Path) -> None:
-    """Take a picture of a page of `--report`: its head, and FIGURES one below the other."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        return
-    shown = ", ".join(f"#{name}" for name in FIGURES)
-    hidden = ".table, nav, #worst, #machine, #buses, #steering, #events, main p:not(.legend), footer"
-    style = f"<style>figure:not({shown}), {hidden} {{ display: none }}</style>"
-    shortened = directory / "shown.html"
-    shortened.write_text(page.replace("</head>", f"{style}</head>"))
-    taken = directory / "taken.png"
-    words = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--hide-scrollbars",
-        "--virtual-time-budget=30000",
-    ]
-    words += [f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={taken}", shortened.as_uri()]
-    subprocess.run([chromium, *words], check=True, capture_output=True, timeout=100)
-    with Image.open(taken) as picture:
-        opaque = picture.convert("RGB")
-        below = ImageChops.difference(opaque, Image.new("RGB", opaque.size, "white")).getbbox()
-        cut = opaque.crop((0, 0, WIDTH, min(HEIGHT, below[3] + 30) if below else HEIGHT))
-        cut.quantize(COLOURS).save(target, optimize=True)
+MADE: dict[str, Callable[[Maker], None]] = {
+    "terminal": Maker.readme,
+    "check": Maker.check,
+    "mistakes": Maker.mistakes,
+    "graph": Maker.graph,
+    "scan": Maker.scan,
+    "lost": Maker.lost,
+    "fall": Maker.fall,
+    "cycle": Maker.cycle,
+    "processes": Maker.processes,
+    "characterize": Maker.characterize,
+    "arm_report": Maker.arm_report,
+    "watch": Maker.watch,
+    "doctor": Maker.doctor,
+    "latency": Maker.latency,
+    "gains": Maker.gains,
+}
+SLOW = ("watch", "doctor", "latency", "gains", "characterize")
+"""Left out with `--virtual`: real time, this machine, or minutes."""
 
 
 def main() -> None:
-    """Run the torso, analyze its log, draw both pictures."""
+    """Make all pictures, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join((*MADE, "view", *ROBOTS)))
     parser.add_argument("--into", type=Path, default=Path(__file__).parent)
-    options, more = parser.parse_known_args()
-    with tempfile.TemporaryDirectory() as name:
-        directory = Path(name)
-        (directory / "robots").symlink_to(ROOT / "robots")
-        ran = printed((*RUN, *more), directory)
-        analyzed = printed(("analyze", "--report", "report.html"), directory)
-        report((directory / "report.html").read_text(), directory, options.into / "report.png")
-    end = next(number for number, line in enumerate(analyzed) if LEFT_OUT.match(line))
-    commands = [(f"dxlrun {' '.join((*RUN, *more))}", ran), ("dxlrun analyze", [*analyzed[:end], "..."])]
-    (options.into / "terminal.svg").write_text(terminal(commands))
+    parser.add_argument("--virtual", action="store_true")
+    options = parser.parse_args()
+    names = options.names or [
+        *(name for name in MADE if not (options.virtual and name in SLOW)),
+        "view",
+        *ROBOTS,
+    ]
+    with tempfile.TemporaryDirectory() as directory:
+        os.environ["XDG_RUNTIME_DIR"] = directory  # no other robot of this machine
+        maker = Maker(options.into.resolve(), Path(directory), virtual=options.virtual)
+        for name in names:
+            if name in MADE:
+                MADE[name](maker)
+        maker.viewed(names)
 
 
 if __name__ == "__main__":

@@ -71,6 +71,7 @@ TESTS = {
     ),
     "by-hand.md": ("tests/hand/test_terminal.py",),
     "frames.md": ("tests/cli/test_frames.py",),
+    "gallery.md": ("tests/cli/test_docs.py",),
     "humanoid.md": ("tests/cli/test_tutorial.py",),
     "logs.md": (
         "tests/analysis/season/test_logs.py",
@@ -243,6 +244,15 @@ def test_every_robot_of_the_clone_is_checked_and_runs(
     assert ran.code == 0, ran.err
     cycles = -(-100_000_000 // compile_files(robot, {}, []).plan.loop.period_ns)  # one at 0 s
     assert f": 0 of {cycles} periods skipped" in ran.out
+
+
+def test_gallery_md_each_robot_has_a_picture_and_runs(dxlrun: Dxlrun, clone: Path) -> None:
+    robots = re.split(r"^## ", PAGES["gallery.md"], flags=re.MULTILINE)[1:]
+    assert len(robots) == len(commands("gallery.md")) > 5
+    assert all("](pictures/" in robot for robot in robots)
+    for line in commands("gallery.md"):
+        ran = dxlrun(*shlex.split(line)[1:], "--duration", "0.2")
+        assert ran.code == 0, line + ran.err
 
 
 def anchors(text: str) -> set[str]:
