@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,11 +20,13 @@ from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import plan_of
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-PYTHON = os.environ.get("DXLRUN_ROS2_PYTHON", "")
+PYTHON = os.getenv("DXLRUN_ROS2_PYTHON", "")
 """Of a ROS environment that has dxlrun_ros2"""
 READS = {wire.READ, wire.SYNC_READ, wire.FAST_SYNC_READ}
-STILL = 200
-"""So many reads after the last new goal, joints hold: half a second of the torso."""
+STILL = 80
+"""So many reads after the last new goal, joints hold: a second of the torso at `RATE`."""
+RATE = 10
+"""Hz: a loop that a busy machine stops for less than five periods goes on"""
 
 
 def seconds(number: float) -> dict[str, int]:
@@ -47,12 +50,12 @@ class Goal(NamedTuple):
 class Robot:
     """A robot in a process of its own."""
 
-    def __init__(self, place: Path, file: Path, environment: Mapping[str, str]) -> None:
+    def __init__(self, place: Path, file: Path, rate: float, environment: Mapping[str, str]) -> None:
         self.name = name = file.stem
         self.ledger, self.place, self.bus = place / f"{name}.ledger", place, plan_of(file).buses[0]
         self._read, self._sent = 0, list[wire.Instruction]()
         program = Path(sys.executable).with_name("dxlrun")
-        command = [program, file, "--ledger", self.ledger, "--duration", "7200"]
+        command = [program, file, f"rate:={rate}", "--ledger", self.ledger, "--duration", "7200"]
         with (place / f"{name}.said").open("ab") as said:
             self.process = subprocess.Popen(command, cwd=place, stdout=said, stderr=said, env=environment)
         until(lambda: name in dxlrun.running() or self.process.poll() is not None, name)
@@ -163,7 +166,8 @@ class Place:
     """A folder and a ROS domain, in which robots, bridges and foreign programs run; `end` ends them all."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.robots = folder, ROBOTS
+        self.folder = folder
+        shutil.copytree(ROBOTS, folder / "robots")
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_"))}
         self.environment = kept | {
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",  # what is killed leaves no shared memory behind
@@ -174,9 +178,13 @@ class Place:
         }
         self._running: list[Robot | Foreign | subprocess.Popen[bytes]] = []
 
-    def robot(self, name: str) -> Robot:
-        """Start a robot of `robots`."""
-        self._running.append(robot := Robot(self.folder, self.robots / f"{name}.yaml", self.environment))
+    def robot(self, name: str, rate: float = RATE) -> Robot:
+        """Start a robot of `robots`, whose joint states are those of every cycle."""
+        file = self.folder / f"robots/{name}.yaml"
+        file.write_text(
+            file.read_text().replace("joint_state_broadcaster, rate: 50", "joint_state_broadcaster")
+        )
+        self._running.append(robot := Robot(self.folder, file, rate, self.environment))
         return robot
 
     def foreign(self, name: str = "foreign") -> Foreign:

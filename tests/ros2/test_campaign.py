@@ -56,7 +56,7 @@ def test_either_side_restarts_and_every_stamp_is_the_logs(empty: Place) -> None:
         bridge.send_signal((signal.SIGKILL, signal.SIGINT)[number % 2])
         bridge.wait()
         bridge = empty.bridge("bioloid_torso")
-        of_bridge = comes(foreign, 50)
+        of_bridge = comes(foreign, 20)
         commanded(robot, foreign, 0.2 + 0.1 * (number % 2))
         mark = robot.mark()
         foreign.ask("act", *elbow(1.5, 30.0))

@@ -53,7 +53,7 @@ class Torso(NamedTuple):
         """Bring the left arm home, and return where the ledger is then."""
         mark = self.robot.mark()
         end = self.follow(goal(LEFT, (1.0, HOME)))
-        assert (end["status"], end["error_code"]) == (SUCCEEDED, 0), end
+        assert (end["status"], end["error_code"]) == (SUCCEEDED, 0), end["error_string"]
         self.robot.held(mark)
         return self.robot.mark()
 
@@ -294,6 +294,11 @@ def test_controllers_are_listed_and_switched_as_by_ros2_control(torso: Torso) ->
     assert torso.states()["whole_body_position"] == "active"
     assert torso.follow(goal(LEFT, (1.0, HOME)))["accepted"] is False
     assert torso.switch(["head", "left_arm", "right_arm"], ["whole_body_position"])
+    for _ in range(3):  # the answer of a switch is when it holds
+        assert torso.follow(goal(LEFT, (1.0, HOME)), 0)["accepted"]
+        assert torso.switch([], ["left_arm"])
+        assert torso.follow(goal(LEFT, (1.0, HOME)))["accepted"] is False
+        assert torso.switch(["left_arm"], [])
     assert torso.states() == before
     assert torso.cm("configure_controller", name="whole_body_position")["ok"]
     assert not torso.cm("configure_controller", name="no_such_controller")["ok"]
