@@ -163,6 +163,17 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
             "sudo apt install linux-image-rt-$(dpkg --print-architecture)",
         ),
         (
+            {
+                "proc/sys/kernel/version": "#1 SMP PREEMPT",
+                "proc/device-tree/model": "Raspberry Pi 5 Model B Rev 1.0\0",
+                "etc/os-release": "ID=debian\n",
+            },
+            {},
+            "kernel",
+            "a stock kernel (PREEMPT)",
+            "build the Raspberry Pi's kernel with PREEMPT_RT",
+        ),
+        (
             {"proc/sys/kernel/version": "#1 SMP", ".dockerenv": ""},
             {},
             "kernel",

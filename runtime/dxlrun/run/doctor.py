@@ -44,6 +44,12 @@ _REAL_TIME_KERNELS = {
     "ubuntu": "sudo pro enable realtime-kernel",
     "arch": "sudo pacman -S linux-rt",
 }
+_RASPBERRY_PI = "proc/device-tree/model"
+_REAL_TIME_KERNELS_OF_PI = {
+    "debian": "build the Raspberry Pi's kernel with PREEMPT_RT: docs/explanation/real-time.md",
+    "ubuntu": "sudo pro enable realtime-kernel --variant=raspi",
+}
+"""Debian's own kernel does not start on every Raspberry Pi [i]."""
 _CONTAINER = "start the container with --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
 _PREEMPTIONS = ("none", "voluntary", "full", "lazy")
 """Values of `preempt=` on the kernel's command line (Documentation/admin-guide/kernel-parameters.txt)."""
@@ -371,7 +377,9 @@ def _real_time_kernel(machine: Machine) -> str:
         return "install a PREEMPT_RT kernel on the machine that runs this container"
     lines = (machine.read("etc/os-release") or "").splitlines()
     ids = [line.partition("=")[2].strip('"') for line in lines if line.startswith(("ID=", "ID_LIKE="))]
-    known = [_REAL_TIME_KERNELS[one] for words in ids for one in words.split() if one in _REAL_TIME_KERNELS]
+    is_pi = (machine.read(_RASPBERRY_PI) or "").startswith("Raspberry Pi")
+    kernels = _REAL_TIME_KERNELS_OF_PI if is_pi else _REAL_TIME_KERNELS
+    known = [kernels[one] for words in ids for one in words.split() if one in kernels]
     return known[0] if known else "install your distribution's PREEMPT_RT kernel"
 
 
