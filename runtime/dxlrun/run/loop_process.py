@@ -85,7 +85,7 @@ def _keep_to_this_process(descriptors: Sequence[int]) -> None:
 def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     """Return the check after foreign code prepared something: it took its time, and left no second thread,
     which is the fault of the newest, and no second loop."""
-    before, own = 1, os.getpid()
+    before, own = realtime.thread_count(), os.getpid()
 
     def check(name: str) -> None:
         nonlocal before
