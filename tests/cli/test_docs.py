@@ -79,6 +79,7 @@ TESTS = {
     ),
     "mechanics.md": ("tests/cli/test_mechanics.py",),
     "models.md": ("tests/cli/test_models.py",),
+    "raspberry-pi.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/lab/tracking/test_command.py",),
     "recipes.md": ("tests/cli/test_recipes.py", "tests/robots/test_stand_up.py"),
@@ -164,6 +165,13 @@ def test_bus_md_its_checks_print_what_the_page_has(dxlrun: Dxlrun, clone: Path) 
     assert refused.code == 2
     (highest,) = re.findall(r"highest rate that is left, (\d+ Hz)", PAGES["bus.md"])
     assert highest in refused.err + refused.out
+
+
+def test_raspberry_pi_md_its_run_needs_no_hardware(dxlrun: Dxlrun, clone: Path) -> None:
+    run, doctor, _ = commands("raspberry-pi.md")
+    assert doctor == "dxlrun doctor"
+    found = dxlrun(*shlex.split(run)[1:-1], "0.2")
+    assert (found.code, "bioloid_torso: done" in found.out) == (0, True)
 
 
 def test_bus_md_the_simulation_and_the_robot_meet_at_the_link(

@@ -147,7 +147,7 @@ def measuring(process: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("page", ["experiments.md", "real-time.md"])
+@pytest.mark.parametrize("page", ["experiments.md", "real-time.md", "raspberry-pi.md"])
 def test_the_commands_of_a_page_are_understood(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
