@@ -23,9 +23,9 @@ ROBOTS = Path(__file__).parents[2] / "robots"
 PYTHON = os.getenv("DXLRUN_ROS2_PYTHON", "")
 """Of a ROS environment that has dxlrun_ros2"""
 READS = {wire.READ, wire.SYNC_READ, wire.FAST_SYNC_READ}
-STILL = 80
+STILL = 40
 """So many reads after the last new goal, joints hold: a second of the torso at `RATE`."""
-RATE = 10
+RATE = 5
 """Hz: a loop that a busy machine stops for less than five periods goes on"""
 
 

@@ -121,14 +121,14 @@ def test_frames_lie_where_pinocchio_has_them(empty: Place) -> None:
     )
     joints = [servo.joint for servo in robot.bus.servos]
     order = [model.joints[model.getJointId(joint)].idx_q for joint in joints]
-    rows = [{"data": [0.5 * drawn.uniform(*limits[at]) for at in order]} for _ in range(200)]
+    rows = [{"data": [0.5 * drawn.uniform(*limits[at]) for at in order]} for _ in range(500)]
     switched = {
         "activate_controllers": ["whole_body_position"],
         "deactivate_controllers": ["head", "left_arm", "right_arm"],
     }
     words = "/controller_manager/switch_controller", "controller_manager_msgs/srv/SwitchController"
     assert foreign.do("call", *words, {**switched, "strictness": 2, "timeout": seconds(5.0)})["ok"]
-    foreign.do("stream", "/whole_body_position/commands", "std_msgs/msg/Float64MultiArray", rows, 0.25)
+    foreign.do("stream", "/whole_body_position/commands", "std_msgs/msg/Float64MultiArray", rows, 0.1)
     (still,) = foreign.do("heard", "still")["messages"]
     judged: set[tuple[float, ...]] = set()
     states: dict[int, Any] = {}

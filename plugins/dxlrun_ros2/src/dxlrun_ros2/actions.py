@@ -17,6 +17,7 @@ from dxlrun import DxlrunError, Floats, GoalState, Refused, RemoteGoal, RemoteRo
 from dxlrun.remote.requests.replies import ControllerInfo
 from dxlrun_controllers.laws.spline import SplineSample
 from dxlrun_ros2 import CLIENT
+from dxlrun_ros2.manager import info_of
 from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.trajectories import (
     Result,
@@ -76,7 +77,11 @@ class Action:
     def _answer(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> GoalResponse:
         try:
             self.check(request)
-            if not self.run.active(self.controller.name):
+            with connect(
+                self.run.address, CLIENT
+            ) as robot:  # a switch just now is not yet in the newest cycle
+                active = {one.name for one in info_of(robot).controllers if one.active}
+            if self.controller.name not in active:
                 raise Refused(f"{self.controller.name} is not active")
         except DxlrunError as error:
             self.node.get_logger().error(f"goal rejected: {error}")
@@ -118,6 +123,8 @@ class Action:
                         raise
         until = time.monotonic() + _MEASURED_S
         while self.run.time_s < (state.ended or 0.0) and time.monotonic() < until:
+            if self.run.ended.is_set():
+                break  # no cycle comes any more, and the bridge waits for results only shortly
             time.sleep(_CYCLE_S)  # what its result reports was measured at its end
         return state, why
 

@@ -98,13 +98,6 @@ class PublishedRun(LiveMessages):
 
     # The newest cycle
 
-    def active(self, controller: str) -> bool:
-        """Return whether a controller is active."""
-        names = [one.name for one in self.header.controllers]
-        if self.newest is None or controller not in names:
-            return True  # loaded since, or too early: the robot itself will tell
-        return bool(int(self.newest["active"]) >> names.index(controller) & 1)
-
     @property
     def time_s(self) -> float:
         """When it was measured, on the run's clock; 0: there was none."""
