@@ -1,8 +1,8 @@
 """Build backend and hook: hatchling, and what is in C compiled into the wheel: exchange and gate.
 
 Where no C compiler works, `pip install .` fetches `ziglang` for the build alone, which has one. The object
-carries a checksum of its source, so that an old one is never used. Only Linux has them: elsewhere robot
-files are checked.
+carries a checksum of its source, so that an old one is never used. `release/build.py` compiles for other
+platforms by CC, LDLIBS and _PYTHON_HOST_PLATFORM, which sysconfig.get_platform() returns.
 """
 
 from __future__ import annotations
@@ -51,10 +51,18 @@ def compile_kernel(root: Path, compiler: list[str], target: Path, name: Path = S
     crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
     with tempfile.TemporaryDirectory() as cache:
         caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
-        command = [*compiler, *FLAGS, crc, "-o", str(target), str(source), "-lm"]
+        command = [
+            *compiler,
+            *FLAGS,
+            crc,
+            "-o",
+            str(target),
+            str(source),
+            *shlex.split(os.environ.get("LDLIBS", "-lm")),
+        ]
         try:
             built = subprocess.run(
-                command, capture_output=True, text=True, check=False, env={**os.environ, **caches}
+                command, capture_output=True, text=True, check=False, env={**caches, **os.environ}
             )
         except OSError as error:
             return str(error)
@@ -72,8 +80,7 @@ def system_compiler(root: Path) -> list[str]:
 
 def compiler_needed() -> list[str]:
     """Return the compiler that a build needs where none works."""
-    missing = sys.platform.startswith("linux") and not system_compiler(Path.cwd())
-    return ["ziglang"] if missing else []
+    return [] if system_compiler(Path.cwd()) else ["ziglang"]
 
 
 def get_requires_for_build_wheel(config_settings: dict[str, Any] | None = None) -> list[str]:
@@ -95,7 +102,7 @@ class KernelHook(BuildHookInterface[Any]):
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and name the wheel's platform."""
-        if self.target_name != "wheel" or not sys.platform.startswith("linux"):
+        if self.target_name != "wheel":
             return
         root = Path(self.root)
         compiler = system_compiler(root)

@@ -93,7 +93,9 @@ EXTRAS = {
     "mujoco": "physics",
     "pyarrow": "logs",
     "scipy": "identify",
+    "twine": "release",
     "websockets": "foxglove",
+    "ziglang": "release",
     **dict.fromkeys(
         ("Phidget22", "ahrs", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
         "foreign",

@@ -7,6 +7,7 @@ from importlib import metadata
 
 import pytest
 
+from dxlrun.channels import compiled
 from dxlrun.cli import inputs
 from dxlrun.errors import DxlrunError, InputError, Mark, PortError, Problem
 
@@ -53,7 +54,15 @@ def test_a_command_is_imported_alone():
 def test_the_version_is_that_of_the_package(dxlrun):
     said = dxlrun("--version")
 
-    assert (said.code, said.out.strip()) == (0, metadata.version("dxlrun"))
+    assert (said.code, said.out) == (0, f"{metadata.version('dxlrun')}, with the compiled kernel\n")
+    assert dxlrun("check", "--version").out == said.out
+
+
+def test_the_version_shows_that_the_kernel_is_missing(dxlrun, monkeypatch, tmp_path):
+    monkeypatch.setattr(compiled, "SOURCES", [tmp_path / "kernel.c"])
+    said = dxlrun("--version")
+    assert said.code == 0
+    assert said.out.endswith(", but the compiled kernel is missing: install dxlrun again\n")
 
 
 def test_help_names_every_command_and_option(dxlrun):

@@ -11,10 +11,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels import shared_memory
-from dxlrun.control import gate
+from dxlrun.channels import compiled
 from dxlrun.control.realtime import UNLIMITED
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
 
 GOOD = {
@@ -354,9 +352,6 @@ def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
 
 @pytest.mark.parametrize("what", ["kernel", "gate", "shared_memory"])
 def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        {"kernel": kernel, "gate": gate, "shared_memory": shared_memory}[what],
-        "SOURCE",
-        tmp_path / f"{what}.c",
-    )
-    assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again, on Linux"
+    sources = [tmp_path / path.name if path.stem == what else path for path in compiled.SOURCES]
+    monkeypatch.setattr(compiled, "SOURCES", sources)
+    assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again"

@@ -394,7 +394,8 @@ def test_a_build_asks_for_a_compiler_where_none_works(build, tmp_path, monkeypat
     monkeypatch.setenv("CC", compiler)
     monkeypatch.setattr(build.hatchling.build, "get_requires_for_build_wheel", lambda _: ["first"])
     assert build.get_requires_for_build_wheel() == (["first"] if works else ["first", "ziglang"])
-    assert build.get_requires_for_build_editable is build.get_requires_for_build_wheel
+    monkeypatch.setattr(build.hatchling.build, "get_requires_for_build_editable", lambda _: ["editables"])
+    assert build.get_requires_for_build_editable() == (["editables"] if works else ["editables", "ziglang"])
     found = build.system_compiler(tmp_path)
     assert found == (compiler.split() if works else [])
     why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so")

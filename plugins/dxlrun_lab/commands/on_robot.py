@@ -11,9 +11,7 @@ import os
 import select
 import signal
 import sys
-import termios
 import time
-import tty
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -384,6 +382,9 @@ class Aborting:
         if not self.has_keys:
             yield
             return
+        import termios  # not above: a log is replayed everywhere
+        import tty
+
         descriptor = sys.stdin.fileno()
         before = termios.tcgetattr(descriptor)
         try:

@@ -12,8 +12,23 @@ from zlib import crc32
 
 from dxlrun.errors import StartUpError
 
-_HINT = "install dxlrun again, on Linux"
+_HINT = "install dxlrun again"
+SOURCES = tuple(
+    Path(__file__).parents[1] / name
+    for name in ("channels/shared_memory.c", "control/gate.c", "dynamixel/exchange/kernel.c")
+)
+"""All that the build compiles."""
 Library = TypeVar("Library", bound=ctypes.CDLL)
+
+
+def missing() -> str:
+    """Return why what is compiled cannot be used, in one sentence; empty: it can."""
+    try:
+        for source in SOURCES:
+            compiled(source, ctypes.PyDLL)
+    except StartUpError as error:
+        return f"{error}"
+    return ""
 
 
 def compiled(source: Path, kind: type[Library], path: Path | None = None) -> Library:

@@ -29,9 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(tokens: tuple[str, ...]) -> int:
     try:
         if tokens == ("--version",):  # the framework takes longer to import than all that is printed
-            from importlib import metadata
+            from dxlrun.cli.help import version
 
-            sys.stdout.write(f"{metadata.version('dxlrun')}\n")
+            sys.stdout.write(f"{version()}\n")
             return 0
         if not tokens or tokens in (("--help",), ("-h",), ("help",)):
             from dxlrun.cli.help import print_help

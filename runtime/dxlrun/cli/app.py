@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import App, CycloptsError, Group
 
 from dxlrun.cli import verbs
+from dxlrun.cli.help import version
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 from dxlrun.output.table import Table
@@ -52,7 +53,7 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         help_format="plaintext",  # rich.markdown takes as long to import as all else together
         help_formatter=_Help(),
         usage=USAGE,
-        version=_version,
+        version=version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
         group_arguments=Group("Arguments", sort_key=_BEHIND),
         group_parameters=_PARAMETERS,
@@ -123,12 +124,6 @@ def _filled(text: object) -> str:
     return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
 
 
-def _version() -> str:
-    from importlib import metadata  # not above: only --version needs it
-
-    return metadata.version("dxlrun")
-
-
 def run_tokens(tokens: Sequence[str]) -> int:
     """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
     app = build(tokens[0] if tokens else "")
@@ -183,6 +178,8 @@ def _explained(error: Exception, verb: str) -> tuple[tuple[str, ...], int]:
         where = f"{error.filename}: " if error.filename else ""
         return (f"{where}{error.strerror or error}; --debug shows what was being done",), 1
     what = " ".join(f"{type(error).__name__}: {error}".split())
+    if sys.platform != "linux" and isinstance(error, ImportError | AttributeError):
+        return (f"`dxlrun {verb}` needs Linux, and this is {sys.platform}: {what}",), InputError.exit_code
     if verb in verbs.packaged() and not verbs.package_of(verb):
         place = verbs.packaged()[verb].place
         return (

@@ -49,3 +49,13 @@ def _with_verb(text: str, command: Command) -> str:
 def in_list(about: str) -> str:
     """Return what a list of verbs shows of the line about one: the part before a colon or a semicolon."""
     return " ".join(re.split("[:;]", about)[0].split()).removesuffix(".") + "."
+
+
+def version() -> str:
+    """Return the version of dxlrun, and whether what is compiled can be used."""
+    from importlib import metadata  # not above: only --version needs it
+
+    from dxlrun.channels.compiled import missing
+
+    why = missing()
+    return f"{metadata.version('dxlrun')}, {f'but {why}' if why else 'with the compiled kernel'}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,6 +108,11 @@ def run(
         listen=listen or "",
     )
     console = out()
+    if not virtual and sys.platform != "linux":
+        raise InputError(
+            f"a run in real time needs Linux, and this is {sys.platform}; give --virtual, and --duration or "
+            "--play"
+        )
     if virtual:
         from dxlrun.run.virtual_run import run_virtual
 

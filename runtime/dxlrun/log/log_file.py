@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from pathlib import Path
 
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
+_FLAGS = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 
 class LogFile:
@@ -16,7 +18,7 @@ class LogFile:
     __slots__ = ("_descriptor", "_path", "_size")
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, LOG_MODE)
+        self._descriptor = os.open(path, _FLAGS, LOG_MODE)
         if os.fstat(self._descriptor).st_size:  # empty is how a name is taken before a log begins
             os.close(self._descriptor)
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
@@ -42,7 +44,7 @@ class LogFile:
 
     def sync(self) -> None:
         """Wait until the disk has what was written."""
-        os.fdatasync(self._descriptor)
+        (os.fdatasync if sys.platform == "linux" else os.fsync)(self._descriptor)
 
     def truncate(self, size: int) -> None:
         """Cut what lies behind `size`; a file that is shorter stays so."""

@@ -7,14 +7,11 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from ctypes import PyDLL
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from dxlrun.channels import shared_memory
-from dxlrun.channels.compiled import compiled
-from dxlrun.control import gate
+from dxlrun.channels import compiled
 from dxlrun.control.realtime import (
     IDLE_LATENCY,
     IPC_LOCK,
@@ -27,9 +24,7 @@ from dxlrun.control.realtime import (
     lockable_bytes,
     user,
 )
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
-from dxlrun.errors import StartUpError
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
@@ -114,15 +109,6 @@ def may_schedule() -> bool:
     return True
 
 
-def _compiled() -> str:
-    try:
-        for source in (shared_memory.SOURCE, kernel.SOURCE, gate.SOURCE):
-            compiled(source, PyDLL)
-    except StartUpError as error:
-        return f"{error}"
-    return ""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
     """One machine and its user, as far as checks depend on them; the tests make up others."""
@@ -156,7 +142,7 @@ class Machine:
             capabilities=tuple(name for bit, name in _CAPABILITIES.items() if has_capability(bit)),
             highest_priority=highest_priority(),
             lockable=lockable_bytes(),
-            compiled=_compiled(),
+            compiled=compiled.missing(),
         )
 
     @property

@@ -8,7 +8,6 @@ call, its processes are not seen. A process that a controller needs is started i
 
 from __future__ import annotations
 
-import _posixsubprocess
 import os
 import signal
 import sys
@@ -148,6 +147,7 @@ _STARTS = {
     "os.forkpty": "a child process",
     "os.posix_spawn": "a child process",
     "os.system": "a child process",
+    "_winapi.CreateProcess": "a child process",
     "subprocess.Popen": "a child process",
     "os.exec": "another program in place of the loop",
     "_thread.start_new_thread": "a thread",
@@ -178,15 +178,20 @@ def _guard() -> None:
     """
     sys.addaudithook(_audit)
     start: Callable[[threading.Thread], None] = threading.Thread.start
-    fork_exec: Callable[..., int] = _posixsubprocess.fork_exec
 
     def start_thread(thread: threading.Thread) -> None:
         _refuse("a thread")
         start(thread)
 
+    setattr(threading.Thread, "start", start_thread)  # noqa: B010  a method, which mypy would not let replace
+    if sys.platform == "win32":
+        return
+    import _posixsubprocess
+
+    fork_exec: Callable[..., int] = _posixsubprocess.fork_exec
+
     def start_process(*arguments: object) -> int:
         _refuse("a child process")
         return fork_exec(*arguments)
 
-    setattr(threading.Thread, "start", start_thread)  # noqa: B010  a method, which mypy would not let replace
     setattr(_posixsubprocess, "fork_exec", start_process)  # noqa: B010  see above

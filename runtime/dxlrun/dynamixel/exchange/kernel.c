@@ -11,12 +11,20 @@
 #define _GNU_SOURCE
 #include <errno.h>
 #include <math.h>
-#include <poll.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <string.h>
 #include <time.h>
 #include <unistd.h>
+#ifdef __linux__
+#include <poll.h>
+#else /* robots run on virtual time alone, where no line has a descriptor */
+#define POLLIN 1
+#define POLLOUT 4
+struct pollfd { int fd; short events, revents; };
+typedef unsigned nfds_t;
+#define ppoll(set, count, timeout, mask) ((void)(set), (void)(count), (void)(timeout), 0)
+#endif
 
 #ifndef SOURCE_CRC
 #define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py refuses an object of another one, as it reads the structs here */
@@ -208,7 +216,7 @@ static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
     }
     int64_t deadline = 0;
     while (size > 0) {
-        ssize_t count = write(l->descriptor, data, (size_t)size);
+        ssize_t count = write(l->descriptor, data, (uint32_t)size);
         if (count < 0 && errno != EAGAIN && errno != EINTR) {
             l->gone = errno;
             return 0;
@@ -240,7 +248,7 @@ static int32_t receive(Kernel *k, Line *l)
     int32_t room = l->room - l->have;
     if (k->receive)
         return k->receive((int32_t)(l - k->lines), place, room);
-    ssize_t count = read(l->descriptor, place, (size_t)room);
+    ssize_t count = read(l->descriptor, place, (uint32_t)room);
     if (count > 0)
         return (int32_t)count;
     return count < 0 && (errno == EAGAIN || errno == EINTR) ? 0 : -1;

@@ -1,0 +1,183 @@
+"""What `release/build.py` publishes: tags, contents, what the objects need of a system, the same bytes again.
+
+These run where ziglang is installed (extra `release`), for a minute or two.
+"""
+
+from __future__ import annotations
+
+import email
+import importlib
+import importlib.util
+import re
+import shutil
+import subprocess
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OBJECTS = {
+    "dxlrun/channels/libshared_memory.so": {
+        "dxl_append",
+        "dxl_commit",
+        "dxl_read_next",
+        "dxl_read_newest",
+        "dxl_source",
+    },
+    "dxlrun/control/libgate.so": {"gate_apply", "dxl_source"},
+    "dxlrun/dynamixel/exchange/libkernel.so": {
+        "dxl_read",
+        "dxl_write",
+        "dxl_abandon",
+        "dxl_take",
+        "dxl_source",
+    },
+}
+"""The objects of a wheel, and functions of each."""
+PROCESSORS = {"EM_X86_64": "x86_64", "EM_AARCH64": "aarch64"}
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+
+
+@pytest.fixture(scope="module")
+def release() -> ModuleType:
+    for module in ("ziglang", "twine"):
+        importlib.import_module(module)
+    spec = importlib.util.spec_from_file_location("release_of_dxlrun", ROOT / "release/build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def tree(place: Path, umask: int = 0o022) -> Path:
+    """A copy of what a clone has."""
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=False).stdout.split("\n")
+    folders = [path.name for path in ROOT.iterdir() if path.name not in {".git", ".venv", "dist", "logs"}]
+    for name in filter(None, names if any(names) else folders):
+        source, target = ROOT / name, place / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+        elif source.is_file():
+            shutil.copyfile(source, target)
+            target.chmod(0o666 & ~umask)
+    return place
+
+
+@pytest.fixture(scope="module")
+def built(release: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    root = tree(tmp_path_factory.mktemp("tree") / "dxlrun")
+    files: list[Path] = release.build(root, root / "dist")
+    return files
+
+
+@pytest.mark.timeout(600)
+def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
+    release: ModuleType, built: list[Path]
+) -> None:
+    names = [f"dxlrun-{VERSION}-py3-none-{platform}.whl" for platform in release.PLATFORMS]
+    assert [path.name for path in built] == [f"dxlrun-{VERSION}.tar.gz", *names]
+    for path, platform in zip(built[1:], release.PLATFORMS, strict=True):
+        with zipfile.ZipFile(path) as wheel:
+            assert wheel.testzip() is None
+            facts = email.message_from_bytes(wheel.read(f"dxlrun-{VERSION}.dist-info/WHEEL"))
+            about = email.message_from_bytes(wheel.read(f"dxlrun-{VERSION}.dist-info/METADATA"))
+        assert (facts["Tag"], facts["Root-Is-Purelib"]) == (f"py3-none-{platform}", "false")
+        assert (about["Name"], about["Version"]) == ("dxlrun", VERSION)
+
+
+@pytest.mark.timeout(600)
+def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path]) -> None:
+    elffile = importlib.import_module("elftools.elf.elffile")
+    sources = {str(path.relative_to(ROOT / "runtime")) for path in (ROOT / "runtime/dxlrun").rglob("*.py")}
+    for path in built[1:]:
+        with zipfile.ZipFile(path) as wheel:
+            assert sources - {*wheel.namelist()} == set()
+            assert {name for name in wheel.namelist() if name.endswith(".so")} == OBJECTS.keys()
+            for name, functions in OBJECTS.items():
+                with wheel.open(name) as stream:
+                    elf = elffile.ELFFile(stream)
+                    assert path.stem.endswith(PROCESSORS[elf["e_machine"]])
+                    symbols = {one.name for one in elf.get_section_by_name(".dynsym").iter_symbols()}
+                    assert functions - symbols == set()
+
+
+@pytest.mark.timeout(600)
+def test_no_object_needs_a_newer_system_than_its_tag_names(built: list[Path]) -> None:
+    elffile = importlib.import_module("elftools.elf.elffile")
+    for path in built[1:]:
+        with zipfile.ZipFile(path) as wheel:
+            for name in OBJECTS:
+                with wheel.open(name) as stream:
+                    elf = elffile.ELFFile(stream)
+                    dynamic = elf.get_section_by_name(".dynamic").iter_tags()
+                    needed = {tag.needed for tag in dynamic if tag.entry.d_tag == "DT_NEEDED"}
+                    section = elf.get_section_by_name(".gnu.version_r")
+                    versions = [
+                        auxiliary.name
+                        for _, all_of_it in (section.iter_versions() if section else ())
+                        for auxiliary in all_of_it
+                    ]
+                if "manylinux" in path.name:
+                    assert needed <= {"libc.so.6", "libm.so.6"}
+                    newest = [
+                        tuple(map(int, version.removeprefix("GLIBC_").split("."))) for version in versions
+                    ]
+                    assert newest
+                    assert max(newest) <= (2, 17)
+                else:  # no library has one name in all systems with musl
+                    assert (needed, versions) == (set(), [])
+
+
+@pytest.mark.timeout(600)
+def test_the_same_tree_gives_the_same_bytes(release: ModuleType, built: list[Path], tmp_path: Path) -> None:
+    """In another folder, with other permissions, and with a cache of zig's own that is empty."""
+    root = tree(tmp_path / "another" / "folder", umask=0o077)
+    again = release.build(root, tmp_path / "dist", ["manylinux_2_17_x86_64", "musllinux_1_2_aarch64"])
+    first = {path.name: path.read_bytes() for path in built}
+    assert len(again) == 3
+    assert [path.name for path in again if path.read_bytes() != first[path.name]] == []
+
+
+@pytest.mark.timeout(600)
+def test_an_index_takes_all_of_it(release: ModuleType, built: list[Path]) -> None:
+    release.judge(built)
+
+
+@pytest.mark.timeout(600)
+def test_a_wheel_that_promises_too_much_is_refused(
+    release: ModuleType, built: list[Path], tmp_path: Path
+) -> None:
+    wrong = tmp_path / built[1].name.replace("2_17", "2_5")
+    shutil.copy(built[1], wrong)
+    with pytest.raises(RuntimeError, match="need another platform"):
+        release.judge([wrong])
+    with zipfile.ZipFile(built[1]) as old, zipfile.ZipFile(tmp_path / built[1].name, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            new.writestr(
+                name,
+                re.sub(rb"Metadata-Version: \S+", b"Metadata-Version: 9.9", data)
+                if "METADATA" in name
+                else data,
+            )
+    with pytest.raises(RuntimeError, match="twine check"):
+        release.judge([tmp_path / built[1].name])
+
+
+def test_the_sdist_can_be_built_without_a_clone(built: list[Path]) -> None:
+    with tarfile.open(built[0]) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+    assert {"hatch_build.py", "release/build.py", "pyproject.toml", "LICENSE"} <= names
+    assert not any(name.endswith(".so") for name in names)
+
+
+def test_what_cannot_be_built_is_one_message(release: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="hatchling build -t sdist"):
+        release.build(tmp_path, tmp_path / "dist")
