@@ -21,7 +21,8 @@ from dxlrun.output.terminal import print_error, show, show_json
 if TYPE_CHECKING:
     from dxlrun_fleet.fleet_file import Fleet
 
-_START_S = 60.0
+_START_S = 300.0
+"""Ten robots that start together on a small computer take minutes; one that cannot listen ends by itself."""
 _POLL_S = 0.2
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 

@@ -62,7 +62,7 @@ class Run:
             *(() if self.record else ("--no-record",)),
             "--ledger",
             str(self.ledger),
-            *(self.words or ("--duration", "300")),
+            *(self.words or ("--duration", "3600")),
         ]
         with (self.place / "said").open("wb") as said:
             self.process = subprocess.Popen(
