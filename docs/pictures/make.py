@@ -170,16 +170,12 @@ class Maker:
         self.terminal("graph", "check robots/bioloid_torso.yaml --graph", columns=150)
 
     def watch(self) -> None:
-        """Watch the tutorial's arm in its motion, with a priority that a busy machine respects."""
-        file = self.place / "arm.yaml"
-        kept, loop = file.read_text(), "scheduler: {policy: round_robin, priority: 31}"
-        file.write_text(kept.replace("{rate: 100}", f"{{rate: 100, {loop}}}"))
+        """Watch the tutorial's arm in its motion."""
         with self.running("arm.yaml"):
             printed(("play", "wave", "--no-wait"), self.place)
             time.sleep(2)
             lines = printed(("watch", "--once"), self.place, columns=90)
             printed(("stop",), self.place)
-        file.write_text(kept)
         shown = [line.replace(f"{self.place}/", "") for line in lines]
         (self.into / "watch.svg").write_text(terminal([("dxlrun watch --once", shown)], 90))
 

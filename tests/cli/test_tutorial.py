@@ -32,6 +32,8 @@ INSTALLS = (
     ". .venv/bin/activate",
     "pip install ./plugins/dxlrun_view",
 )
+STARTS = 3
+"""Of a robot: where the machine is busy, its servos may answer too late."""
 pytestmark = pytest.mark.timeout(300)
 """Robots of whole pages, one after the other, in real time."""
 
@@ -64,8 +66,11 @@ class Reader:
             assert "http://127.0.0.1" in served.stdout.readline()
             served.kill()
         elif words[0].endswith(".yaml") and "--virtual" not in words:
-            robot = self._started(*words)
-            until(lambda: robot.poll() is not None or " active" in self.dxlrun("list").out, line)
+            for _ in range(STARTS):
+                robot = self._started(*words)
+                until(lambda one=robot: one.poll() is not None or " active" in self.dxlrun("list").out, line)
+                if robot.poll() is None:
+                    break
             assert robot.poll() is None, robot.stdout and robot.stdout.read()
         else:
             said = self.dxlrun(*words, *(["--once"] if words == ["watch"] else []))
@@ -113,7 +118,7 @@ def reader(
     yield begin
     for process in [one for each in readers for one in each.running]:
         process.kill()
-        process.communicate()
+        print(process.communicate()[0])  # of a failed test, how its robot fared
 
 
 def test_an_arm_in_ten_minutes(reader: Callable[[str], Reader]) -> None:
@@ -124,7 +129,7 @@ def test_an_arm_in_ten_minutes(reader: Callable[[str], Reader]) -> None:
     file.write_text(file.read_text().replace("120]", "120 deg]"))
     assert page.dxlrun("check", "arm.yaml").code == 0
     assert "arm: good. 4 joints" in page.until("dxlrun check arm.yaml")
-    assert "reached" in page.until("dxlrun send arm position shoulder=30deg elbow=45deg --in 2s --wait")
+    assert "reached" in page.until("dxlrun send arm position shoulder=10deg elbow=20deg --in 2s --wait")
     assert "shoulder" in page.until("dxlrun send arm position shoulder=100deg", code=2)
     assert page.until("dxlrun stop") == "arm has ended\n"
     page.until("dxlrun arm.yaml --virtual --play wave.yaml")
