@@ -46,7 +46,7 @@ SAMPLED = (
 
 No test of how a run ends is among them: those of safety always run.
 """
-SHARE = int(os.environ.get("DXLRUN_LONG", "6"))
+SHARE = int(os.environ.get("DXLRUN_LONG", "9"))
 
 
 def commit() -> str:
