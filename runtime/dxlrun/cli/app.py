@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import App, CycloptsError, Group
 
 from dxlrun.cli import verbs
-from dxlrun.cli.help import version
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 from dxlrun.output.table import Table
@@ -53,7 +52,7 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         help_format="plaintext",  # rich.markdown takes as long to import as all else together
         help_formatter=_Help(),
         usage=USAGE,
-        version=version,
+        version=_version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
         group_arguments=Group("Arguments", sort_key=_BEHIND),
         group_parameters=_PARAMETERS,
@@ -122,6 +121,12 @@ def _filled(text: object) -> str:
     """Return a text of a docstring without the line breaks inside its paragraphs."""
     plain = str(getattr(text, "primary_renderable", text) or "").strip()
     return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
+
+
+def _version() -> str:
+    from dxlrun.cli.help import version  # not above: only --version needs it
+
+    return version()
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
