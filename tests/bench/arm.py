@@ -1,6 +1,6 @@
 """dxlrun on ARM: the wheel for aarch64 in a Debian arm64 root under qemu-user, beside this machine.
 
-    sudo apt install qemu-user-static debootstrap && .venv/bin/pip install ziglang
+    sudo apt install qemu-user-static debootstrap && .venv/bin/pip install '.[release]'
     sudo .venv/bin/python tests/bench/arm.py /tmp/arm64 --qemu /usr/bin/qemu-aarch64
     sudo .venv/bin/python tests/bench/arm.py /tmp/arm64 fuzz --streams 2000
 
@@ -10,7 +10,7 @@ runs of same_runs.py are done here, too, and must show the same: bytes, log, sta
 
 The step `processes` needs TCGETS2, which qemu 11.1 of Debian sid has, and 7.2 of Debian 12 has not.
 On x86 qemu keeps stores in order: that ARM may not is the matter of tests/run/channels/ring_model.c. Nor are
-times measured: it is some ten times slower, and knows no real-time scheduling and no hardware.
+times measured: it is some seven times slower [measured], and knows no real-time scheduling and no hardware.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parents[2]
+sys.path.insert(0, str(HERE / "release"))
+from build import build  # noqa: E402  it lies beside, and is no package
+
 PLATFORMS = ("manylinux_2_17_aarch64", "manylinux2014_aarch64", "manylinux_2_28_aarch64")
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 RUN = "dxlrun robots/bioloid_torso.yaml --play robots/motions/three_parts.yaml"
@@ -42,10 +45,10 @@ LANG=C.UTF-8 bash -c "cd /dxlrun; $1"
 """
 
 
-def run(*words: str | Path, folder: Path = HERE, environment: dict[str, str] | None = None) -> str:
+def run(*words: str | Path) -> str:
     """Run a program of this machine; return what it prints. Raises RuntimeError where it fails."""
     both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
-    ran = subprocess.run(words, cwd=folder, env=environment, check=False, **both)
+    ran = subprocess.run(words, cwd=HERE, check=False, **both)
     if ran.returncode:
         raise RuntimeError(
             f"{shlex.join(map(str, words))} ended with {ran.returncode}:\n{ran.stdout[-6000:]}"
@@ -86,13 +89,7 @@ class Arm:
             shutil.unpack_archive(f"{folder}/tree.tar", self.clone)
             self.inside("python3 -m venv .venv")
             (packages,) = self.clone.glob(".venv/lib/python3*/site-packages")
-            compiler = shlex.join(
-                [sys.executable, "-m", "ziglang", "cc", "-target", "aarch64-linux-gnu.2.17"]
-            )
-            of_arm = {"CC": f"{compiler} -mcpu=baseline", "_PYTHON_HOST_PLATFORM": PLATFORMS[0]}
-            build = ("-m", "hatchling", "build", "-t", "wheel", "-d", folder)
-            run(sys.executable, *build, folder=self.clone, environment={**os.environ, **of_arm})
-            (wheel,) = Path(folder).glob("*.whl")
+            _, wheel = build(self.clone, Path(folder), PLATFORMS[:1])
             same = Path(folder, "same.txt")
             same.write_text(run(sys.executable, "-m", "pip", "freeze", "--exclude-editable"))
             options = ["--target", packages, "--only-binary=:all:", "-c", same]
