@@ -237,6 +237,7 @@ def test_a_name_that_a_client_chose_does_not_hide_that_of_its_certificate(desk):
     assert desk.taken[-1].origin == "anna: bert"
 
 
+@pytest.mark.campaign
 def test_half_open_connections_keep_no_client_out_and_are_closed(net):
     def act():
         ends = []
