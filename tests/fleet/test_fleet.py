@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import pty
@@ -20,6 +21,7 @@ from typing import TypeVar
 
 import msgspec
 import pytest
+from rich.console import Console
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.commands import Dxlrun
 from tests.kit.fuzzed_http import FRAMES, Said, children, process_of, stands
@@ -27,6 +29,7 @@ from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code
 from dxlrun.cli import app
+from dxlrun.cli.steering.watch import compact
 from dxlrun.errors import InputError, Refused
 from dxlrun.remote.network.certificates import keys_place
 from dxlrun.remote.network.network_link import NetworkLink
@@ -35,7 +38,7 @@ from dxlrun.remote.requests.table import Role
 from dxlrun.remote.sockets import Address
 from dxlrun_fleet.agent import START, Starter
 from dxlrun_fleet.fleet_file import Agent, read_fleet
-from dxlrun_fleet.fleet_view import SILENT_S, RobotView
+from dxlrun_fleet.fleet_view import SILENT_S, RobotView, Seen, fleet_table
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
@@ -131,6 +134,16 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     until(lambda: views["joint"].seen().state == "running", "it runs again")
     said = dxlrun("fleet", lab, "--stop", "joint", "--json")
     assert json.loads(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
+
+
+def test_a_long_error_takes_no_room_from_the_names() -> None:
+    row = Seen(
+        "joint_7", "running", voltage=12.0, temperature=30.0, error="a packet was lost " * 20, log="x" * 90
+    )
+    shown = io.StringIO()
+    Console(file=shown, width=120).print(compact(fleet_table([row])))
+    for words in ("joint_7", "running", "12.0 V", "30 deg C", "a packet was lost"):
+        assert words in shown.getvalue()
 
 
 def looked(dxlrun: Dxlrun, lab: Path) -> list[dict[str, str]]:

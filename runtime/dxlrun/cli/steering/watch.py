@@ -343,7 +343,7 @@ def compact(table: Table) -> RenderableType:
         shown.add_column(
             column.name,
             justify="right" if right else "left",
-            no_wrap=True,
+            no_wrap=column.kind != "text",  # these give way first
             overflow="ellipsis",
             min_width=5 if right else None,
         )
