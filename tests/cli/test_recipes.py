@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from tests.kit.hands import LiveRobot
 from tests.kit.pages import page_text
+from tests.kit.torso import copy_robots
 
 import dxlrun as face
 from dxlrun import RemoteRobot, connect
@@ -132,7 +133,8 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRobot]:
     directory = tmp_path_factory.mktemp("live")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
-        with LiveRobot(directory, ROOT / "robots" / "bioloid_torso.yaml") as live:
+        copy_robots(directory)
+        with LiveRobot(directory, directory / "robots" / "bioloid_torso.yaml") as live:
             yield live
 
 

@@ -1,6 +1,7 @@
 """Goals: numbers, results, preemption, cancel, and what ends a goal that its controller does not end."""
 
 import gc
+import re
 import sys
 from dataclasses import replace
 from typing import Annotated, ClassVar
@@ -395,7 +396,9 @@ def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(active):
     story.mover.fail_in = {"parameters"}
     assert story.run(5, {2: changes(story, {"speed": 2.0})}).reason == "stopped"
     why = "controller arm raised in on_parameters: RuntimeError: no way"
-    assert story.refused() == (Code.CONTROLLER_FAULT, why)
+    code, text = story.refused()
+    assert code is Code.CONTROLLER_FAULT
+    assert re.fullmatch(rf"{why} \(test_goals\.py:\d+\)", text)
     assert story.active(4) == (["leg", "careful"] if active else ["leg"])
 
 

@@ -67,7 +67,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     port = free_port()
     robot = (ROBOTS / "single_joint.yaml").read_text()
     (tmp_path / "single_joint.yaml").write_text(
-        robot.replace("rate: 320 ", "rate: 32 ")
+        robot.replace("rate: 320 ", "rate: 32 ").replace("latency: 1 ms", "latency: 20 ms")
     )  # also on a busy machine
     (tmp_path / "lab.yaml").write_text(
         f"robots:\n  joint: 127.0.0.1:{port}\n  hung: 127.0.0.1:{free_port()}\n"

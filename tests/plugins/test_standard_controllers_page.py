@@ -33,7 +33,7 @@ def test_a_section_has_a_table_of_the_keys(name: str) -> None:
 def test_every_controller_and_each_of_its_keys_is_described() -> None:
     parts = json.loads(schema_text("robot", only="dxlrun "))["$defs"]
     named = {name for name in OFFERS if f"`{name}`" in PAGE or name in TYPES}
-    assert set(OFFERS) - named == {"joint_state_broadcaster"}  # it has no key
+    assert set(OFFERS) == named
     assert [
         f"{name}.{key}"
         for name, part in parts.items()

@@ -14,6 +14,7 @@ import inspect
 import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -58,8 +59,9 @@ Models = Mapping[str, type[BaseModel]]  # Models of parameters, by the type that
 
 def robot_schema(controllers: Models, sensors: Models) -> Schema:
     """Return the schema of robot files, with the parameters of the types of controllers and sensors."""
-    lenient = fragment_schema(controllers, sensors)
-    needed = _Needs(_robot(controllers, sensors)).of_root()
+    robot = _robot(controllers, sensors)
+    lenient = _without_required(robot)
+    needed = _Needs(robot).of_root()
     joints = {"properties": {"joints": needed["properties"].pop("joints")}}  # but what others may give them
     needed |= {"if": {"anyOf": [{"required": [key]} for key in (DEFAULTS, GROUPS)]}, "else": joints}
     return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
@@ -211,6 +213,7 @@ class _Documented(GenerateJsonSchema):
         return found
 
 
+@cache  # the source of a class is looked up once a schema, not once for each class below it
 def _docstrings(kind: type) -> dict[str, str]:
     """Return the docstrings below the fields of a class, by field; of a class without source none."""
     with suppress(OSError, TypeError, SyntaxError):
