@@ -254,7 +254,8 @@ def parameters_of(
     try:
         return model.model_validate(entries[name].parameters)
     except ValidationError as error:
-        file.extend(problems_of(error, file.marks, (f"{kind}s", name), model=model))
+        beside = type(entries[name]).model_fields.keys() - {"parameters"}
+        file.extend(problems_of(error, file.marks, (f"{kind}s", name), model=model, beside=sorted(beside)))
     except Exception as error:  # a validator of the model is foreign code
         at_fault(file, kind, name, distribution, raised("check its parameters", error))
     return None

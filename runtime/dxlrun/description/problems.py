@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from types import UnionType
 from typing import Annotated, TypeVar, Union, get_args, get_origin
 
@@ -21,14 +21,16 @@ def problems_of(
     prefix: KeyPath = (),
     *,
     model: type[BaseModel] | None = None,
+    beside: Collection[str] = (),
     unknown: Set[KeyPath] = frozenset(),
 ) -> list[Problem]:
     """Return one problem for each place that a model refused, in file order.
 
     `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest known
-    one and missing keys an example. `unknown` paths and what is below them are skipped.
+    one, also of those that stand `beside` the model's, and missing keys an example. `unknown` paths and what
+    is below them are skipped.
     """
-    return _problems(error.errors(include_url=False), marks, prefix, model, unknown)
+    return _problems(error.errors(include_url=False), marks, prefix, model, beside=beside, unknown=unknown)
 
 
 def _problems(
@@ -36,11 +38,13 @@ def _problems(
     marks: Marks,
     prefix: KeyPath,
     model: type[BaseModel] | None,
+    *,
+    beside: Collection[str] = (),
     unknown: Set[KeyPath] = frozenset(),
 ) -> list[Problem]:
     found: dict[KeyPath, list[_Error]] = {}
     for details in errors:
-        error = _Error(details, marks, prefix, model)
+        error = _Error(details, marks, prefix, model, beside)
         if error.meant and not any(error.path[:end] in unknown for end in range(len(error.path) + 1)):
             found.setdefault(error.path, []).append(error)
     problems = [_merged(errors, marks) for errors in found.values()]
@@ -75,19 +79,25 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
 
 def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
     """Return every place that a model refused."""
-    return [_Error(details, marks, (), None).path for details in error.errors(include_url=False)]
+    return [_Error(details, marks).path for details in error.errors(include_url=False)]
 
 
 class _Error:
     """One error of pydantic, and the place in the file that it is about."""
 
     def __init__(
-        self, details: ErrorDetails, marks: Marks, prefix: KeyPath, model: type[BaseModel] | None
+        self,
+        details: ErrorDetails,
+        marks: Marks,
+        prefix: KeyPath = (),
+        model: type[BaseModel] | None = None,
+        beside: Collection[str] = (),
     ) -> None:
         self.kind = details["type"]
         self.context: Mapping[str, object] = details.get("ctx", {})
         self.input: object = details["input"]
         self.model = model
+        self.beside = beside
         self.location = details["loc"]
         of_key = self.location[-1:] == ("[key]",)
         location = self.location[:-1] if of_key else self.location
@@ -257,6 +267,8 @@ def _sentence_missing(error: _Error) -> tuple[str, str]:
 def _sentence_unknown(error: _Error) -> tuple[str, str]:
     key, parent = str(error.path[-1]), path_text(error.path[:-1])
     known, refused = ((), {}) if error.model is None else keys_at(error.model, error.location[:-1])
+    if len(error.location) == 1:
+        known = (*known, *error.beside)
     if key in refused:
         return f"{path_text(error.path)} is not possible", refused[key]
     otherwise = f"take it out; known keys: {', '.join(known)}" if known else "take it out"
