@@ -12,7 +12,7 @@ from dxlrun import DxlrunError, InputError, RemoteRobot, connect
 from dxlrun.channels.loop_requests import Switch, TorqueRequest
 from dxlrun.log import schemas
 from dxlrun.messages.definition import MessageType
-from dxlrun.remote.client import TopicMessage
+from dxlrun.remote.live.listening import TopicMessage
 from dxlrun.remote.live.live_messages import LiveMessages
 from dxlrun.remote.requests.replies import RobotInfo
 from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text

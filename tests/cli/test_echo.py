@@ -13,7 +13,8 @@ from dxlrun.cli.steering import echo as module
 from dxlrun.cli.steering.echo import fields
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
-from dxlrun.remote.client import TopicMessage, TopicState
+from dxlrun.remote.live.listening import TopicMessage
+from dxlrun.remote.requests.replies import TopicState
 
 MESSAGE: dict[str, object] = {
     "header": {"stamp": {"sec": 3, "nanosec": 0}, "frame_id": ""},

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from dxlrun.cli.steering import goals, parameters, play, steer
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
-from dxlrun.remote.client import Executed, GoalState, RemoteGoal
-from dxlrun.remote.requests.replies import Parameter
+from dxlrun.remote.client import Executed, RemoteGoal
+from dxlrun.remote.requests.replies import GoalState, Parameter
 
 Dxlrun = Callable[..., Any]
 RUNNING = GoalState(3, "arm", "trajectory", "anna", "running", 0.5, 0.01, "")

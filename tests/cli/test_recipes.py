@@ -24,7 +24,7 @@ from tests.kit.torso import copy_robots
 
 import dxlrun as face
 from dxlrun import RemoteRobot, connect
-from dxlrun.remote.client import Listening
+from dxlrun.remote.live.listening import Listening
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of

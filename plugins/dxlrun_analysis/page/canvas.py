@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from xml.etree import ElementTree as ET
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from bokeh.document import Document
@@ -29,7 +30,7 @@ from bokeh.resources import Resources
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.output.html import Element, data, figure, script
+from dxlrun.output.html import data, figure, script
 from dxlrun_analysis.page.curves import Curves
 
 PAPER = "#ffffff"

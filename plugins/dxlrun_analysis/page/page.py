@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 from dxlrun.channels.events import Event, Severity
 from dxlrun.log.reader import Log, LogReader
-from dxlrun.output.html import Element, document, folded, footer, header, paragraph, section, table_element
+from dxlrun.output.html import document, folded, footer, header, paragraph, section, table_element
 from dxlrun.output.table import Cell, Column, Columns, Table, microseconds
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.page.canvas import Canvas

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from dxlrun.errors import counted
-from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
+from dxlrun.output.html import document, footer, header, paragraph, section, table_element
 from dxlrun_analysis.figures.servos import (
     Mark,
     Points,

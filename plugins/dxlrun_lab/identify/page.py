@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
+from dxlrun.output.html import document, footer, header, paragraph, section, table_element
 from dxlrun.output.table import Sentence
 from dxlrun_analysis.figures.drawing import (
     BLUE,

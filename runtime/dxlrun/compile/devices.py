@@ -16,13 +16,8 @@ from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
 from dxlrun.description.document import KeyPath
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.control_table.devices import (
-    DeviceItem,
-    DeviceTable,
-    device_table,
-    perhaps_meant_device,
-)
+from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable, read_device_table
+from dxlrun.dynamixel.control_table.devices import device_table, perhaps_meant_device
 from dxlrun.dynamixel.plan.devices import device_blocks, device_command
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire.dialect import dialect_of

@@ -27,41 +27,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.messages.declared import Length, Number
-
-__all__ = [
-    "BatteryState",
-    "Bool",
-    "Float64",
-    "Float64MultiArray",
-    "FluidPressure",
-    "Header",
-    "Imu",
-    "Int32",
-    "Int64",
-    "JointState",
-    "JointTrajectoryPoint",
-    "Length",
-    "MagneticField",
-    "MultiArrayDimension",
-    "MultiArrayLayout",
-    "Number",
-    "Odometry",
-    "Point",
-    "Pose",
-    "PoseWithCovariance",
-    "Quaternion",
-    "Range",
-    "String",
-    "Temperature",
-    "Time",
-    "Twist",
-    "TwistWithCovariance",
-    "UInt32",
-    "Vector3",
-    "Wrench",
-    "WrenchStamped",
-]
+from dxlrun.messages.declared import Length as Length
+from dxlrun.messages.declared import Number as Number
 
 Floats = NDArray[np.float64]
 Covariance = Annotated[Floats, Length(36)]

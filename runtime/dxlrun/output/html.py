@@ -15,20 +15,6 @@ from dxlrun.output.escaping import escaped
 from dxlrun.output.json import json_text
 from dxlrun.output.table import Table
 
-__all__ = [
-    "Element",
-    "data",
-    "document",
-    "figure",
-    "folded",
-    "footer",
-    "header",
-    "paragraph",
-    "script",
-    "section",
-    "table_element",
-]
-
 _STYLE_SHEET = Path(__file__).with_name("page.css")
 
 

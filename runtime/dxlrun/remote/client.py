@@ -32,26 +32,13 @@ from dxlrun.remote.requests import replies
 from dxlrun.remote.requests import table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
 from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Request, Row, Value
-from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, address_of, running, sockets
+from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, address_of, sockets
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import FrameTree
     from dxlrun.log.schemas import LogHeader
     from dxlrun.remote.live.states import RobotStates
-
-__all__ = [
-    "Executed",
-    "GoalState",
-    "Listening",
-    "RemoteGoal",
-    "RemoteRobot",
-    "Stream",
-    "TopicMessage",
-    "TopicState",
-    "connect",
-    "running",
-]
 
 LEASE_S = 0.2
 _STOP_S = 30.0

@@ -13,7 +13,8 @@ from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json, show_json_line
 
 if TYPE_CHECKING:
-    from dxlrun.remote.client import TopicMessage, TopicState
+    from dxlrun.remote.live.listening import TopicMessage
+    from dxlrun.remote.requests.replies import TopicState
 
 _NAMES = ("name", "joint_names")
 """Fields in which messages of ROS 2 name their joints."""

@@ -17,7 +17,8 @@ from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
 
 if TYPE_CHECKING:
-    from dxlrun.remote.client import Executed, GoalState, RemoteRobot
+    from dxlrun.remote.client import Executed, RemoteRobot
+    from dxlrun.remote.requests.replies import GoalState
 
 REST_S = 10.0
 """How long a cancelled goal may take until its joints are at rest."""

@@ -30,7 +30,8 @@ from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.modes import mode_of
 from dxlrun.dynamixel.control_table import add_control_table
-from dxlrun.dynamixel.control_table.devices import add_device_table, is_device_table
+from dxlrun.dynamixel.control_table.device_table import is_device_table
+from dxlrun.dynamixel.control_table.devices import add_device_table
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan

@@ -4,48 +4,22 @@
 Each model has a data file in `tables/`.
 """
 
-from dxlrun.dynamixel.control_table.models import (
-    add_control_table,
-    added_control_tables,
-    all_tables,
-    control_table,
-    model_names,
-    models_by_number,
-    perhaps_meant,
-    protocols_of,
-)
-from dxlrun.dynamixel.control_table.sources import read_control_table
-from dxlrun.dynamixel.control_table.table import (
-    CAPABILITIES,
-    SIGN_BIT,
-    Access,
-    Area,
-    ControlItem,
-    ControlTable,
-    EffortUnit,
-    Encoding,
-    decoded,
-    side_by_side,
-)
-
-__all__ = [
-    "CAPABILITIES",
-    "SIGN_BIT",
-    "Access",
-    "Area",
-    "ControlItem",
-    "ControlTable",
-    "EffortUnit",
-    "Encoding",
-    "add_control_table",
-    "added_control_tables",
-    "all_tables",
-    "control_table",
-    "decoded",
-    "model_names",
-    "models_by_number",
-    "perhaps_meant",
-    "protocols_of",
-    "read_control_table",
-    "side_by_side",
-]
+from dxlrun.dynamixel.control_table.models import add_control_table as add_control_table
+from dxlrun.dynamixel.control_table.models import added_control_tables as added_control_tables
+from dxlrun.dynamixel.control_table.models import all_tables as all_tables
+from dxlrun.dynamixel.control_table.models import control_table as control_table
+from dxlrun.dynamixel.control_table.models import model_names as model_names
+from dxlrun.dynamixel.control_table.models import models_by_number as models_by_number
+from dxlrun.dynamixel.control_table.models import perhaps_meant as perhaps_meant
+from dxlrun.dynamixel.control_table.models import protocols_of as protocols_of
+from dxlrun.dynamixel.control_table.sources import read_control_table as read_control_table
+from dxlrun.dynamixel.control_table.table import CAPABILITIES as CAPABILITIES
+from dxlrun.dynamixel.control_table.table import SIGN_BIT as SIGN_BIT
+from dxlrun.dynamixel.control_table.table import Access as Access
+from dxlrun.dynamixel.control_table.table import Area as Area
+from dxlrun.dynamixel.control_table.table import ControlItem as ControlItem
+from dxlrun.dynamixel.control_table.table import ControlTable as ControlTable
+from dxlrun.dynamixel.control_table.table import EffortUnit as EffortUnit
+from dxlrun.dynamixel.control_table.table import Encoding as Encoding
+from dxlrun.dynamixel.control_table.table import decoded as decoded
+from dxlrun.dynamixel.control_table.table import side_by_side as side_by_side

@@ -9,23 +9,10 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table.device_table import (
-    DeviceItem,
     DeviceTable,
-    is_device_table,
     read_device_table,
 )
 from dxlrun.dynamixel.control_table.models import beginning_or_near, models_by_number, protocols_of
-
-__all__ = [
-    "DeviceItem",
-    "DeviceTable",
-    "add_device_table",
-    "device_table",
-    "device_tables",
-    "devices_by_number",
-    "is_device_table",
-    "perhaps_meant_device",
-]
 
 _TABLES = Path(__file__).parent / "tables" / "devices"
 _ADDED: list[DeviceTable] = []  # Tables of plug-ins

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dxlrun.dynamixel.control_table.devices import DeviceItem, DeviceTable
+from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.plan.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
 
