@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.terminal import print_error, show, show_json
 
@@ -35,7 +35,7 @@ def fleet(
     stop: Names = (),
     serve: str | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Show the robots of a file in one table, live; q or Ctrl-C ends it. Start and stop them.
 
@@ -52,10 +52,6 @@ def fleet(
         Stop these robots, by their policy on_exit; needs the role command.
     serve
         Be the agent of this name: start the robots that the file names for it. Robots go on when it ends.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.remote.network.certificates import client_context
     from dxlrun_fleet.fleet_file import read_fleet

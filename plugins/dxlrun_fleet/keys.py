@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import show, show_json
@@ -29,7 +29,7 @@ def keys(
     days: int = 365,
     to: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Make certificates for robots and clients of a network, renew and revoke them.
 
@@ -49,10 +49,6 @@ def keys(
     to
         Write it to this directory, to be copied to `~/.config/dxlrun/keys` of another computer; without, this
         computer uses it.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     try:
         from dxlrun_fleet import authority

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from cyclopts import Parameter
 
 from dxlrun import InputError, connect
-from dxlrun.cli.inputs import Flag, leave_real_time
+from dxlrun.cli.inputs import DebugFlag, Flag, RobotName, leave_real_time
 from dxlrun.output.terminal import show
 
 if TYPE_CHECKING:
@@ -33,14 +33,14 @@ APP = "https://app.foxglove.dev"
 
 def foxglove(
     *,
-    robot: str | None = None,
+    robot: RobotName = None,
     control: Flag = False,
     port: int | None = None,
     listen: str = LOOPBACK,
     cert: Path | None = None,
     key: Path | None = None,
     origin: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = (),
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Serve a running robot to Foxglove and Lichtblick: and to other viewers of their protocol.
 
@@ -49,8 +49,6 @@ def foxglove(
 
     Parameters
     ----------
-    robot
-        Name of the robot, where several run.
     control
         Viewers may change parameters, switch controllers and torque, and halt the robot.
     port
@@ -63,8 +61,6 @@ def foxglove(
         Its private key (PEM).
     origin
         Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
-    debug
-        Print the traceback of an error.
     """
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, terminated_as_interrupted
+from dxlrun.cli.inputs import DebugFlag, Flag, RobotName, terminated_as_interrupted
 from dxlrun.cli.steering.steer import Chosen, robot_of
 from dxlrun.errors import InputError
 
@@ -21,8 +21,8 @@ def teleop(
     gamepad: Flag = False,
     device: str | None = None,
     speed: float = 1.0,
-    robot: str | None = None,
-    debug: Flag = False,
+    robot: RobotName = None,
+    debug: DebugFlag = False,
 ) -> int:
     """Drive a running robot by hand, from the keyboard or a gamepad.
 
@@ -40,10 +40,6 @@ def teleop(
         Drive with this gamepad or keyboard, such as /dev/input/event5.
     speed
         How fast, as a factor: 0.5 is half as fast.
-    robot
-        Name of the robot, where several run.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.output.terminal import show
     from dxlrun_teleop.bank import banks_of

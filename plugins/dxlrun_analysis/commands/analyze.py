@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
+from dxlrun.cli.inputs import DebugFlag, Flag, check_report, write_report
 from dxlrun.errors import InputError, LogError, counted, missing_extra
 from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
@@ -36,8 +36,8 @@ def analyze(
     *logs: Annotated[Path, Parameter(name="log", converter=_log)],
     report: Path | None = None,
     worst: int = 0,
-    as_json: JsonFlag = False,
-    debug: Flag = False,
+    as_json: Annotated[Flag, Parameter(name="--json")] = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Analyze a log: latency, duration of each step, skipped periods, packets and errors per servo.
 
@@ -57,8 +57,6 @@ def analyze(
         expected it.
     as_json
         Print the result as JSON; with several logs {"logs": [...]}.
-    debug
-        Print the traceback of an error.
     """
     _check(logs, report=report, worst=worst)
     if report is not None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.terminal import err, show, show_json
 
@@ -26,7 +26,7 @@ def export(
     file_format: Annotated[Format, Parameter(name="--format")],
     topic: Annotated[str | None, Parameter(show_default=False)] = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Write a log in another format, to a new file or directory; nothing is written over.
 
@@ -44,10 +44,6 @@ def export(
         layout of LeRobotDataset v3.0.
     topic
         For csv: /events, /commands, /bus/NAME or a controller's topic instead of /cycle.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
@@ -33,7 +33,7 @@ def logs(
     sort: Text = None,
     sql: Text = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Show all logs below a directory as a table, one row a log.
 
@@ -51,10 +51,6 @@ def logs(
         Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
     sql
         Instead of both: a whole SELECT over the table logs.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     _check(directory, where, sort, sql)
     from dxlrun_analysis.season import query, runs
@@ -83,7 +79,7 @@ def logs(
     return 0
 
 
-def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: Flag = False) -> int:
+def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.
 
     Logs that are there as a whole are left out, and so is one that changed within the last 10 s; what an
@@ -97,10 +93,6 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     store
         Such as s3://BUCKET/PREFIX, or file:///DIRECTORY. Keys and the address of a server of one's own are
         those of the AWS command line: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if missing := missing_extra("`dxlrun upload`", "store", "fsspec", "duckdb", "pyarrow"):
         raise InputError(missing)

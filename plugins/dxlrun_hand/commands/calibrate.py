@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, compiled, parse_assignments, read_models
+from dxlrun.cli.inputs import Assignment, DebugFlag, RobotPath, compiled, parse_assignments, read_models
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,9 @@ Joints = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, c
 """Names of joints or groups, one or several behind the option."""
 
 
-def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debug: Flag = False) -> int:
+def calibrate(
+    robot: RobotPath, /, *assignments: Assignment, joint: Joints = (), debug: DebugFlag = False
+) -> int:
     """Measure reference, direction and limits of joints by hand: for the robot file.
 
     A dialogue: the joints become limp, are brought to their zero pose, and each to both of its ends. What
@@ -30,14 +32,8 @@ def calibrate(robot: Path, /, *assignments: Assignment, joint: Joints = (), debu
 
     Parameters
     ----------
-    robot
-        The robot file.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     joint
         Only these joints, or the joints of these groups.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Terminal

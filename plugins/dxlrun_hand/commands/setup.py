@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, Flag, known_file, parse_assignments
+from dxlrun.cli.inputs import Assignment, DebugFlag, Flag, RobotPath, known_file, parse_assignments
 from dxlrun.cli.tools.scan import load_models
 from dxlrun.errors import InputError
 from dxlrun_hand.commands.calibrate import Joints
@@ -19,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def setup(
-    robot: Path,
+    robot: RobotPath,
     /,
     *assignments: Assignment,
     joint: Joints = (),
     find_port: Flag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Give new servos the ID, rate and registers of a robot file: one after the other.
 
@@ -34,16 +33,10 @@ def setup(
 
     Parameters
     ----------
-    robot
-        The robot file.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     joint
         Only the servos of these joints, or of the joints of these groups.
     find_port
         Find the port of each bus by unplugging its adapter, also where the file's is there.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.description.reading import read_robot
     from dxlrun.dynamixel.port.serial_open import serial_devices

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag
+from dxlrun.cli.inputs import DebugFlag, RobotName
 from dxlrun.cli.steering.steer import Chosen, robot_of
 from dxlrun.errors import InputError
 
@@ -20,8 +20,8 @@ def teach(
     /,
     *joints: Joints,
     speed: str = "30 deg/s",
-    robot: str | None = None,
-    debug: Flag = False,
+    robot: RobotName = None,
+    debug: DebugFlag = False,
 ) -> int:
     """Show a running robot a motion by hand, and save it as a motion file.
 
@@ -38,10 +38,6 @@ def teach(
         active controller plays motions for.
     speed
         How fast joints go from one pose to the next.
-    robot
-        Name of the robot, where several run.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.description.units import angular_velocity
     from dxlrun.log.target import check_new

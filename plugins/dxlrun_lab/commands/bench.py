@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Seconds, parse_assignments
+from dxlrun.cli.inputs import Assignment, DebugFlag, JsonFlag, RobotPath, Seconds, parse_assignments
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import show, show_json
 
@@ -20,12 +19,12 @@ bench = App(name="bench", help="Measure a robot on this machine.")
 
 @bench.command(name="rate")
 def bench_rate(
-    robot: Path,
+    robot: RobotPath,
     /,
     *assignments: Assignment,
     duration: Seconds = 3.0,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Find the highest rate that a robot keeps, by running it at one rate after another.
 
@@ -34,16 +33,8 @@ def bench_rate(
 
     Parameters
     ----------
-    robot
-        The robot file.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     duration
         How long each run lasts, s.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if not robot.is_file():
         raise InputError(f"there is no robot file {robot}; check the path")

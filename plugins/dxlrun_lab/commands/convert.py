@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import show, show_json
 from dxlrun_lab.commands.recorded import ALL_OF_IT, RecordedPart
@@ -25,7 +25,7 @@ def convert(
     controller: str | None = None,
     part: RecordedPart = ALL_OF_IT,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Write a recorded motion to a new motion file: of a log, a foreign MCAP file or a ROS 2 bag.
 
@@ -40,10 +40,6 @@ def convert(
     controller
         This controller is to play it, a joint_trajectory_controller for example; without it those that moved
         the joints in the log.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
+from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
 
@@ -33,7 +33,7 @@ def latency(
     no_record: Flag = False,
     report: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Measure how late this machine wakes a loop up: one that waits as a run's; no robot is used.
 
@@ -70,10 +70,6 @@ def latency(
     report
         Also write a page with all numbers and plots to this file, such as latency.html. Needs bokeh:
         `pip install 'dxlrun[report]'`.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     import os
 

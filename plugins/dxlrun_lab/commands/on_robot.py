@@ -23,7 +23,7 @@ import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from dxlrun.cli.inputs import Flag, JsonFlag, compiled
+from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag, compiled
 from dxlrun.errors import DxlrunError, InputError, counted
 from dxlrun.output.terminal import err, print_error, print_warning
 
@@ -61,10 +61,6 @@ class OnRobot:
         Do not ask before a real joint moves; the countdown stays.
     report
         Write the result as one HTML page, with its plots.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
 
     range: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
@@ -73,7 +69,7 @@ class OnRobot:
     yes: Flag = False
     report: Path | None = None
     as_json: JsonFlag = False
-    debug: Flag = False
+    debug: DebugFlag = False
 
 
 DEFAULTS = OnRobot()

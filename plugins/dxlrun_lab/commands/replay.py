@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
+from dxlrun.cli.inputs import DebugFlag, JsonFlag, parse_assignments
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import print_warning, show, show_json
 from dxlrun_lab.commands.on_robot import Chosen
@@ -26,12 +26,12 @@ Settings = Annotated[
 def replay(
     log: Path,
     /,
-    *assignments: Assignment,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
     settings: Settings = (),
     played_on: PlayedOn = NOWHERE,
     part: RecordedPart = ALL_OF_IT,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Run the controllers of a log again: on its inputs; commands and goals are compared bit for bit.
 
@@ -46,10 +46,6 @@ def replay(
         Other arguments for the robot file that is in the log, or for that of --on.
     settings
         Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if played_on.on is not None:
         if settings:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import (
-    Assignment,
-    Flag,
+    DebugFlag,
     JsonFlag,
     Motions,
     Seconds,
@@ -42,7 +41,7 @@ _MOST_DRAWN = 2
 def sweep(
     robot: Path,
     /,
-    *assignments: Assignment,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
     play: Motions = (),
     over: Ranges = (),
     sort: By = "rms",
@@ -51,7 +50,7 @@ def sweep(
     workers: int | None = None,
     time_limit: Seconds = 600.0,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Run a motion at many values of the robot file: on virtual time; each run is scored.
 
@@ -80,10 +79,6 @@ def sweep(
         How many runs at once; without it one a core.
     time_limit
         Seconds of real time that one run may take.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if missing := missing_extra("a sweep", "sweep", "pyarrow"):
         raise InputError(missing)

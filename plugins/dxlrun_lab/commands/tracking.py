@@ -10,6 +10,7 @@ from cyclopts import App
 from dxlrun.cli.examples import examples_directory
 from dxlrun.cli.inputs import (
     Assignment,
+    DebugFlag,
     Flag,
     JsonFlag,
     check_report,
@@ -43,7 +44,7 @@ def tracking(
     no_stress: Flag = False,
     report: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Measure how well a motion is followed: by the loop, and by a sender that counts poses instead of time.
 
@@ -54,8 +55,6 @@ def tracking(
     ----------
     robot
         The robot file; without it single_joint.yaml of `dxlrun examples`.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     play
         The motion file, of one joint; without it the thesis' motion for single_joint.yaml, 30 s.
     setups
@@ -65,10 +64,6 @@ def tracking(
     report
         Also write a page with the table and a figure for each set-up to this file, such as tracking.html.
         Needs matplotlib: `pip install 'dxlrun[report]'`.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     words = list(assignments)
     if robot is not None and ":=" in robot:

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, Seconds, compiled, read_models
+from dxlrun.cli.inputs import (
+    Assignment,
+    DebugFlag,
+    Flag,
+    JsonFlag,
+    Motions,
+    RobotPath,
+    Seconds,
+    compiled,
+    read_models,
+)
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
@@ -28,7 +38,7 @@ _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 
 
 def check(
-    robot: Path,
+    robot: RobotPath,
     /,
     *assignments: Assignment,
     play: Motions = (),
@@ -37,7 +47,7 @@ def check(
     graph: Annotated[tuple[Path, ...] | None, _OPTIONAL] = None,
     log: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Check a robot file: joints, reach, controllers, claims, the time budget of each bus.
 
@@ -46,10 +56,6 @@ def check(
 
     Parameters
     ----------
-    robot
-        The robot file.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     play
         Check this motion file too; may be given several times.
     duration
@@ -60,10 +66,6 @@ def check(
         Draw the controllers, what they read and what they command: here, or into a file, .svg or .dot.
     log
         Write every packet of --online into this new file, a log.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if log is not None and not online:
         raise InputError("--log keeps what --online sends and receives; give --online too")

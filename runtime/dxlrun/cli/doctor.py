@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -16,18 +16,11 @@ if TYPE_CHECKING:
 _TONES: Mapping[str, Tone] = {"good": "good", "worse": "warning", "missing": "error"}
 
 
-def doctor(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
+def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """Check whether this machine is fit to run robots: ports, rights, kernel, processor.
 
     Nothing is changed; what could be better is printed with the command that improves it. Exit code 0, or 1
     when something is missing without which no robot runs.
-
-    Parameters
-    ----------
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.run.doctor import Machine, diagnose
 

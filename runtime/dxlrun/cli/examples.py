@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.terminal import show, show_json
 
@@ -40,7 +40,12 @@ class Example:
 
 
 def examples(
-    name: str | None = None, directory: Path = _HERE, /, *, as_json: JsonFlag = False, debug: Flag = False
+    name: str | None = None,
+    directory: Path = _HERE,
+    /,
+    *,
+    as_json: JsonFlag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """List the robots that come with dxlrun, or copy one with its motions: to be run and changed.
 
@@ -50,10 +55,6 @@ def examples(
         The robot to be copied; without it all are listed.
     directory
         Where it is copied to; nothing there is overwritten.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     source = examples_directory()
     known = {path.stem: path for path in sorted(source.glob("*.yaml"))}
@@ -187,7 +188,7 @@ def schema(
     /,
     *,
     output: Path | None = None,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Print the JSON Schema of robot files: with the parameters of all installed controllers.
 
@@ -200,8 +201,6 @@ def schema(
         Which files: robot, motion, motor, or fragment (what a robot file includes).
     output
         Write it into this file instead.
-    debug
-        Print the traceback of an error.
     """
     text = schema_text(kind)
     if output is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
+from dxlrun.cli.inputs import Assignment, DebugFlag, JsonFlag, RobotPath, compiled
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
 
@@ -26,7 +26,7 @@ _ASCII: _Branches = ("|-- ", "|.. ", "`-- ", "`.. ", "|   ")
 
 
 def frames(
-    robot: Path,
+    robot: RobotPath,
     /,
     *assignments: Assignment,
     of: str | None = None,
@@ -34,7 +34,7 @@ def frames(
     at: _Positions = (),
     graph: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Draw a robot's frames after its URDF, or print where one of them lies: in another one.
 
@@ -42,10 +42,6 @@ def frames(
 
     Parameters
     ----------
-    robot
-        The robot file.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     of
         Print where this frame lies, instead of the tree.
     relative_to
@@ -54,10 +50,6 @@ def frames(
         Position of a joint, for example elbow=30deg or jaw=5mm; may be given several times. The others rest.
     graph
         Draw the tree into a file, .svg or .dot.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     if of is None and (at or relative_to):
         raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")
@@ -81,7 +73,7 @@ def frames(
     return 0
 
 
-def _tree(plan: Plan, robot: Path) -> FrameTree:
+def _tree(plan: Plan, robot: RobotPath) -> FrameTree:
     from dxlrun.description.frames.tree import FrameTree  # as above
 
     if plan.urdf is None or plan.frames is None:

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.table import Column, Columns, Table, Value
 from dxlrun.output.terminal import show, show_json
@@ -32,16 +32,8 @@ Row = dict[str, Any]
 """What JSON has of one thing."""
 
 
-def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
-    """List the plug-ins that are installed, and what each of them offers.
-
-    Parameters
-    ----------
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
-    """
+def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
+    """List the plug-ins that are installed, and what each of them offers."""
     from dxlrun.control.controllers.plugins import load_plugins
 
     found = load_plugins()
@@ -137,7 +129,7 @@ def _table(row: Row) -> Table:
 
 
 def new_plugin(
-    name: str, directory: Path | None = None, /, *, as_json: JsonFlag = False, debug: Flag = False
+    name: str, directory: Path | None = None, /, *, as_json: JsonFlag = False, debug: DebugFlag = False
 ) -> int:
     """Make a package with a controller of your own: a robot file that uses it, and a test.
 
@@ -147,10 +139,6 @@ def new_plugin(
         Name of the package, such as my_robotics.
     directory
         Where it is made; without it, in a new directory of its name.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     module = _module(name)
     place = Path(name) if directory is None else directory

@@ -52,8 +52,6 @@ def run(
     ----------
     robot
         The robot file, for example robots/bioloid_torso.yaml.
-    assignments
-        Arguments of the robot file, for example port:=/dev/ttyUSB0.
     duration
         Stop after this time, s; or with its unit: 500ms, 2min.
     play

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, Hertz, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, Flag, Hertz, JsonFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
@@ -38,15 +38,11 @@ class Chosen:
     ----------
     robot
         Name of the robot, where several run; NAME@HOST:PORT of one on another computer.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
 
     robot: str | None = None
     as_json: JsonFlag = False
-    debug: Flag = False
+    debug: DebugFlag = False
 
 
 ONLY_ONE = Chosen()
@@ -54,7 +50,7 @@ ONLY_ONE = Chosen()
 
 
 def list_robots(
-    *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: Flag = False
+    *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: DebugFlag = False
 ) -> int:
     """List the robots that run: their controllers, devices and sensors, and the commands these take.
 
@@ -64,13 +60,10 @@ def list_robots(
         Only the robot of this name.
     graph
         Draw the controllers, what they read and what they command, with those that are active now.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
-    from dxlrun.remote.client import connect, running
+    from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
+    from dxlrun.remote.sockets import running
 
     here = running()
     names = dict.fromkeys((*here, *known_robots()))
@@ -216,8 +209,9 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 
 def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
     """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
-    from dxlrun.remote.client import connect, running
+    from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
+    from dxlrun.remote.sockets import running
 
     names = running()
     if chosen.robot is not None:

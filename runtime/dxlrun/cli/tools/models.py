@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import asdict
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json
@@ -37,7 +37,7 @@ def models(
     *,
     protocol: float | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """List the models of servos and devices, or print one's control table: those that a robot file can name.
 
@@ -47,10 +47,6 @@ def models(
         A model, for example AX-12A; without it all are listed.
     protocol
         Only those of this protocol, 1.0 or 2.0.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.control.controllers.plugins import load_plugins
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
@@ -46,7 +46,7 @@ def scan(
     output: Path | None = None,
     log: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Look for servos and devices on a port: both protocols, every baud rate, every ID; writes nothing.
 
@@ -67,10 +67,6 @@ def scan(
         Write a robot file for the servos that were found, to be completed by hand.
     log
         Write every packet into this new file, a log.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag
 from dxlrun.cli.tools.scan import HIGHEST_ID, load_models, read_search
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
@@ -54,7 +54,7 @@ def servo(
     yes: Flag = False,
     log: Path | None = None,
     as_json: JsonFlag = False,
-    debug: Flag = False,
+    debug: DebugFlag = False,
 ) -> int:
     """Read or change one servo on a port that no run uses: its registers, ID, baud rate, torque.
 
@@ -83,10 +83,6 @@ def servo(
         Do not ask before the EEPROM is changed.
     log
         Write every packet into this new file, a log.
-    as_json
-        Print the result as JSON.
-    debug
-        Print the traceback of an error.
     """
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
