@@ -17,16 +17,6 @@ def dxlrun_contract() -> int:
 def dxlrun_commands() -> Sequence[Command]:
     """Return the verbs."""
     return (
-        Command(
-            "fleet",
-            "dxlrun_fleet.fleet:fleet",
-            "Show the robots of a file in one table, live; q or Ctrl-C ends it. Start and stop them.",
-            "Robots that run",
-        ),
-        Command(
-            "keys",
-            "dxlrun_fleet.keys:keys",
-            "Make certificates for robots and clients of a network, renew and revoke them.",
-            "Robots that run",
-        ),
+        Command("fleet", "dxlrun_fleet.fleet:fleet", group="Robots that run"),
+        Command("keys", "dxlrun_fleet.keys:keys", group="Robots that run"),
     )

@@ -16,5 +16,4 @@ def dxlrun_contract() -> int:
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
     """Return the verb."""
-    help_line = "Serve a running robot to Foxglove and Lichtblick: and to other viewers of their protocol."
-    return (Command("foxglove", "dxlrun_foxglove.command:foxglove", help_line, "Robots that run"),)
+    return (Command("foxglove", "dxlrun_foxglove.command:foxglove", group="Robots that run"),)

@@ -19,22 +19,7 @@ def dxlrun_contract() -> int:
 def dxlrun_commands() -> Sequence[Command]:
     """Return the verbs that lead a person through a task, step by step."""
     return (
-        Command(
-            "setup",
-            f"{_PLACE}.setup:setup",
-            "Give new servos the ID, rate and registers of a robot file: one after the other.",
-            "Servos",
-        ),
-        Command(
-            "calibrate",
-            f"{_PLACE}.calibrate:calibrate",
-            "Measure reference, direction and limits of joints by hand: for the robot file.",
-            "Servos",
-        ),
-        Command(
-            "teach",
-            f"{_PLACE}.teach:teach",
-            "Show a running robot a motion by hand, and save it as a motion file.",
-            "Robots that run",
-        ),
+        Command("setup", f"{_PLACE}.setup:setup", group="Servos"),
+        Command("calibrate", f"{_PLACE}.calibrate:calibrate", group="Servos"),
+        Command("teach", f"{_PLACE}.teach:teach", group="Robots that run"),
     )

@@ -16,11 +16,4 @@ def dxlrun_contract() -> int:
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
     """Return the verb that drives a running robot."""
-    return (
-        Command(
-            "teleop",
-            "dxlrun_teleop.command:teleop",
-            "Drive a running robot by hand, from the keyboard or a gamepad.",
-            "Robots that run",
-        ),
-    )
+    return (Command("teleop", "dxlrun_teleop.command:teleop", group="Robots that run"),)

@@ -41,7 +41,8 @@ def _with_verb(text: str, command: Command) -> str:
     place = headings.index(command.group)
     first = re.search(r"\n(\S+ +)", parts[place])
     width = max(len(first[1]) if first else 0, len(command.name) + 2)
-    about = textwrap.indent(textwrap.fill(in_list(command.help), _COLUMNS - width), " " * width)
+    about = in_list(command.help or command.place)
+    about = textwrap.indent(textwrap.fill(about, _COLUMNS - width), " " * width)
     parts[place] += f"\n{command.name.ljust(width)}{about[width:]}"
     return "\n\n".join(parts)
 

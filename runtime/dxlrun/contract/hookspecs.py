@@ -43,8 +43,8 @@ class Command(NamedTuple):
     name: str
     place: str
     """`module:function`, or `module:app` of a cyclopts App; imported when the verb is used."""
-    help: str
-    """One line, for `dxlrun --help`."""
+    help: str = ""
+    """One line, for `dxlrun --help`; a verb that comes with dxlrun has it in its docstring alone."""
     group: str = "Other commands"
     """The heading under which the help shows it: `Robots that run`, `Robot files`, `Servos`, `Logs`,
     `Experiments`, `Developing`, or one of its own."""
