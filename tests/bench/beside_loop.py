@@ -8,6 +8,7 @@ one after the other.
 
     python tests/bench/beside_loop.py view [--robot robots/humanoid_20.yaml] [--blocks 20] [--seconds 20]
     python tests/bench/beside_loop.py foxglove
+    DXLRUN_ROS2_PYTHON=PYTHON python tests/bench/beside_loop.py ros2
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import json
 import logging
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -28,26 +30,30 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 import numpy as np
 from scipy.stats import t as student
+from tests.ros2 import started
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 import dxlrun
 from dxlrun.log.reader import read_log
 
+DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"
 PERIOD_S = 0.04
 RECONNECTIONS = 50
-SETTLING_S = 0.5
-"""At the begin of a block, which does not count."""
+SETTLING_S = 4.0
+"""At the begin of a block, which does not count: a ROS program has found the bridge by then."""
 
 
 class Beside(Protocol):
     """A program beside the loop, and its clients."""
 
-    words: Sequence[str]
-    """Behind `dxlrun`; the first line that it prints has its address."""
+    command: Sequence[Path | str]
+    """The first line that it prints has its address."""
 
     def look(self, address: str, seconds: float) -> None:
         """Let a client look for so long."""
@@ -59,7 +65,7 @@ class Beside(Protocol):
 class View:
     """`dxlrun view` and a browser, which looks 25 times a second with four curves."""
 
-    words = ("view", "--no-browser", "--port", "0")
+    command = (DXLRUN, "view", "--no-browser", "--port", "0")
 
     def look(self, address: str, seconds: float) -> None:
         connection, began = http.client.HTTPConnection(_host(address), timeout=10), time.monotonic()
@@ -92,7 +98,7 @@ class View:
 class Foxglove:
     """`dxlrun foxglove` and a viewer, which has subscribed to all channels."""
 
-    words = ("foxglove", "--port", "0")
+    command = (DXLRUN, "foxglove", "--port", "0")
 
     def look(self, address: str, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -123,8 +129,29 @@ class Foxglove:
         return True
 
 
+class Ros2:
+    """`dxlrun-ros2` and a ROS program that hears the joint states by a reliable subscription."""
+
+    command = (Path(started.PYTHON).with_name("dxlrun-ros2"),) if started.PYTHON else ()
+
+    def look(self, address: str, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        listener = self._hearing()
+        time.sleep(max(0.0, end - time.monotonic()))
+        listener.end()
+
+    def die(self, address: str) -> None:
+        self._hearing().end(signal.SIGKILL)
+
+    def _hearing(self) -> started.Foreign:
+        listener = started.Foreign("listener", os.environ)
+        listener.do("hear", "states", "/joint_states", "sensor_msgs/msg/JointState")
+        listener.do("heard", "states")
+        return listener
+
+
 SILENT = logging.Logger("clients", logging.CRITICAL)
-BESIDE: Mapping[str, Beside] = {"view": View(), "foxglove": Foxglove()}
+BESIDE: Mapping[str, Beside] = {"view": View(), "foxglove": Foxglove(), "ros2": Ros2()}
 
 
 def _host(address: str) -> str:
@@ -144,17 +171,16 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
     words = parser.parse_args()
-    program = Path(sys.executable).with_name("dxlrun")
     duration = 2 * (2 * words.blocks + 1) * words.seconds + 120
     with tempfile.TemporaryDirectory() as folder:
-        ran = [program, words.robot.resolve(), "--duration", str(duration)]
+        os.environ |= started.environment(Path(folder))
+        ran = [DXLRUN, words.robot.resolve(), "--duration", str(duration)]
         with subprocess.Popen(ran, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as robot:
             while not dxlrun.running():
                 time.sleep(0.05)
             time.sleep(3.0)
             beside = BESIDE[words.beside]
-            shown = [program, *beside.words]
-            with subprocess.Popen(shown, cwd=folder, stdout=subprocess.PIPE, text=True) as view:
+            with subprocess.Popen(beside.command, cwd=folder, stdout=subprocess.PIPE, text=True) as view:
                 assert view.stdout is not None
                 address = view.stdout.readline()
                 with dxlrun.connect() as client:
@@ -179,7 +205,7 @@ def main() -> None:
         found = read_log(Path(folder, log)).cycles
     report(found, cycles)
     show(
-        f"memory of dxlrun {words.beside}: {memories[0]:.1f} MB, after 10 dead clients {memories[1]:.1f}, "
+        f"memory of {words.beside}: {memories[0]:.1f} MB, after 10 dead clients {memories[1]:.1f}, "
         f"after {RECONNECTIONS} {memories[2]:.1f}; {files} open files"
     )
 

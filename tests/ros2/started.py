@@ -163,20 +163,25 @@ class Foreign:
         self.process.stdout.close()
 
 
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of ROS programs and robots, whose files and sockets are in a folder."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_"))}
+    return kept | {
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",  # what is killed leaves no shared memory behind
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_LOG_DIR": str(folder / "ros"),
+        "XDG_RUNTIME_DIR": str(folder),
+    }
+
+
 class Place:
     """A folder and a ROS domain, in which robots, bridges and foreign programs run; `end` ends them all."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         shutil.copytree(ROBOTS, folder / "robots")
-        kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_"))}
-        self.environment = kept | {
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",  # what is killed leaves no shared memory behind
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-            "ROS_LOG_DIR": str(folder / "ros"),
-            "XDG_RUNTIME_DIR": str(folder),
-        }
+        self.environment = environment(folder)
         self._running: list[Robot | Foreign | subprocess.Popen[bytes]] = []
 
     def robot(self, name: str, rate: float = RATE) -> Robot:
