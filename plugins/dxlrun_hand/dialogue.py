@@ -9,29 +9,12 @@ import sys
 import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import print_error
 
 LOOK_S = 0.02
 """Between two looks while Enter is awaited."""
-
-
-class Dialogue(Protocol):
-    """What a task says and asks; the terminal, or a script in tests. Raises KeyboardInterrupt at Ctrl-C."""
-
-    def say(self, *lines: str) -> None:
-        """Print lines."""
-        ...
-
-    def ask(self, question: str) -> str:
-        """Return the line that a person types, without spaces around it; empty: Enter alone."""
-        ...
-
-    def ask_while(self, question: str, look: Callable[[], str]) -> str:
-        """Ask, and call `look` again and again until the answer comes; what it returns is shown live."""
-        ...
 
 
 def yes(dialogue: Dialogue, question: str) -> bool:
@@ -50,10 +33,11 @@ def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
         raise
 
 
-class Terminal:
-    """The dialogue with a person; raises InputError where there is none."""
+class Dialogue:
+    """What a task says and asks at the terminal; raises KeyboardInterrupt at Ctrl-C."""
 
     def __init__(self, verb: str) -> None:
+        """Raises InputError where there is no terminal."""
         self._input = sys.stdin.fileno() if sys.stdin.isatty() else -1
         if self._input < 0 or not sys.stdout.isatty():
             raise InputError(

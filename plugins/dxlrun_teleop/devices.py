@@ -6,14 +6,17 @@ A device is asked for its state, so that no event can be missed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from glob import glob
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from dxlrun.errors import DxlrunError, InputError, missing_extra
 from dxlrun_teleop.keyboard import AXES
 from dxlrun_teleop.source import Given, Press
+
+if TYPE_CHECKING:
+    from evdev import InputDevice
 
 EV_KEY, EV_ABS = 1, 3
 SHOULDERS = frozenset((0x136, 0x137))
@@ -35,35 +38,13 @@ SIDES: Mapping[int, tuple[int, float]] = {
 """From KEY_Q and from KEY_A on, by their places whatever is printed on them; up, down, left, right"""
 
 
-class Device(Protocol):
-    """What is used of evdev.InputDevice; OSError, or SystemError (evdev 1.6 to 2.0): it is gone."""
-
-    name: str
-    path: str
-
-    def capabilities(self, *, absinfo: bool) -> Mapping[int, Sequence[int]]:
-        """Return the codes that it has, by type of event."""
-
-    def active_keys(self) -> Sequence[int]:
-        """Return the codes of what is held down."""
-
-    def absinfo(self, axis_num: int) -> Sequence[int]:
-        """Return where an axis is, its ends, and more."""
-
-    def grab(self) -> None:
-        """Let no other program have what is typed."""
-
-    def close(self) -> None:
-        """Close it, and let others have it."""
-
-
 class Gamepad:
     """Sticks and the pad of directions; a shoulder button that is held is the dead-man's switch."""
 
     help = "shoulder button held: moves, released: holds; A: next controller; Start: end"
     pressing = BUTTONS
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: InputDevice[str]) -> None:
         self._device, self._held = device, frozenset({*BUTTONS, *KEYS})  # what is held at first is no press
         codes = {*device.capabilities(absinfo=False).get(EV_ABS, ())}
         codes -= {5, 2} if 3 in codes else {code for code in codes & {5, 2} if self._axis(code)}  # triggers
@@ -87,7 +68,7 @@ class Gamepad:
     def _axis(self, code: int) -> float:
         """Return where a stick is: up and left are positive, as for a base that drives and turns."""
         value, lowest, highest = self._device.absinfo(code)[:3]
-        way = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
+        way: float = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
         beyond = min(max(0.0, abs(way) - DEAD_ZONE) / (1.0 - DEAD_ZONE), 1.0)
         return beyond if way > 0 else -beyond
 
@@ -105,7 +86,7 @@ class KeyboardDevice(Gamepad):
     help = "held: moves, released: holds; Tab: next controller; = -: speed; Esc: end"
     pressing = KEYS
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: InputDevice[str]) -> None:
         super().__init__(device)
         self.axes, self._taken = AXES, False
 
@@ -119,7 +100,7 @@ class KeyboardDevice(Gamepad):
         return tuple(axes), any(axes)
 
 
-def source_of(device: Device) -> Gamepad | None:
+def source_of(device: InputDevice[str]) -> Gamepad | None:
     """Return the source that a device can be: a gamepad, a keyboard, or none."""
     codes = {kind: set(found) for kind, found in device.capabilities(absinfo=False).items()}
     keys = codes.get(EV_KEY, set())
@@ -137,7 +118,7 @@ def chosen(path: str | None) -> Gamepad:
         from evdev import InputDevice
     except ImportError as error:
         raise InputError(missing_extra("a gamepad", "teleop", "evdev") or str(error)) from error
-    devices: list[Device] = []
+    devices: list[InputDevice[str]] = []
     paths = sorted(glob("/dev/input/event*"))
     for each in paths:
         with suppress(OSError):  # most of them only for other users

@@ -3,7 +3,7 @@
 import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
-from dxlrun.channels.packets import NoPackets
+from dxlrun.channels.packets import PacketLog
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol2
@@ -33,7 +33,7 @@ class Job:
 def ask(*said):
     line, job = ScriptedLine(said), Job()
     plan = make_plan((1, 2, 3), protocol=2.0, model="XM430-W350")
-    lines = Lines([plan], line, line.clock, NoPackets())
+    lines = Lines([plan], line, line.clock, PacketLog())
     (bus,) = lines.buses
     bus.load(job)
     lines.pump()

@@ -5,7 +5,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import NoPackets
+from dxlrun.channels.packets import PacketLog
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Lines
@@ -35,7 +35,7 @@ def declared(plan, index=0, **values):
 def bench(plan, **change):
     """Build a rig and a bus of ours on it; gives the rig and what runs a program there."""
     rig = make_rig(plan, **change)
-    lines = Lines([plan], rig.ports, rig.clock, NoPackets())
+    lines = Lines([plan], rig.ports, rig.clock, PacketLog())
 
     def execute(program):
         (result,) = lines.run([program])

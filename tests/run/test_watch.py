@@ -16,7 +16,7 @@ from dxlrun.channels import heartbeat, process
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.events import EventRing
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
-from dxlrun.channels.packets import NoPackets
+from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
@@ -265,7 +265,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
         clock,
         States.empty(2),
         Commands.empty(2),
-        NoPackets(),
+        PacketLog(),
         events,
         beat,
     )

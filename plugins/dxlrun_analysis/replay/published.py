@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.events import EventCode, LostRecords
-from dxlrun.channels.messages import Topic
+from dxlrun.channels.messages import MessageSink, Topic
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import MACHINE_TOPIC
@@ -33,7 +33,7 @@ class _Pending:
     """Times and messages that were read and not compared."""
 
 
-class MessageComparison:
+class MessageComparison(MessageSink):
     """Takes what a replayed loop publishes, and compares it with the log as it comes.
 
     Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.

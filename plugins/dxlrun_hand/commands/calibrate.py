@@ -36,10 +36,10 @@ def calibrate(
         Only these joints, or the joints of these groups.
     """
     from dxlrun.dynamixel.tools.tool_line import TunablePort
-    from dxlrun_hand.dialogue import Terminal
+    from dxlrun_hand.dialogue import Dialogue
 
     result = compiled(robot, assignments, (), None, read_models)
-    return calibrated(result, Terminal("calibrate"), TunablePort, joint, assignments)
+    return calibrated(result, Dialogue("calibrate"), TunablePort, joint, assignments)
 
 
 def calibrated(

@@ -41,12 +41,12 @@ def setup(
     from dxlrun.description.reading import read_robot
     from dxlrun.dynamixel.port.serial_open import serial_devices
     from dxlrun.dynamixel.tools.tool_line import TunablePort
-    from dxlrun_hand.dialogue import Terminal
+    from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.servo_setup import SetUp
 
     known_file(robot)
     load_models()
-    task = SetUp(read_robot(robot, parse_assignments(assignments)), Terminal("setup"))
+    task = SetUp(read_robot(robot, parse_assignments(assignments)), Dialogue("setup"))
     return set_up(task, TunablePort, serial_devices, joint, search=find_port)
 
 

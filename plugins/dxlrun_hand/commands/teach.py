@@ -41,7 +41,7 @@ def teach(
     """
     from dxlrun.description.units import angular_velocity
     from dxlrun.log.target import check_new
-    from dxlrun_hand.dialogue import Terminal
+    from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.teaching import taught
 
     if motion.suffix not in (".yaml", ".yml"):
@@ -54,4 +54,4 @@ def teach(
     if way_speed <= 0:
         raise InputError(f"--speed {speed}: write a speed above 0, such as 30 deg/s")
     with robot_of(Chosen(robot), "teach") as running:
-        return taught(running, Terminal("teach"), joints, motion, way_speed)
+        return taught(running, Dialogue("teach"), joints, motion, way_speed)

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import structs
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
+from dxlrun.clock import Clock
 
 
 @unique
@@ -240,20 +241,12 @@ class EventTotals(msgspec.Struct, frozen=True):
     """When the loop started; ns of the run's clock."""
 
 
-class _Now(Protocol):
-    """The part of a Clock that an event needs."""
-
-    def now_ns(self) -> int:
-        """Return the time of the run's clock, ns."""
-        ...
-
-
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
     __slots__ = ("_clock", "_errors", "_goals", "_missed", "_started_ns", "_writer")
 
-    def __init__(self, writer: Appender, clock: _Now) -> None:
+    def __init__(self, writer: Appender, clock: Clock) -> None:
         self._writer = writer
         self._clock = clock
         self._errors = EventCounts()

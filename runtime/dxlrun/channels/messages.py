@@ -7,8 +7,6 @@ message has its number among those of its topic's name, so a reader knows how ma
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import msgspec
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
@@ -53,19 +51,20 @@ class TopicMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
     """CDR."""
 
 
-class MessageSink(Protocol):
-    """Takes topics and their messages; never blocks, never raises."""
+class MessageSink:
+    """Takes topics and their messages; never blocks, never raises. This one forgets them: there is no log."""
+
+    __slots__ = ()
 
     def announce(self, topic: Topic) -> int:
         """Take a topic; return its number."""
-        ...
+        return 0
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
         """Take one message of an announced topic, of LONGEST_MESSAGE at most."""
-        ...
 
 
-class MessageRing:
+class MessageRing(MessageSink):
     """Appends topics and messages to a ring."""
 
     __slots__ = ("_counts", "_numbers", "_writer")
@@ -92,17 +91,6 @@ class MessageRing:
         self._counts[topic] = number = self._counts[topic] + 1
         message = TopicMessage(t_ns, topic, number, data)
         self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(message))
-
-
-class NoMessages:
-    """Forgets messages: a loop without a log."""
-
-    def announce(self, topic: Topic) -> int:
-        """Forget it."""
-        return 0
-
-    def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Forget it."""
 
 
 LONGEST_RECORD = LONGEST_MESSAGE + 64

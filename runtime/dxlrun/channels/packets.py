@@ -6,7 +6,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, unique
-from typing import Protocol
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, RingWriter, record_size
 
@@ -78,35 +77,36 @@ class Desk:
     """One 64-bit word: how many of these bytes are used."""
 
 
-class PacketSink(Protocol):
-    """Takes packets; never blocks, never raises."""
+class PacketSink:
+    """Takes packets; never blocks, never raises. This one forgets them."""
+
+    __slots__ = ()
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
         """Record bytes that were sent or received; `data` is copied before the call returns."""
-        ...
 
 
-class PacketLog(PacketSink, Protocol):
-    """Takes packets of the cyclic exchange, too."""
+class PacketLog(PacketSink):
+    """Takes packets of the cyclic exchange, too. This one forgets them: a run without a log."""
+
+    __slots__ = ()
 
     @property
     def desk(self) -> Desk | None:
         """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
-        ...
+        return None
 
     def wake(self, cycle: int) -> None:
         """Note that a cycle begins: what follows is of its period."""
-        ...
 
-    @property
-    def commit(self) -> Callable[[], object]:
-        """Hands on what was collected."""
-        ...
+    def commit(self) -> object:
+        """Hand on what was collected."""
+        return None
 
 
-class PacketBatch:
+class PacketBatch(PacketLog):
     """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
 
     A batch has the packets of one cycle, and in front of them those of the idle time before it, which are of
@@ -198,27 +198,6 @@ def salvage(desk: memoryview, head: int, writer: Appender) -> int:
         writer.append(RecordKind.PACKETS, desk[_BATCH_AT : _DESK_HEADER + used])
         words[_USED] = 0
     return (words[_CYCLE] >> _MARK_BITS) - 1
-
-
-class NoPackets:
-    """Takes packets and forgets them: a run without a log."""
-
-    __slots__ = ()
-
-    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
-        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
-    ) -> None:
-        """Forget it."""
-
-    @property
-    def desk(self) -> None:
-        """There is none."""
-
-    def wake(self, cycle: int) -> None:
-        """Nothing to be told apart."""
-
-    def commit(self) -> None:
-        """Nothing to hand on."""
 
 
 def decode_packets(payload: Payload) -> list[LoggedPacket]:

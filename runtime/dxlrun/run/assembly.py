@@ -11,7 +11,7 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventSink
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.kept import KeptStates
-from dxlrun.channels.messages import MessageSink, NoMessages
+from dxlrun.channels.messages import MessageSink
 from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.ring import Appender, RecordKind
 from dxlrun.clock import Clock
@@ -43,7 +43,7 @@ class Sinks:
     commands: CommandSink
     progress: Callable[[int, int], None] = lambda cycles, skipped: None
     """Called after each cycle with how many ran and how many periods were skipped."""
-    messages: MessageSink = field(default_factory=NoMessages)
+    messages: MessageSink = field(default_factory=MessageSink)
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this, for the stamps of messages."""
     wake: Callable[[int], None] = field(init=False)

@@ -14,8 +14,8 @@ from dxlrun.channels import slot
 from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
-from dxlrun.channels.messages import MessageRing, NoMessages
-from dxlrun.channels.packets import NoPackets, PacketBatch
+from dxlrun.channels.messages import MessageRing, MessageSink
+from dxlrun.channels.packets import PacketBatch, PacketLog
 from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.clock import VirtualClock
@@ -101,10 +101,10 @@ class VirtualRobot:
         self._events = EventRing(to_log, self.clock)
         self.sinks = Sinks(
             to_log,
-            PacketBatch(to_log) if log else NoPackets(),
+            PacketBatch(to_log) if log else PacketLog(),
             self._events,
             CommandRing(to_log) if log else NoCommands(),
-            messages=MessageRing(to_log) if log or kept else NoMessages(),
+            messages=MessageRing(to_log) if log or kept else MessageSink(),
         )
         self.robot = assemble(
             plan,

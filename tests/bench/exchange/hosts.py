@@ -18,9 +18,9 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import (
     LONGEST_BATCH,
-    NoPackets,
     PacketBatch,
     PacketKind,
+    PacketLog,
     decode_packets,
     packet_capacity,
 )
@@ -98,7 +98,7 @@ class Ours:
         tty.setraw(self._descriptor)
         self._ring = -1
         self._recorded: RingReader | None = None
-        packets: PacketBatch | NoPackets = NoPackets()
+        packets: PacketLog = PacketLog()
         if recorded:
             servos = sum(len(bus.servos) for bus in plan.buses)
             self._ring = create("bench", packet_capacity(1_000_000, servos), LONGEST_BATCH)

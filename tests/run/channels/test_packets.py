@@ -13,9 +13,9 @@ from dxlrun.channels.packets import (
     DESK_SIZE,
     LONGEST_BATCH,
     LoggedPacket,
-    NoPackets,
     PacketBatch,
     PacketKind,
+    PacketLog,
     decode_packets,
     packet_capacity,
     salvage,
@@ -117,7 +117,7 @@ def test_the_ring_holds_ten_seconds_of_a_robot(rate, servos):
 
 
 def test_without_a_log_packets_are_taken_and_forgotten():
-    sink = NoPackets()
+    sink = PacketLog()
     sink.wake(0)
     sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
     sink.commit()

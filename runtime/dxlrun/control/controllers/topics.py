@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, NoMessages, Topic
+from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, Topic
 from dxlrun.errors import ControllerFault
 from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
 
@@ -53,7 +53,7 @@ class TopicLog:
     ) -> None:
         """`epoch_offset_ns` + time of the run's clock is wall time, for stamps."""
         self._record = record
-        self._sink = sink or NoMessages()
+        self._sink = sink or MessageSink()
         self._epoch_offset_ns = epoch_offset_ns
 
     def open(

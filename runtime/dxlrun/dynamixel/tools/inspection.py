@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import NoPackets, PacketSink
+from dxlrun.channels.packets import PacketSink
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Lines
@@ -122,7 +122,7 @@ def _run(
     packets: Mapping[str, PacketSink],
 ) -> list[Result]:
     """Run one program a bus with longer timeouts; raises PortError when a line is gone."""
-    lines = Lines(plans, ports, clock, [packets.get(plan.name) or NoPackets() for plan in plans])
+    lines = Lines(plans, ports, clock, [packets.get(plan.name) or PacketSink() for plan in plans])
     found = lines.run([extend_timeouts(program) for program in programs])
     if lines.failure is not None:
         raise lines.failure

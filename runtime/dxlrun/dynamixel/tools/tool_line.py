@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import termios
 
-from dxlrun.channels.packets import NoPackets, PacketKind, PacketSink
+from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.channels.ring import Payload
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.exchange.bus import Lines
@@ -71,7 +71,7 @@ class TunablePort:
         return True
 
 
-class Heard(NoPackets):
+class Heard(PacketSink):
     """Keeps which servos answered on a line, whether awaited or not."""
 
     def __init__(self, log: PacketSink | None = None) -> None:
@@ -96,7 +96,7 @@ class Heard(NoPackets):
             self.noise += len(data)
 
 
-class OnBus(NoPackets):
+class OnBus(PacketSink):
     """Hands packets on as those of one bus of a log."""
 
     def __init__(self, log: PacketSink, index: int) -> None:
