@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -39,9 +41,19 @@ ELSEWHERE = """
 import contextlib, importlib, io, json, sys
 from dxlrun.cli import main
 
-platform, names, modules, words = json.loads(sys.argv[1])
-with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-    main(words)
+platform, names, modules, lines = json.loads(sys.argv[1])
+
+def run(words):
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(words)
+        except SystemExit as end:
+            code = end.code
+    return [code or 0, out.getvalue(), err.getvalue()]
+
+for words in lines:
+    run(words)
 for name in [name for name in sys.modules if name.partition(".")[0].startswith("dxlrun")]:
     del sys.modules[name]
 for module in modules:
@@ -52,20 +64,29 @@ for module, lacking in names.items():
 sys.platform = platform
 from dxlrun.cli import main
 
-sys.exit(main(words))
+print(json.dumps([run(words) for words in lines]))
 """
 
 
-def on(platform: str, place: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command line as if on another system."""
+class Ran(NamedTuple):
+    """How a command line ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def on(platform: str, place: Path, *lines: Sequence[str]) -> list[Ran]:
+    """Run command lines as if on another system."""
     windows = platform == "win32"
     names = {
         module: f"{LINUX.get(module, '')} {POSIX.get(module, '') if windows else ''}"
         for module in LINUX | POSIX
     }
-    given = json.dumps([platform, names, MODULES if windows else (), words])
+    given = json.dumps([platform, names, MODULES if windows else (), lines])
     command = [sys.executable, "-c", ELSEWHERE, given]
-    return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+    ran = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
+    return [Ran(*one) for one in json.loads(ran.stdout.splitlines()[-1])]
 
 
 @pytest.fixture(scope="module")
@@ -77,48 +98,75 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next((place / "logs").iterdir())
 
 
-SYSTEMS = pytest.mark.parametrize("platform", ["win32", "darwin"])
+OTHERS = {"check": "Policies", "replay": "0 differences", "analyze": "The loop kept 50 Hz"}
+"""What is seen in the output of some commands."""
 
 
-@SYSTEMS
+class Elsewhere(NamedTuple):
+    """Command lines on another system, each with how it ended; they wrote logs to a place."""
+
+    platform: str
+    place: Path
+    ran: dict[str, Ran]
+
+
+@pytest.fixture(scope="module", params=["win32", "darwin"])
+def elsewhere(
+    request: pytest.FixtureRequest, log: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Elsewhere:
+    platform: str = request.param
+    place = tmp_path_factory.mktemp(platform)
+    lines = {
+        "check": ["check", TORSO],
+        "models": ["models"],
+        "schema": ["schema"],
+        "analyze": ["analyze", str(log)],
+        "replay": ["replay", str(log)],
+        "--version": ["--version"],
+        "help": ["help", "check"],
+        "virtual": [TORSO, "--virtual", "--duration", "1"],
+        "wrong": [TORSO, "no_such:=1", "--duration", "1"],
+        "real": [str(ROOT / "robots/single_joint.yaml"), "port:=/dev/none", "--duration", "1"],
+    }
+    if platform == "win32":
+        lines |= {"scan": ["scan", "/dev/none"], "list": ["list"], "watch": ["watch"]}
+    return Elsewhere(platform, place, dict(zip(lines, on(platform, place, *lines.values()), strict=True)))
+
+
 @pytest.mark.parametrize("words", ["check", "models", "schema", "analyze", "replay", "--version", "help"])
-def test_what_needs_no_robot_works(platform: str, words: str, log: Path, tmp_path: Path) -> None:
-    of = {"check": [TORSO], "analyze": [str(log)], "replay": [str(log)], "help": ["check"]}.get(words, [])
-    ran = on(platform, tmp_path, words, *of)
-    assert ran.returncode == 0, ran.stderr
-    expected = {"check": "Policies", "replay": "0 differences", "analyze": "The loop kept 50 Hz"}
-    assert expected.get(words, "\n") in ran.stdout
+def test_what_needs_no_robot_works(elsewhere: Elsewhere, words: str) -> None:
+    ran = elsewhere.ran[words]
+    assert ran.code == 0, ran.err
+    assert OTHERS.get(words, "\n") in ran.out
 
 
-@SYSTEMS
-def test_a_robot_runs_on_virtual_time_and_is_replayed_by_linux(platform: str, tmp_path: Path) -> None:
-    ran = on(platform, tmp_path, TORSO, "--virtual", "--duration", "1")
-    assert ran.returncode == 0, ran.stderr
-    assert "0 of 50 periods skipped" in ran.stdout
-    logs = sorted((tmp_path / "logs").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+def test_a_robot_runs_on_virtual_time_and_is_replayed_by_linux(elsewhere: Elsewhere) -> None:
+    ran = elsewhere.ran["virtual"]
+    assert ran.code == 0, ran.err
+    assert "0 of 50 periods skipped" in ran.out
+    logs = sorted((elsewhere.place / "logs").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+    assert len(logs) == 2  # of Linux and of the other system, and none of what was refused
     command = [DXLRUN, "replay", str(logs[-1])]
     replayed = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (replayed.returncode, "50 cycles replayed, 0 differences" in replayed.stdout) == (0, True)
 
 
-@SYSTEMS
-def test_a_run_in_real_time_needs_linux_and_starts_nothing(platform: str, tmp_path: Path) -> None:
-    ran = on(platform, tmp_path, TORSO, "no_such:=1", "--duration", "1")
-    assert (ran.returncode, "no_such" in ran.stderr) == (2, True)  # the file is checked first
-    ran = on(platform, tmp_path, str(ROOT / "robots/single_joint.yaml"), "port:=/dev/none", "--duration", "1")
-    assert ran.returncode == 2
-    sentence = (
-        f"a run in real time needs Linux, and this is {platform}; give --virtual, and --duration or --play"
-    )
-    assert ran.stderr.splitlines()[-1:] == [f"dxlrun: {sentence}"]
-    assert [*tmp_path.rglob("*.mcap")] == []
+def test_a_run_in_real_time_needs_linux_and_starts_nothing(elsewhere: Elsewhere) -> None:
+    ran = elsewhere.ran["wrong"]
+    assert (ran.code, "no_such" in ran.err) == (2, True)  # the file is checked first
+    ran = elsewhere.ran["real"]
+    assert ran.code == 2
+    assert ran.err.splitlines()[-1:] == [
+        f"dxlrun: a run in real time needs Linux, and this is {elsewhere.platform}; "
+        "give --virtual, and --duration or --play"
+    ]
 
 
-@pytest.mark.parametrize("words", ["scan /dev/none", "list", "watch"])
-def test_what_needs_linux_is_refused_in_one_sentence(words: str, tmp_path: Path) -> None:
-    ran = on("win32", tmp_path, *words.split())
-    assert ran.returncode == 2
-    (sentence,) = ran.stderr.splitlines()
-    assert sentence.startswith(
-        f"dxlrun: `dxlrun {words.split(maxsplit=1)[0]}` needs Linux, and this is win32"
-    )
+@pytest.mark.parametrize("verb", ["scan", "list", "watch"])
+def test_what_needs_linux_is_refused_in_one_sentence(elsewhere: Elsewhere, verb: str) -> None:
+    if elsewhere.platform != "win32":
+        pytest.skip("macOS has what they need")
+    ran = elsewhere.ran[verb]
+    assert ran.code == 2
+    (sentence,) = ran.err.splitlines()
+    assert sentence.startswith(f"dxlrun: `dxlrun {verb}` needs Linux, and this is win32")
