@@ -48,13 +48,17 @@ Seen: TypeAlias = tuple[int, float, Floats, Floats]
 class Action:
     """An action of a controller: each goal is one of the robot, from its acceptance to its end."""
 
-    def __init__(
-        self, node: Node, run: PublishedRun, controller: ControllerInfo, name: str, kind: type
-    ) -> None:
+    kind: type
+    """Of its messages."""
+    name: str
+    """Behind that of the controller."""
+
+    def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
         self.node, self.run, self.controller = node, run, controller
+        name = f"{controller.name}/{self.name}"
         self._server = ActionServer(
             node,
-            kind,
+            self.kind,
             name,
             self._execute,
             goal_callback=self._answer,
@@ -132,10 +136,7 @@ class Action:
 class FollowTrajectory(Action):
     """control_msgs/FollowJointTrajectory of a trajectory controller, also for some of its joints."""
 
-    def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
-        super().__init__(
-            node, run, controller, f"{controller.name}/follow_joint_trajectory", FollowJointTrajectory
-        )
+    kind, name = FollowJointTrajectory, "follow_joint_trajectory"
 
     def check(self, request: FollowJointTrajectory.Goal) -> None:
         """Raise WrongTrajectory for a goal that is not accepted."""
@@ -165,9 +166,7 @@ class FollowTrajectory(Action):
         watch = Watch(self.run, plan, tolerances(request.path_tolerance, plan.joints))
         self.run.seen.add(watch.see)
         try:
-            goal = robot.send(self.controller.name, "trajectory", plan.command()).goal
-            if goal is None:
-                raise DxlrunError(f"{self.controller.name} takes no trajectory as a goal")
+            goal = _sent(robot, self.controller, "trajectory", plan.command())
 
             def look(state: GoalState) -> str:
                 watch.begin(state)
@@ -222,10 +221,17 @@ def stopped(robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo) -
     # of a stream of chunks: a goal takes over with the velocity of now, and is cancelled at once
     rows = run.rows(controller.joints)
     place = [{"time": _FAR_S, "positions": run.desired[rows].tolist()}]
-    goal = robot.send(controller.name, "trajectory", {"points": place}).goal
-    if goal is None:
-        raise DxlrunError(f"{controller.name} takes no trajectory as a goal")
+    goal = _sent(robot, controller, "trajectory", {"points": place})
     goal.cancel()
+    return goal
+
+
+def _sent(
+    robot: RemoteRobot, controller: ControllerInfo, kind: str, command: dict[str, object]
+) -> RemoteGoal:
+    goal = robot.send(controller.name, kind, command).goal
+    if goal is None:
+        raise DxlrunError(f"{controller.name} takes no {kind} as a goal")
     return goal
 
 
@@ -277,8 +283,7 @@ class Watch:
 class Gripper(Action):
     """control_msgs/GripperCommand of a gripper_controller: the position of its joint, rad or m."""
 
-    def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
-        super().__init__(node, run, controller, f"{controller.name}/gripper_cmd", GripperCommand)
+    kind, name = GripperCommand, "gripper_cmd"
 
     def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
         """Return the result of a goal that failed."""
@@ -290,9 +295,7 @@ class Gripper(Action):
         wish: dict[str, object] = {"position": command.position}
         if command.max_effort > 0:
             wish["effort"] = command.max_effort
-        goal = robot.send(self.controller.name, "grip", wish).goal
-        if goal is None:
-            raise DxlrunError(f"{self.controller.name} takes no grip as a goal")
+        goal = _sent(robot, self.controller, "grip", wish)
         state, why = self.wait(
             handle,
             robot,

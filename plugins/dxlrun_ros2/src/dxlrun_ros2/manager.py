@@ -110,10 +110,8 @@ class Manager:
         self, robot: RemoteRobot, _: ListHardwareInterfaces.Request, response: ListHardwareInterfaces.Response
     ) -> None:
         found = _hardware(robot)
-        response.command_interfaces, response.state_interfaces = (
-            found.command_interfaces,
-            found.state_interfaces,
-        )
+        response.command_interfaces = found.command_interfaces
+        response.state_interfaces = found.state_interfaces
 
     def _components(
         self, robot: RemoteRobot, _: ListHardwareComponents.Request, response: ListHardwareComponents.Response
