@@ -16,14 +16,13 @@ from functools import partial
 from pathlib import Path
 from urllib.parse import unquote
 
-import uvicorn
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
 from dxlrun.remote.network.listener import Listener
 from dxlrun.remote.requests.table import Role
-from dxlrun.remote.server import Connection
+from dxlrun.remote.server import Connection, config_of
 from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
@@ -79,18 +78,7 @@ class Starter:
 
 async def serve(agent: Agent, directory: Path) -> None:
     """Serve until the process ends. Raises InputError for certificates that are refused, and OSError."""
-    config = uvicorn.Config(
-        Starter(agent, directory),
-        http=Connection,
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        log_level="critical",
-        access_log=False,
-        proxy_headers=False,
-        server_header=False,
-        h11_max_incomplete_event_size=16384,
-    )
+    config = config_of(Starter(agent, directory))
     config.load()
     listener = Listener.secured(agent.address)
     await listener.serve(partial(Connection, config, ServerState(), {"listener": listener}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import os
 import signal
 import ssl
@@ -19,8 +18,7 @@ from dxlrun.cli.inputs import DebugFlag, Flag, RobotName, leave_real_time
 from dxlrun.output.terminal import show
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server
-
+    from dxlrun.remote.network.listener import Listener
     from dxlrun_foxglove.server import FoxgloveServer
 
 PORT = 8765
@@ -77,40 +75,29 @@ def foxglove(
         from dxlrun_foxglove.server import FoxgloveServer
     except ImportError as error:
         raise InputError("Foxglove needs the extra of this name: pip install 'dxlrun[foxglove]'") from error
+    from dxlrun.remote.network.listener import listening
+
     with connect(robot, "dxlrun foxglove") as running:
         name = running.name
     served = FoxgloveServer(name, (APP, *origin), control=control)
-    asyncio.run(_serve(served, listen, port, tls_of(cert, key)))
+    tls = tls_of(cert, key)
+    asyncio.run(_serve(served, listening(listen, port, PORT), tls))
     return 0
 
 
-async def _serve(served: FoxgloveServer, listen: str, port: int | None, tls: ssl.SSLContext | None) -> None:
+async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext | None) -> None:
     """Serve until Ctrl-C or SIGTERM."""
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
-    async with await _listening(served, listen, port, tls) as server:
-        host, taken = next(iter(server.sockets)).getsockname()[:2]
+    async with await served.serve(listener, tls):
+        host, taken = listener.getsockname()[:2]
         url = (
             f"{'wss' if tls else 'ws'}://{f'[{host}]' if ':' in host else host}:{taken}/?token={served.token}"
         )
         app = f"{APP}/~/view?ds=foxglove-websocket&ds.url={quote(url, safe='')}"
         show(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends this, not the robot.")
         await ended.wait()
-
-
-async def _listening(
-    served: FoxgloveServer, listen: str, port: int | None, tls: ssl.SSLContext | None
-) -> Server:
-    """Listen; without a port on the usual one, or if that is taken on any. Raises InputError."""
-    try:
-        return await served.listen(listen, PORT if port is None else port, tls)
-    except OSError as error:
-        if port is None and error.errno == errno.EADDRINUSE:
-            return await _listening(served, listen, 0, tls)
-        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
-        why = f"{listen}:{PORT if port is None else port} cannot be listened on: {error.strerror or error}"
-        raise InputError(f"{why}; give another {other}") from error
 
 
 def tls_of(cert: Path | None, key: Path | None) -> ssl.SSLContext | None:

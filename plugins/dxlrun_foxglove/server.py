@@ -55,15 +55,15 @@ class FoxgloveServer:
         self._following: asyncio.Task[None] | None = None
         self._beginning = asyncio.Lock()
 
-    async def listen(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> Server:
-        """Listen. Raises OSError."""
+    async def serve(self, listener: Listener, tls: ssl.SSLContext | None = None) -> Server:
+        """Let viewers connect from now on."""
         workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)  # none waits for another's
         asyncio.get_running_loop().set_default_executor(workers)
-        self._listener = Listener(host, port)
+        self._listener = listener
         more: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": OPENING_S} if tls else {}
         return await serve(
             self._served,
-            sock=self._listener,
+            sock=listener,
             origins=self._origins,
             subprotocols=[Subprotocol(one) for one in protocol.SUBPROTOCOLS],
             process_request=self._let_in,

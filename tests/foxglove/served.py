@@ -7,6 +7,7 @@ import ssl
 import threading
 from concurrent.futures import Future
 
+from dxlrun.remote.network.listener import Listener
 from dxlrun_foxglove.server import FoxgloveServer
 
 PAGE = "https://app.foxglove.dev"
@@ -26,8 +27,9 @@ class Served:
         self.port = begun.result()
 
     async def _serve(self, begun: Future[int]) -> None:
-        async with await self.server.listen("127.0.0.1", 0, self._tls) as listening:
-            begun.set_result(next(iter(listening.sockets)).getsockname()[1])
+        listener = Listener("127.0.0.1", 0)
+        async with await self.server.serve(listener, self._tls):
+            begun.set_result(listener.getsockname()[1])
             await self._ended.wait()
         await self._loop.shutdown_default_executor()
 

@@ -7,7 +7,8 @@ import json
 import threading
 from typing import Any
 
-from dxlrun_view.server import HEADER, Page, hosts_of, listening, server_of
+from dxlrun.remote.network.listener import Listener
+from dxlrun_view.server import HEADER, Page, hosts_of, server_of
 from dxlrun_view.shown import Source
 
 
@@ -15,7 +16,7 @@ class Served:
     """A page that is served, and what a browser would ask of it."""
 
     def __init__(self, source: Source, *, control: bool = False) -> None:
-        self.listener = listening("127.0.0.1", 0)
+        self.listener = Listener("127.0.0.1", 0)
         self.port = self.listener.getsockname()[1]
         self.page = Page(source, self.listener, hosts=hosts_of("127.0.0.1", self.port), control=control)
         self.server = server_of(self.page)

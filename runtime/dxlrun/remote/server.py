@@ -25,6 +25,7 @@ from functools import partial
 import msgspec
 import uvicorn
 from msgspec.json import Decoder
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from dxlrun.channels import process
@@ -96,21 +97,7 @@ async def serve(
     network: Listener | None = None,
 ) -> None:
     """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
-    config = uvicorn.Config(
-        gateway.app(),
-        http=Connection,
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        log_level="critical",
-        access_log=False,
-        proxy_headers=False,
-        server_header=False,
-        backlog=MOST_CONNECTIONS,
-        timeout_keep_alive=math.ceil(SILENCE_S) + 1,  # the connection's own timeout ends before
-        timeout_graceful_shutdown=1,
-        h11_max_incomplete_event_size=16384,
-    )
+    config = config_of(gateway.app())
     server = _Server(config)
     config.load()
     if network is not None:
@@ -132,6 +119,25 @@ async def serve(
     watching.cancel()
     with suppress(asyncio.CancelledError):
         await watching
+
+
+def config_of(app: ASGIApp) -> uvicorn.Config:
+    """Return how requests of clients are served, each as a Connection."""
+    return uvicorn.Config(
+        app,
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        log_level="critical",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        backlog=MOST_CONNECTIONS,
+        timeout_keep_alive=math.ceil(SILENCE_S) + 1,  # the connection's own timeout ends before
+        timeout_graceful_shutdown=1,
+        h11_max_incomplete_event_size=16384,
+    )
 
 
 class _Server(uvicorn.Server):

@@ -7,7 +7,6 @@ works without `--control`.
 
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
@@ -222,18 +221,6 @@ def hosts_of(address: str, port: int) -> tuple[str, ...]:
         names.append(socket.gethostname())
         names += [str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
     return tuple(f"{name}:{port}" for name in dict.fromkeys([*names, address]))
-
-
-def listening(address: str, port: int | None) -> Listener:
-    """Return a listening socket; without a port the usual one, or if that is taken any. Raises InputError."""
-    try:
-        return Listener(address, PORT if port is None else port)
-    except OSError as error:
-        if port is None:
-            return listening(address, 0)
-        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
-        why = f"{address}:{port} cannot be listened on: {error.strerror or error}"
-        raise InputError(f"{why}; give another {other}") from error
 
 
 class Server(uvicorn.Server):

@@ -51,11 +51,12 @@ def view(
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")
     leave_real_time()
-    from dxlrun_view.server import ANY, Page, hosts_of, listening, server_of
+    from dxlrun.remote.network.listener import listening
+    from dxlrun_view.server import ANY, PORT, Page, hosts_of, server_of
 
     source = _source(what)
     try:
-        with listening(listen, port) as listener:
+        with listening(listen, port, PORT) as listener:
             address, taken = listener.getsockname()
             page = Page(source, listener, hosts=hosts_of(listen, taken), control=control)
             url = f"http://{'127.0.0.1' if address == ANY else address}:{taken}/?token={page.token}"

@@ -6,6 +6,7 @@ Whatever connects is unproved until the server admits it: its certificate was ch
 from __future__ import annotations
 
 import asyncio
+import errno
 import gc
 import socket
 import ssl
@@ -13,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 
+from dxlrun.errors import InputError
 from dxlrun.remote.network.certificates import server_context
 from dxlrun.remote.sockets import Address
 
@@ -70,3 +72,18 @@ class Listener(socket.socket):
     def admit(self, peer: tuple[str, int]) -> None:
         """Count a connection no longer, by the address of its other end (of IPv6 with more behind it)."""
         self._unproved.pop((peer[0], peer[1]), None)
+
+
+def listening(host: str, port: int | None, usual: int) -> Listener:
+    """Return a listening socket; without a port on the usual one, or if that is taken on any.
+
+    Raises InputError, with the option that helps.
+    """
+    try:
+        return Listener(host, usual if port is None else port)
+    except OSError as error:
+        if port is None and error.errno == errno.EADDRINUSE:
+            return listening(host, 0, usual)
+        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
+        why = f"{host}:{usual if port is None else port} cannot be listened on: {error.strerror or error}"
+        raise InputError(f"{why}; give another {other}") from error
