@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import msgspec
 
@@ -16,7 +15,7 @@ from dxlrun.channels.events import (
     Granted,
     LostRecords,
 )
-from dxlrun.log.reader import UNREADABLE, Log, open_log
+from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.clients import Clients
@@ -149,14 +148,6 @@ class Tally:
             trends=self._trends.finish(self._tracking.movement.bins),
             conduct=self._conduct.finish(),
         )
-
-
-def totals_of(path: str | Path) -> RunTotals:
-    """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
-    tally, reader = Tally(), open_log(path)
-    for part in reader.slices():
-        tally.take(part)
-    return tally.totals(reader.about)
 
 
 def _real_time(log: Log, *, granted: bool) -> RealTime:

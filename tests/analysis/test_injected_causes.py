@@ -20,13 +20,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from tests.kit.line_faults import corrupt_next, delay_next, other_host
+from tests.kit.totals import totals_of
 
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import Verdict, judge
 
 MS = 1_000_000
@@ -120,7 +121,7 @@ def others(robot: VirtualRobot, target: Target) -> Sequence[str]:
     bus, dialect = robot.buses[target.index], protocol1 if target.protocol == 1.0 else protocol2
     for number in range(300):
         packet = dialect.ping(target.other) if number % 3 else dialect.read(target.servo, 36, 2)
-        bus.other_host(packet, (2000 + 29 * number) * MS + 400_000 * (number % 7))
+        other_host(bus, packet, (2000 + 29 * number) * MS + 400_000 * (number % 7))
     return []
 
 
@@ -130,7 +131,7 @@ def held_back(robot: VirtualRobot, target: Target) -> Sequence[str]:
         for index, bus in enumerate(robot.buses):
             servo = target.servos[0] if index == target.index else bus.servos[0].servo_id
             delay_ns = (14 + number % 3 * 2) * MS
-            bus.at((2000 + 700 * number) * MS, partial(bus.delay_next, servo, delay_ns))
+            bus.at((2000 + 700 * number) * MS, partial(delay_next, bus, servo, delay_ns))
     return []
 
 
@@ -138,7 +139,7 @@ def later(robot: VirtualRobot, target: Target) -> Sequence[str]:
     """A servo answers now and then after it was given up."""
     bus = robot.buses[target.index]
     for number in range(12):
-        bus.at((2000 + 700 * number) * MS, partial(bus.delay_next, target.servo, 25 * MS))
+        bus.at((2000 + 700 * number) * MS, partial(delay_next, bus, target.servo, 25 * MS))
     return []
 
 
@@ -149,7 +150,7 @@ def at_an_angle(robot: VirtualRobot, target: Target) -> Sequence[str]:
 
     def check() -> None:
         if low <= servo.position <= low + math.radians(20):
-            bus.delay_next(target.servo, 900_000)
+            delay_next(bus, target.servo, 900_000)
 
     for number in range(20, 50 * DURATION_S):
         bus.at(number * 20 * MS + 100, check)
@@ -159,7 +160,7 @@ def at_an_angle(robot: VirtualRobot, target: Target) -> Sequence[str]:
 def broken(robot: VirtualRobot, target: Target) -> Sequence[str]:
     bus = robot.buses[target.index]
     for number in range(30):
-        corrupt = partial(bus.corrupt_next, target.servo, 7 - number % 3)
+        corrupt = partial(corrupt_next, bus, target.servo, 7 - number % 3)
         bus.at((2000 + 290 * number) * MS, corrupt)
     return []
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import structs
+from tests.kit.totals import totals_of
 
 from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.log.reader import Log, read_log
@@ -26,7 +27,7 @@ from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.plan import NO_LOOP, LoggedPlan
 from dxlrun_analysis.report import analyze
-from dxlrun_analysis.tally import RunTotals, totals_of
+from dxlrun_analysis.tally import RunTotals
 from dxlrun_analysis.verdict import judge
 
 S = 10**9

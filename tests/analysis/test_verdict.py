@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 from tests.kit.made_logs import loop_of
+from tests.kit.totals import totals_of
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode, EventGroup, Severity
@@ -37,7 +38,7 @@ from dxlrun_analysis.report import analyze, analyze_log
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
-from dxlrun_analysis.tally import RealTime, RunTotals, Tally, totals_of
+from dxlrun_analysis.tally import RealTime, RunTotals, Tally
 from dxlrun_analysis.verdict import judge
 
 Make = Callable[..., Any]

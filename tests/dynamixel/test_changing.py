@@ -1,6 +1,7 @@
 """What `dxlrun servo` does to one servo, on virtual time, judged by the simulated servo and the ledger."""
 
 import pytest
+from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.cli.tools.servo import VERBS, Asked
@@ -422,7 +423,7 @@ def test_a_value_that_comes_late_is_not_shown_for_the_next_register(model, proto
     true = [rig.one.read([name])[name] for name in names]
     assert true[0] != true[1]
     for _ in range(40):
-        rig.line.bus.delay_next(1, late_ms * 1_000_000)
+        delay_next(rig.line.bus, 1, late_ms * 1_000_000)
     shown = []
     for name in names * 3:
         try:

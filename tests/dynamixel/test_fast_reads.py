@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 from tests.kit import rigs
+from tests.kit.line_faults import corrupt_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
@@ -73,7 +74,7 @@ def test_who_comes_before_an_absent_servo_keeps_its_sample(started):
 @pytest.mark.parametrize("index", range(14))
 def test_a_spoilt_byte_costs_that_servo_and_those_behind_it(started, index):
     started.cycle()
-    started.buses[0].corrupt_next(14, index=index)
+    corrupt_next(started.buses[0], 14, index=index)
     before = len(started.packets.list)
     started.cycle()
     assert started.states.valid.tolist() == [True] * 3 + [False] * 5
@@ -91,7 +92,7 @@ def test_a_spoilt_byte_costs_that_servo_and_those_behind_it(started, index):
 @pytest.mark.parametrize("index", range(22))
 def test_a_spoilt_byte_of_the_first_part_is_never_taken(started, index):
     started.cycle()
-    started.buses[0].corrupt_next(11, index=index)
+    corrupt_next(started.buses[0], 11, index=index)
     started.cycle()
     assert not started.states.valid.any()
     started.cycles(2)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from tests.kit.line_faults import corrupt_next, delay_next
 from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -81,7 +82,7 @@ class OneBus:
     def test_what_is_recorded_is_what_the_ledger_has(self, rig):
         rig.goals.position[:] = 0.2
         rig.buses[0].inject_noise(b"\x12\xff\xff\x03noise\xff", rig.clock.now_ns() + 100_000)
-        rig.buses[0].corrupt_next(self.ids[2])
+        corrupt_next(rig.buses[0], self.ids[2])
         rig.cycles(5)
         rig.hardware.stop()
         rig.hardware.idle(rig.clock.now_ns() + 10_000_000)
@@ -143,7 +144,7 @@ class OneBus:
     def test_a_corrupted_reply_is_not_a_value(self, rig):
         rig.cycle()
         held = rig.states.position[1]
-        rig.buses[0].corrupt_next(self.ids[1], index=5, flip=0x40)
+        corrupt_next(rig.buses[0], self.ids[1], index=5, flip=0x40)
         rig.cycle()
         assert not rig.states.valid[1]
         assert rig.states.position[1] == held
@@ -181,7 +182,7 @@ class OneBus:
         rig.goals.position[:] = np.resize([1.8, -1.8], len(self.ids))
         rig.goals.velocity[:] = 1.0
         rig.cycles(10)  # from here on each joint turns by 0.02 rad a cycle
-        rig.buses[0].delay_next(self.ids[place], int(late_ms * 1e6))
+        delay_next(rig.buses[0], self.ids[place], int(late_ms * 1e6))
         missed = 0
         for _ in range(8):
             deadline = rig.clock.now_ns() + rig.period_ns

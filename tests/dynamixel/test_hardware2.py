@@ -4,6 +4,7 @@ import re
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import delay_next
 from tests.kit.rigs import (
     X_IDS,
     goal_block,
@@ -170,7 +171,7 @@ def test_late_replies_of_three_silent_servos_are_never_taken_as_current(late_ms)
     rig.cycle()
     for servo in servos:
         servo.silence(False)
-        rig.buses[0].delay_next(servo.servo_id, int(late_ms * 1e6))
+        delay_next(rig.buses[0], servo.servo_id, int(late_ms * 1e6))
     rig.cycle()
     for servo in servos:
         servo.silence()

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -131,7 +132,7 @@ def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(reb
     def spoil():
         asked.append(rig.clock.now_ns())
         if len(asked) <= 3:
-            rig.buses[0].truncate_next(13, 5)
+            truncate_next(rig.buses[0], 13, 5)
 
     with rig.away(13, 5) as servo:
         if rebooted:
@@ -236,7 +237,7 @@ def _answer_no_third_question_for_torque(rig):
     def spoil():
         asked.append(rig.clock.now_ns())
         if 3 <= len(asked) <= 5:
-            rig.buses[0].truncate_next(13, 0)
+            truncate_next(rig.buses[0], 13, 0)
 
     rig.when(lambda data: data == protocol2.read(13, 64, 1), spoil)
 

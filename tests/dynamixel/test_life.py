@@ -7,6 +7,7 @@ import random
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import goals_in, make_plan, make_rig
 
 from dxlrun.channels.cycle import States
@@ -315,7 +316,7 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(seed, 
         lambda: chance.choice(line.servos).reset(),
         lambda: chance.choice(line.servos).poke("torque_enable", 0),
         lambda: chance.choice(line.servos).trigger_overload(),
-        lambda: line.truncate_next(chance.choice((11, 12, 13)), chance.randrange(6)),
+        lambda: truncate_next(line, chance.choice((11, 12, 13)), chance.randrange(6)),
         lambda: rig.set_modes(*(chance.choice((0, 1, 2)) for _ in range(3))),
         lambda: rig.clock.wait_until(rig.clock.now_ns() + 300_000_000),
         pull,

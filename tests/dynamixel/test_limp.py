@@ -2,6 +2,7 @@ import subprocess
 import sys
 
 import pytest
+from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp
@@ -9,7 +10,7 @@ from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp
 
 def lose_readbacks(rig):
     """Let a servo acknowledge every write and answer no read."""
-    rig.when(lambda data: (data[2], data[4]) == (6, 2), lambda: rig.buses[0].truncate_next(6, 0))
+    rig.when(lambda data: (data[2], data[4]) == (6, 2), lambda: truncate_next(rig.buses[0], 6, 0))
 
 
 @pytest.mark.parametrize(
@@ -40,7 +41,7 @@ def test_what_answers_late_is_heard_before_the_ports_are_closed():
     def late():
         if not asked:  # the first read-back: given up before its answer comes
             asked.append(rig.clock.now_ns())
-            rig.buses[0].delay_next(1, LATE_NS)
+            delay_next(rig.buses[0], 1, LATE_NS)
 
     rig.when(lambda data: data[4] == 2, late)
     (outcome,) = limp(rig.lines)

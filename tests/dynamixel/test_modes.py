@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -439,7 +440,7 @@ def test_a_servo_whose_torque_could_not_be_read_after_a_change_gets_no_goal_unti
     def lose():
         asked.append(arm.clock.now_ns())
         if 3 <= len(asked) <= 5:  # the first one is before the change, the second one reads torque on back
-            arm.buses[0].truncate_next(1, 0)
+            truncate_next(arm.buses[0], 1, 0)
 
     arm.when(lambda data: data == ask, lose)
     arm.when(lambda data: data[7] == 0x83 and 1 in data[12:-2:5], lambda: goals.append(len(asked)))

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from tests.kit.line_faults import delay_next, other_host, truncate_next
 from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -43,7 +44,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard
     rig, dialect = build(way)
     bus = rig.buses[0]
     for number in range(2):
-        bus.other_host(dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, received=heard)
+        other_host(bus, dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, received=heard)
         assert told(rig) == []
         rig.cycle()
         assert rig.states.valid.all()
@@ -64,7 +65,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard
 def test_another_host_that_talks_into_the_exchange_leaves_an_event(way):
     rig, dialect = build(way)
     for _ in range(20):
-        rig.buses[0].other_host(dialect.write(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
+        other_host(rig.buses[0], dialect.write(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
         rig.cycle()
     assert len(told(rig)) == 1
     assert rig.packets.received() == rig.out_of_bus()
@@ -74,7 +75,7 @@ def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds():
     rig, dialect = build("sync")
     since_ns = rig.clock.now_ns()
     while rig.clock.now_ns() < since_ns + 1.5 * UNREQUESTED_EVENT_NS:
-        rig.buses[0].other_host(dialect.ping(4), rig.clock.now_ns() + IDLE_NS)
+        other_host(rig.buses[0], dialect.ping(4), rig.clock.now_ns() + IDLE_NS)
         rig.cycle()
     counts = [int(text.partition(" ")[0]) for _, text in told(rig)]
     assert len(counts) == 2
@@ -84,7 +85,7 @@ def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds():
 
 def test_one_packet_is_not_yet_another_host():
     rig, dialect = build("plain")
-    rig.buses[0].other_host(dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)  # there is none of this ID
+    other_host(rig.buses[0], dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)  # there is none of this ID
     rig.cycles(3)
     assert told(rig) == []
 
@@ -93,7 +94,7 @@ def test_one_packet_is_not_yet_another_host():
 def test_two_packets_are_another_host_only_near_each_other(apart, events):
     rig, dialect = build("plain")
     for _ in range(2):
-        rig.buses[0].other_host(dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)
+        other_host(rig.buses[0], dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)
         since_ns = rig.clock.now_ns()
         while rig.clock.now_ns() < since_ns + apart * UNREQUESTED_EVENT_NS:
             rig.cycle()
@@ -101,15 +102,15 @@ def test_two_packets_are_another_host_only_near_each_other(apart, events):
 
 
 def lose(bus, servo_id):
-    bus.truncate_next(servo_id, 0)
+    truncate_next(bus, servo_id, 0)
 
 
 def delay(bus, servo_id):
-    bus.delay_next(servo_id, 14_000_000)
+    delay_next(bus, servo_id, 14_000_000)
 
 
 def delay_beyond_the_cycle(bus, servo_id):
-    bus.delay_next(servo_id, 31_000_000)
+    delay_next(bus, servo_id, 31_000_000)
 
 
 def duplicate(bus, servo_id):

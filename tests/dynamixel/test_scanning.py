@@ -1,6 +1,7 @@
 """Scanning on virtual time, judged by the ledger."""
 
 import pytest
+from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.dynamixel.control_table import all_tables
@@ -56,11 +57,11 @@ def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(protocol):
     model = "AX-12A" if protocol == 1.0 else "XM430-W350"
     line = VirtualLine(two(3, model), protocol=protocol, rate=1_000_000)
     for late_ns in (90_000_000, 0, 90_000_000, 0, 90_000_000):
-        line.bus.delay_next(3, late_ns)
+        delay_next(line.bus, 3, late_ns)
     search = Search((protocol,), (1_000_000,), (1, 2, 3, 4))
     found = scan(ToolLine(line), search).servos
     assert [(one.servo_id, one.model, one.remarks) for one in found] == [(3, model, ())]
-    line.bus.delay_next(3, 90_000_000)
+    delay_next(line.bus, 3, 90_000_000)
     (found,) = find(ToolLine(line), 3, search)
     assert (found.model, found.remarks) == (model, ())
 
@@ -76,7 +77,7 @@ def test_protocol_1_is_asked_id_by_id():
 
 def test_a_late_answer_is_noticed_and_asked_again():
     line = VirtualLine(two(5, "AX-12A"), protocol=1.0, rate=1_000_000)
-    line.bus.delay_next(5, 3_000_000)  # it comes while the next ID is asked
+    delay_next(line.bus, 5, 3_000_000)  # it comes while the next ID is asked
     found = scan(ToolLine(line), Search((1.0,), (1_000_000,)))
     assert names(found) == [(1.0, 1_000_000, 5, "AX-12A")]
 

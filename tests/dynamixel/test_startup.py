@@ -3,6 +3,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import corrupt_next, delay_next, truncate_next
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
@@ -131,7 +132,7 @@ def test_one_of_three_pings_may_be_spoilt_and_no_more(spoil, times, said):
         if spoil == "twice":
             rig.buses[0].alter_next(6, "twice", bytes, copies=2)
         else:
-            rig.buses[0].truncate_next(6, 0)
+            truncate_next(rig.buses[0], 6, 0)
     if not said:
         rig.hardware.start()
         assert rig.torque() == [True] * 8
@@ -278,7 +279,7 @@ def test_a_start_that_fails_half_way_takes_the_torque_back():
 def test_one_lost_packet_does_not_stop_the_start():
     rig = make_rig()
     for servo in rig.plans[0].servos:
-        rig.buses[0].corrupt_next(servo.servo_id)
+        corrupt_next(rig.buses[0], servo.servo_id)
     rig.hardware.start()
     assert rig.torque() == [True] * 8
     assert rig.packets.received() == rig.out_of_bus()
@@ -289,7 +290,7 @@ def test_answers_that_come_late_are_those_to_what_was_asked():
     rig = make_rig()
     for servo in rig.plans[0].servos:
         for late_ns in (0, 0, 0, 200_000_000, 30_000_000, 0, 100_000_000):
-            rig.buses[0].delay_next(servo.servo_id, late_ns)
+            delay_next(rig.buses[0], servo.servo_id, late_ns)
     rig.hardware.start()
     assert rig.torque() == [True] * 8
     assert [code for code, severity, *_ in rig.events.list if severity >= Severity.WARNING] == []
@@ -378,7 +379,7 @@ def test_a_servo_whose_state_cannot_be_read_once_it_has_torque_ends_the_start():
 
     def through(data):
         if bytes(data[:6]) == block and rig.torque()[7]:
-            rig.buses[0].truncate_next(plan.servo_id, 0)
+            truncate_next(rig.buses[0], plan.servo_id, 0)
         write(data)
 
     rig.ports.ports[0].write = through

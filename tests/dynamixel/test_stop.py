@@ -1,6 +1,7 @@
 """Torque off on the ways out on which something else is wrong too."""
 
 import pytest
+from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -52,8 +53,8 @@ def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
 
 def test_stop_in_noise_tries_again(started):
     for servo in started.plans[0].servos:
-        started.buses[0].corrupt_next(servo.servo_id)
-        started.buses[0].truncate_next(servo.servo_id, 3)
+        corrupt_next(started.buses[0], servo.servo_id)
+        truncate_next(started.buses[0], servo.servo_id, 3)
     assert started.hardware.stop() == ()
     assert started.torque() == [False] * 8
 

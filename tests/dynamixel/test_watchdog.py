@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -83,7 +84,7 @@ def _answer_once(rig):
     def spoil():
         asked.append(rig.clock.now_ns())
         if len(asked) > 1:
-            rig.buses[0].truncate_next(12, 0)
+            truncate_next(rig.buses[0], 12, 0)
 
     rig.when(lambda data: data == protocol2.read(12, 98, 1), spoil)
 
@@ -117,7 +118,7 @@ class TestWhileOthersAreArmed:
     @pytest.mark.parametrize(("losses", "stopped"), [(1, 0), (3, 1)])
     def test_a_lost_answer_stops_none_and_those_that_three_stop_are_revived(self, losses, stopped):
         rig = make_rig(arm())
-        once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(losses)])
+        once_armed(rig, 14, lambda one: [truncate_next(rig.buses[0], one, 0) for _ in range(losses)])
         rig.hardware.start()
         assert armed(rig)[0] == (TRIPPED if stopped else 10)
         rig.goals.position[:] = 0.5
@@ -129,7 +130,7 @@ class TestWhileOthersAreArmed:
     def test_a_slow_adapter_stops_none(self):
         rig = make_rig(arm(range(11, 23)))
         for servo_id in range(11, 23):
-            once_armed(rig, servo_id, lambda one: rig.buses[0].delay_next(one, 60_000_000))
+            once_armed(rig, servo_id, lambda one: delay_next(rig.buses[0], one, 60_000_000))
         rig.hardware.start()
         assert armed(rig) == [10] * 12
         assert rig.events.of(EventCode.WATCHDOG) == []
@@ -140,7 +141,7 @@ class TestWhileOthersAreArmed:
         read = rig.hardware.read
 
         def spoilt():
-            rig.buses[0].truncate_next(11, 4)
+            truncate_next(rig.buses[0], 11, 4)
             rig.hardware.read = read
             read()
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from tests.kit.line_faults import corrupt_next, truncate_next
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.events import EventCode, Severity
@@ -393,8 +394,8 @@ def random_fault(rig: Rig, chance: Random) -> None:
     bus, servo_id, now_ns = rig.buses[0], chance.choice((1, 2, 3)), rig.clock.now_ns()
     servo = bus.servo(servo_id)
     kinds: list[Callable[[], object]] = [
-        lambda: bus.truncate_next(servo_id, chance.randrange(3)),
-        lambda: bus.corrupt_next(servo_id),
+        lambda: truncate_next(bus, servo_id, chance.randrange(3)),
+        lambda: corrupt_next(bus, servo_id),
         lambda: (
             servo.silence(),
             bus.at(now_ns + chance.randrange(1, 300) * 1_000_000, partial(servo.silence, False)),

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.totals import totals_of
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal
 from dxlrun.channels.commands import Command
@@ -22,7 +23,6 @@ from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
 MS = 1_000_000

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from tests.kit.line_faults import truncate_next
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Done
@@ -118,7 +119,7 @@ def test_a_controller_goes_on_slowly_when_its_servo_answers_again(built, acts):
 def test_two_missed_replies_hold_no_joint(built, acts, tmp_path):
     acts |= {"pair": sway}
     robot = built(1.0)
-    robot.buses[0].at(GONE_NS, lambda: [robot.buses[0].truncate_next(7, 0) for _ in range(2)])
+    robot.buses[0].at(GONE_NS, lambda: [truncate_next(robot.buses[0], 7, 0) for _ in range(2)])
     robot.run()
     assert not [one for one in read_log(tmp_path / "run.mcap").events if one.code == EventCode.POLICY]
 

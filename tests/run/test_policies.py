@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import truncate_next
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Code, Refusal
@@ -360,7 +361,7 @@ def test_a_start_ends_when_a_servo_may_be_left_weak(built, instruction, said):
 
     def heard(data, at_ns):
         if data[2] == 7 and data[4:-1] == instruction:
-            bus.truncate_next(7, 0)
+            truncate_next(bus, 7, 0)
         receive(data, at_ns)
 
     bus.receive = heard  # type: ignore[method-assign]

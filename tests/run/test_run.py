@@ -12,8 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from tests.kit.totals import totals_of
+
 from dxlrun.channels.events import EventCode
-from dxlrun_analysis.tally import totals_of
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 Running = Any

@@ -6,6 +6,7 @@ import math
 
 import pytest
 from fastcrc import crc16
+from tests.kit.line_faults import other_host
 
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim
@@ -81,7 +82,7 @@ def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_star
     run = simulated_robot(robot, duration_s=1.0)
     (bus,) = run.buses
     chain = bytes.fromhex("fffffd00fe0d00920984000400c81f000100")
-    bus.other_host(chain + crc16.umts(chain).to_bytes(2, "little"), bus.now_ns, received=False)
+    other_host(bus, chain + crc16.umts(chain).to_bytes(2, "little"), bus.now_ns, received=False)
     run.run()
     assert run.events.errors == ()
     assert run.record.sources.valid.all()

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.packets import packet1, packet2
 
 from dxlrun.clock import VirtualClock
@@ -235,8 +236,8 @@ def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instr
 def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(make_line2, absent, ids):
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     line.bus.absent = absent
-    line.bus.corrupt_next(1, index=10)
-    line.bus.truncate_next(2, 0)
+    corrupt_next(line.bus, 1, index=10)
+    truncate_next(line.bus, 2, 0)
     sync_read(line)
     received = line.receive()
     assert received[15:][4:5] == bytes(ids)

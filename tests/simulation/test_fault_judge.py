@@ -9,6 +9,7 @@ import pytest
 from msgspec import structs
 from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
+from tests.kit.line_faults import other_host
 
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.dynamixel.wire import protocol2
@@ -101,7 +102,7 @@ def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     robot = simulated_robot(storms.servos(directory, THREE), duration_s=2.0, log=log)
     for number in range(10):
         packet = protocol2.write(2, 116, (2048).to_bytes(4, "little"))
-        robot.buses[0].other_host(packet, 1_000_000_000 + number * 31_000_000)
+        other_host(robot.buses[0], packet, 1_000_000_000 + number * 31_000_000)
     robot.run()
     return Run(read_log(log), list(robot.ledger.entries))
 

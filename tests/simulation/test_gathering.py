@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable
 
 import pytest
+from tests.kit.line_faults import corrupt_next, delay_next, truncate_next
 from tests.kit.packets import packet2
 
 from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
@@ -44,11 +45,11 @@ def disturb(bus: SimulatedBus, chance: random.Random, now_ns: int) -> None:
     servo_id = chance.choice(IDS)
     match chance.randint(0, 12):
         case 0:
-            bus.corrupt_next(servo_id)
+            corrupt_next(bus, servo_id)
         case 1:
-            bus.truncate_next(servo_id, chance.randint(0, 9))
+            truncate_next(bus, servo_id, chance.randint(0, 9))
         case 2:
-            bus.delay_next(servo_id, chance.randrange(200_000))
+            delay_next(bus, servo_id, chance.randrange(200_000))
         case 3:
             bus.inject_noise(b"\x55\xaa", now_ns + chance.randrange(300_000))
         case 4:

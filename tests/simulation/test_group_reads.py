@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from tests.kit.line_faults import truncate_next
 
 SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 BROADCAST = 0xFE
@@ -123,7 +124,7 @@ def test_a_2xl_knows_no_fast_read(make_line2):
 def test_a_cut_answer_is_to_those_after_it_as_none(make_line2, absent, received):
     line = make_line2((1, 2, 3))
     line.bus.absent = absent
-    line.bus.truncate_next(2, 3)
+    truncate_next(line.bus, 2, 3)
     line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert len(line.receive()) == received
     line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 from msgspec.structs import replace
+from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.packets import packet1, packet2
 
 from dxlrun.channels.packets import PacketKind
@@ -64,10 +65,10 @@ ROBOTS = {
 }
 LAPSES: dict[str, Callable[[SimulatedBus], None]] = {
     "": lambda bus: None,
-    "corrupted": lambda bus: bus.after(60, lambda: bus.corrupt_next(1)),
+    "corrupted": lambda bus: bus.after(60, lambda: corrupt_next(bus, 1)),
     "noise": lambda bus: bus.inject_noise(bytes(range(40)), 1_000_000_000),
     "together": lambda bus: bus.set_latency_timer(2_000_000),
-    "silent": lambda bus: bus.after(80, lambda: bus.truncate_next(2, 0)),
+    "silent": lambda bus: bus.after(80, lambda: truncate_next(bus, 2, 0)),
 }
 
 

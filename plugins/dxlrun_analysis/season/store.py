@@ -79,11 +79,6 @@ class Store(NamedTuple):
         return rows
 
 
-def is_store(place: str) -> bool:
-    """Return whether a place is the URL of a store, and no path."""
-    return "://" in place
-
-
 def find_store(url: str) -> Store:
     """Return what lies in a store. Raises InputError for a wrong URL, DxlrunError without connection."""
     files, root = _opened(url)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from tests.kit.totals import totals_of
 
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec import structs
+from tests.kit.totals import totals_of
 
 from dxlrun.compile.robot import compile_files
 from dxlrun.errors import LogError
@@ -16,7 +17,6 @@ from dxlrun.log.reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import recorded, replay_log
 from dxlrun_analysis.report import analyze, facts
-from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
 ROBOTS = Path(__file__).parents[3] / "robots"

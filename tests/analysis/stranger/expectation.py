@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.analysis.stranger.kit import JOINTS, ROBOTS, Spec, Story
+from tests.kit.totals import totals_of
 
-from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
 BUSES = ("bus:left_knee", "bus:right_knee", "bus:head_yaw")

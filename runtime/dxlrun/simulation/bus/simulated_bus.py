@@ -28,8 +28,8 @@ from msgspec.structs import replace
 
 from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.bus.adapter import SimulatedAdapter
-from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
-from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn, flipped
+from dxlrun.simulation.bus.ledger import Ledger
+from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn
 from dxlrun.simulation.device.measured import Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice, make_device
 from dxlrun.simulation.motion.mechanics import Mechanics
@@ -246,38 +246,6 @@ class SimulatedBus:
     def alter_next_instruction(self, text: str, alter: Alteration) -> None:
         """Alter what the servos receive of the next whole instruction; b"" loses it."""
         self._instruction_faults.append(PacketFault(text, alter))
-
-    def corrupt_next(self, servo_id: int, index: int = -1, flip: int = 0x01) -> None:
-        """Flip bits of one byte of a servo's next reply."""
-        text = f"byte {index} of its reply corrupted by {flip:#04x}"
-        self.alter_next(servo_id, text, lambda reply: flipped(reply, index, flip))
-
-    def truncate_next(self, servo_id: int, keep: int) -> None:
-        """Let only the first `keep` bytes of a servo's next reply through; 0 loses it."""
-        self.alter_next(servo_id, f"its reply cut to {keep} bytes", lambda reply: reply[:keep])
-
-    def delay_next(self, servo_id: int, delay_ns: int) -> None:
-        """Let a servo's next reply start later."""
-        self.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
-
-    def other_host(self, packet: bytes, at_ns: int, *, received: bool = True) -> None:
-        """Let another host on the line send an instruction packet at a time: the servos execute it, and this
-        host receives the instruction and their replies.
-
-        `received=False`: it sends by the adapter of this host, which gives back the replies only.
-        """
-
-        def send() -> None:
-            self._withdraw_waiting()
-            self.note(f"{OTHER_HOST} {packet.hex(' ')}")
-            start_ns, end_ns = self.now_ns, self.now_ns + self._line.duration_ns(len(packet))
-            if received:
-                self._line.send(Transmission(start_ns, end_ns, packet, "another host"))
-            instruction = InstructionReceiver(self._codec).feed(packet, 0)
-            if instruction is not None:
-                self._execute(instruction, end_ns)
-
-        self.at(at_ns, send)
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""

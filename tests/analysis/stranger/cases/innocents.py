@@ -10,6 +10,7 @@ from tests.analysis.stranger.kit import JOINTS, MS, Story
 from tests.analysis.stranger.live import compile_jobs, hog_on_the_core_of_the_loop, stop_for_moments
 from tests.analysis.stranger.proof import said
 from tests.analysis.stranger.world import late_wakes, read_slowly, supply, voltages_often
+from tests.kit.line_faults import other_host
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -70,7 +71,7 @@ def frozen_while_another_host_pings(story: Story) -> None:
 
     def ping(t_s: float) -> None:
         bus = story.bus(0)
-        bus.other_host(story.ping(story.id("head_yaw")), bus.now_ns + story.random.randrange(8 * MS))
+        other_host(bus, story.ping(story.id("head_yaw")), bus.now_ns + story.random.randrange(8 * MS))
         story.evidence["ping"] += 1
 
     story.every(0.5, ping, since_s=1.0)

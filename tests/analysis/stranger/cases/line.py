@@ -6,6 +6,7 @@ from functools import partial
 
 from tests.analysis.stranger.expectation import BROKEN, HOST, LATE, SHARED, Case, collector
 from tests.analysis.stranger.kit import JOINTS, MS, Story
+from tests.kit.line_faults import other_host
 
 from dxlrun.plan.simulation_plan import ServoConfig
 
@@ -104,8 +105,8 @@ def other_host_reads(story: Story) -> None:
     def read(t_s: float) -> None:
         bus = story.bus(0)
         joint = story.random.choice(JOINTS)
-        bus.other_host(
-            story.read(story.id(joint), "present_position"), bus.now_ns + story.random.randrange(8 * MS)
+        other_host(
+            bus, story.read(story.id(joint), "present_position"), bus.now_ns + story.random.randrange(8 * MS)
         )
         story.evidence["read"] += 1
 
@@ -118,7 +119,7 @@ def other_host_takes_torque(story: Story) -> None:
 
     def write() -> None:
         bus = story.bus("head_pitch")
-        bus.other_host(story.write(story.id("head_pitch"), "torque_enable", 0), bus.now_ns + 4 * MS)
+        other_host(bus, story.write(story.id("head_pitch"), "torque_enable", 0), bus.now_ns + 4 * MS)
         story.evidence["torque taken"] += 0
 
     def look() -> None:
@@ -137,7 +138,7 @@ def other_host_blinks(story: Story) -> None:
         joints = [joint for joint in JOINTS if story.bus_name(joint) == bus.name]
         on = int(t_s * 10) % 2
         packet = story.sync_write("led", {story.id(joint): on for joint in joints})
-        bus.other_host(packet, bus.now_ns + story.random.randrange(4 * MS))
+        other_host(bus, packet, bus.now_ns + story.random.randrange(4 * MS))
         story.evidence["blink"] += 1
 
     story.every(0.05, blink, "left_knee", since_s=1.2)
@@ -288,7 +289,7 @@ def other_host_pings(story: Story) -> None:
 
     def ping(t_s: float) -> None:
         bus = story.bus(0)
-        bus.other_host(story.ping(next(count) % 60), bus.now_ns + story.random.randrange(9 * MS))
+        other_host(bus, story.ping(next(count) % 60), bus.now_ns + story.random.randrange(9 * MS))
         story.evidence["ping"] += 1
 
     story.every(0.12, ping, since_s=1.0)
@@ -307,8 +308,8 @@ def other_host_changes_an_id(story: Story) -> None:
 
     def write() -> None:
         bus = story.bus("right_elbow")
-        bus.other_host(story.write(story.id("right_elbow"), "torque_enable", 0), bus.now_ns + 2 * MS)
-        bus.other_host(story.write(story.id("right_elbow"), "id", 77), bus.now_ns + 6 * MS)
+        other_host(bus, story.write(story.id("right_elbow"), "torque_enable", 0), bus.now_ns + 2 * MS)
+        other_host(bus, story.write(story.id("right_elbow"), "id", 77), bus.now_ns + 6 * MS)
         story.at_end(lambda: any(servo.servo_id == 77 for servo in bus.servos), "ID changed")
 
     story.at(2.5, write, "right_elbow")
@@ -321,7 +322,7 @@ def other_host_commands(story: Story) -> None:
     def goals(t_s: float) -> None:
         bus = story.bus(0)
         data = {story.id(joint): 2048 + story.random.randrange(-150, 150) for joint in JOINTS}
-        bus.other_host(story.sync_write("goal_position", data), bus.now_ns + story.random.randrange(9 * MS))
+        other_host(bus, story.sync_write("goal_position", data), bus.now_ns + story.random.randrange(9 * MS))
         story.evidence["goals"] += 1
 
     story.every(0.25, goals, since_s=1.5)

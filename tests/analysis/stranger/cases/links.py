@@ -27,6 +27,7 @@ from tests.analysis.stranger.expectation import (
 from tests.analysis.stranger.kit import HEAD, JOINTS, LEFT, MS, RIGHT, S, Story, stronger
 from tests.analysis.stranger.proof import lags, seen, spread, unread
 from tests.analysis.stranger.world import cut_tails, heats, late_wakes, poke, supply, voltages_often
+from tests.kit.line_faults import other_host
 
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
@@ -116,9 +117,9 @@ def tuning_gui_on_the_same_line(story: Story) -> None:
         bus, number = story.bus("left_shoulder"), story.id("left_shoulder")
         for place in range(4):
             at_ns = bus.now_ns + round(0.1 * place * S) + story.random.randrange(8 * MS)
-            bus.other_host(story.read(number, item), at_ns)
+            other_host(bus, story.read(number, item), at_ns)
         value = max(1, story.servo("left_shoulder").registers[item] // 8)
-        bus.other_host(story.write(number, item, value), bus.now_ns + round(0.5 * S) + 3 * MS)
+        other_host(bus, story.write(number, item, value), bus.now_ns + round(0.5 * S) + 3 * MS)
         story.evidence["GUI"] += 1
 
     story.at(2.1, gui, "left_shoulder")
@@ -144,7 +145,7 @@ def script_reads_by_our_adapter(story: Story) -> None:
         joint = JOINTS[numbers[0] % len(JOINTS)]
         numbers[0] += 1
         packet = story.read(story.id(joint), "present_temperature")
-        bus.other_host(packet, bus.now_ns + story.random.randrange(9 * MS), received=False)
+        other_host(bus, packet, bus.now_ns + story.random.randrange(9 * MS), received=False)
         story.evidence["read"] += 1
 
     story.every(0.04, read, 0, 1.3)

@@ -9,6 +9,7 @@ from tests.analysis.stranger.expectation import HOST, LATE, STUCK, Case, collect
 from tests.analysis.stranger.kit import JOINTS, S, Story
 from tests.analysis.stranger.proof import lags, seen
 from tests.analysis.stranger.world import foot_board, poke, supply, voltages_often
+from tests.kit.line_faults import other_host
 
 CASES: list[Case] = []
 case = collector(CASES)
@@ -151,7 +152,7 @@ def wizard_scans_the_line(story: Story) -> None:
 
     def scan(t_s: float) -> None:
         bus = story.bus(0)
-        bus.other_host(story.ping(next(numbers)), bus.now_ns + 1000)
+        other_host(bus, story.ping(next(numbers)), bus.now_ns + 1000)
         story.evidence["ping"] += 1
 
     story.every(0.02, scan, 0, 2.0)
@@ -171,7 +172,7 @@ def torque_off_by_another_program(story: Story) -> None:
     def off() -> None:
         bus = story.bus("head_pitch")
         packet = story.write(story.id("head_pitch"), "torque_enable", 0)
-        bus.other_host(packet, bus.now_ns + 1000, received=False)
+        other_host(bus, packet, bus.now_ns + 1000, received=False)
 
     story.at(2.803, off, "head_pitch")
     story.at_end(lambda: not story.servo("head_pitch").torque_on, "torque off")
@@ -243,7 +244,7 @@ def baud_rate_written(story: Story) -> None:
     def plan() -> None:
         for t_s, item, wire in ((2.6012, "torque_enable", 0), (2.6512, "baud_rate", value)):
             packet = story.write(story.id("left_knee"), item, wire)
-            story.bus("left_knee").other_host(packet, round(t_s * S))
+            other_host(story.bus("left_knee"), packet, round(t_s * S))
 
     story.prepared.append(plan)
     story.at_end(lambda: story.servo("left_knee").baud_rate < 60_000, "listens at another rate")

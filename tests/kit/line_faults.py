@@ -1,0 +1,44 @@
+"""Faults of single packets on a simulated bus, and another host on its line."""
+
+from __future__ import annotations
+
+from dxlrun.simulation.bus.ledger import OTHER_HOST
+from dxlrun.simulation.bus.line import Transmission, flipped
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.wire.packets import InstructionReceiver
+
+
+def corrupt_next(bus: SimulatedBus, servo_id: int, index: int = -1, flip: int = 0x01) -> None:
+    """Flip bits of one byte of a servo's next reply."""
+    text = f"byte {index} of its reply corrupted by {flip:#04x}"
+    bus.alter_next(servo_id, text, lambda reply: flipped(reply, index, flip))
+
+
+def truncate_next(bus: SimulatedBus, servo_id: int, keep: int) -> None:
+    """Let only the first `keep` bytes of a servo's next reply through; 0 loses it."""
+    bus.alter_next(servo_id, f"its reply cut to {keep} bytes", lambda reply: reply[:keep])
+
+
+def delay_next(bus: SimulatedBus, servo_id: int, delay_ns: int) -> None:
+    """Let a servo's next reply start later."""
+    bus.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
+
+
+def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool = True) -> None:
+    """Let another host on the line send an instruction packet at a time: the servos execute it, and this
+    host receives the instruction and their replies.
+
+    `received=False`: it sends by the adapter of this host, which gives back the replies only.
+    """
+
+    def send() -> None:
+        bus._withdraw_waiting()
+        bus.note(f"{OTHER_HOST} {packet.hex(' ')}")
+        start_ns, end_ns = bus.now_ns, bus.now_ns + bus._line.duration_ns(len(packet))
+        if received:
+            bus._line.send(Transmission(start_ns, end_ns, packet, "another host"))
+        instruction = InstructionReceiver(bus._codec).feed(packet, 0)
+        if instruction is not None:
+            bus._execute(instruction, end_ns)
+
+    bus.at(at_ns, send)
