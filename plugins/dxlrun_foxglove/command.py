@@ -69,8 +69,6 @@ def foxglove(
             f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
         )
     leave_real_time()
-    with suppress(OSError):
-        os.nice(NICENESS)
     try:
         from dxlrun_foxglove.server import FoxgloveServer
     except ImportError as error:
@@ -79,6 +77,8 @@ def foxglove(
 
     with connect(robot, "dxlrun foxglove") as running:
         name = running.name
+    with suppress(OSError):
+        os.nice(NICENESS)
     served = FoxgloveServer(name, (APP, *origin), control=control)
     tls = tls_of(cert, key)
     asyncio.run(_serve(served, listening(listen, port, PORT), tls))
