@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -259,6 +260,7 @@ class Maker:
         """Take pictures of robots on the page."""
         if (
             shutil.which("chromium") is None
+            or find_spec("dxlrun_view") is None
             or not files("dxlrun_view").joinpath("page/build/page.js").is_file()
         ):
             return
