@@ -24,6 +24,7 @@ from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.description.problems import problems_of
 from dxlrun.description.reading import Description
+from dxlrun.description.robot import ControllerEntry
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
@@ -86,21 +87,7 @@ def compile_controllers(
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
     for name, entry in file.robot.controllers.items():
-        every = _every(file, name, entry.rate)
-        plan = ControllerPlan(
-            name=name,
-            type=entry.type,
-            distribution="",
-            parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
-            joints=(),
-            command=(),
-            publishes=(),
-            active=entry.active,
-            every=every,
-            rate=entry.rate,
-            fallback=entry.fallback or "",
-            into=entry.into,
-        )
+        plan = entry_plan(name, entry, _every(file, name, entry.rate))
         one = _compiled(file, plan, plugins)
         if one is not None:
             compiled[name] = one
@@ -139,7 +126,37 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     except Exception as error:
         at_fault(file, "controller", name, offer.distribution, raised("name its topics", error))
         return None
-    whole = replace(
+    whole = class_plan(plan, offer, interfaces, topics)
+    buses = (f"/bus/{bus}" for bus in file.robot.buses)
+    if taken := set(whole.topics).intersection(buses):
+        mark = file.key("controllers", name)
+        file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
+    return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
+
+
+def entry_plan(name: str, entry: ControllerEntry, every: int) -> ControllerPlan:
+    """Return what the entry of a controller says, without what its class asks for."""
+    return ControllerPlan(
+        name=name,
+        type=entry.type,
+        distribution="",
+        parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+        joints=(),
+        command=(),
+        publishes=(),
+        active=entry.active,
+        every=every,
+        rate=entry.rate,
+        fallback=entry.fallback or "",
+        into=entry.into,
+    )
+
+
+def class_plan(
+    plan: ControllerPlan, offer: Offer, interfaces: Interfaces, topics: Sequence[str]
+) -> ControllerPlan:
+    """Return the plan of an entry with what the controller's class asks for."""
+    return replace(
         plan,
         distribution=offer.distribution,
         joints=interfaces.joints,
@@ -151,13 +168,8 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
         device_commands=interfaces.device_commands,
         takeovers=interfaces.takeovers,
         partial=interfaces.partial,
-        topics=tuple(f"/{name}/{topic}" for topic in topics),
+        topics=tuple(f"/{plan.name}/{topic}" for topic in topics),
     )
-    buses = (f"/bus/{bus}" for bus in file.robot.buses)
-    if taken := set(whole.topics).intersection(buses):
-        mark = file.key("controllers", name)
-        file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
-    return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
 
 
 def _check_graph(

@@ -5,7 +5,6 @@ All of a plug-in's code that a client can reach runs here, in the gateway's proc
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.compile.controllers import CompiledController, where_to_get
+from dxlrun.compile.controllers import CompiledController, class_plan, entry_plan, where_to_get
 from dxlrun.compile.graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
@@ -276,27 +275,8 @@ class Preparation:
             hint = where_to_get(written.type, tuple(self.plugins.controllers), self.plugins.broken)
             raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
         interfaces, topics = self._interfaces(name, offer, written)
-        plan = ControllerPlan(
-            name=name,
-            type=written.type,
-            distribution=offer.distribution,
-            parameters=json.dumps(written.parameters),
-            joints=interfaces.joints,
-            command=interfaces.command,
-            publishes=offer.controller.publishes,
-            active=False,
-            every=1,  # the loop knows its own rate
-            rate=written.rate,
-            fallback=written.fallback or "",
-            into=written.into,
-            reference=interfaces.reference,
-            reads=interfaces.reads,
-            provides=interfaces.provides,
-            device_commands=interfaces.device_commands,
-            takeovers=interfaces.takeovers,
-            partial=interfaces.partial,
-            topics=tuple(f"/{name}/{topic}" for topic in topics),
-        )
+        alone = replace(entry_plan(name, written, every=1), active=False)  # the loop knows its own rate
+        plan = class_plan(alone, offer, interfaces, topics)
         known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
         if found := [one for one in self._mistakes((*others.values(), plan), rate) if one not in known]:
             raise invalid("; ".join(f"{one.what}; {one.fix}" for one in found[:_MOST_MISTAKES]))

@@ -292,25 +292,14 @@ def _ranged(name: str, ends: Sequence[float]) -> str:
 
 def drawing(info: Row) -> Graph:
     """Return the controller graph of a running robot as it is drawn."""
+    from msgspec import convert
+
     from dxlrun.compile.graph import ControllerGraph  # not above: most commands draw none
     from dxlrun.plan.loop_plan import ControllerPlan
 
+    unknown = {"distribution": "", "parameters": "{}", "publishes": (), "rate": None}
     plans = (
-        ControllerPlan(
-            name=one["name"],
-            type=one["type"],
-            distribution="",
-            parameters="{}",
-            joints=tuple(one["joints"]),
-            command=tuple(one["command"]),
-            publishes=(),
-            active=one["active"],
-            every=max(1, round(info["rate"] / one["rate"])),
-            fallback=one.get("fallback", ""),
-            into=tuple(one["into"]),
-            reference=tuple(one["reference"]),
-            reads=tuple(one["reads"]),
-        )
+        convert({**one, **unknown, "every": max(1, round(info["rate"] / one["rate"]))}, ControllerPlan)
         for one in info["controllers"]
     )
     return ControllerGraph(info["joints"], tuple(plans)).drawing("controllers", info["rate"])
