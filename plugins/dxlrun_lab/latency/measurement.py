@@ -148,7 +148,6 @@ def measure(
 class _Process:
     def __init__(self, settings: Settings, condition: Condition, iterations: int, yardstick: str) -> None:
         self._condition = condition
-        self._iterations = iterations
         self._period_ns = settings.period_ns
         self._buffer = Buffer.create(iterations)
         self._grants, self._errors = memory_file("grants"), memory_file("stderr")

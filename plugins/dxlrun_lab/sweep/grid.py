@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -150,13 +151,11 @@ class Grid:
         first: Compiled | None = None
         bad: dict[tuple[int, int], tuple[Problem, ...]] = {}
         start = (0,) * len(self.parameters)
-        tried: dict[Point, Compiled | tuple[Problem, ...]] = {}
+        tried = functools.cache(self._tried)
         for axis, parameter in enumerate(self.parameters):
             for index in _some_of(len(parameter.values)):
                 point = (*start[:axis], index, *start[axis + 1 :])
-                if point not in tried:
-                    tried[point] = self._tried(point)
-                found = tried[point]
+                found = tried(point)
                 if isinstance(found, Compiled):
                     first = first or found
                 else:
@@ -165,9 +164,7 @@ class Grid:
             raise InputError(self._mistakes(bad))
         for axis, index in list(bad):
             for point in itertools.islice(self._with_value(axis, index), _MOST_TRIED):
-                if point not in tried:
-                    tried[point] = self._tried(point)
-                found = tried[point]
+                found = tried(point)
                 if isinstance(found, Compiled):
                     first = first or found
                     del bad[axis, index]

@@ -35,9 +35,8 @@ def find_place(description: Description, steps: KeyPath) -> KeyPath:
     containers = {path[:end] for path in written for end in range(len(path))}
     found = sorted((path for path in written if path[-len(steps) :] == steps), key=path_text)
     if not found and (inner := [path for path in containers if path and path[-len(steps) :] == steps]):
-        values = sorted(
-            path_text(path[len(inner[0]) - len(steps) :]) for path in written if _in(path, inner[0])
-        )
+        own = [path for path in written if path[: len(inner[0])] == inner[0]]
+        values = sorted(path_text(path[len(inner[0]) - len(steps) :]) for path in own)
         raise ValueError(f"{name} has values in it; name one of them: {_some(values)}")
     if not found:
         possible = _possible(description, steps, containers)
@@ -111,10 +110,6 @@ def _takes(description: Description, container: KeyPath, key: str | int, *, last
 def _below_one(path: KeyPath, written: Set[KeyPath]) -> bool:
     """Return whether a path goes on behind a value, which has nothing below it."""
     return any(path[:end] in written for end in range(1, len(path)))
-
-
-def _in(path: KeyPath, container: KeyPath) -> bool:
-    return path[: len(container)] == container
 
 
 def _some(texts: list[str]) -> str:

@@ -23,30 +23,19 @@ def problems_of(
     model: type[BaseModel] | None = None,
     beside: Collection[str] = (),
     unknown: Set[KeyPath] = frozenset(),
+    most: int | None = None,
 ) -> list[Problem]:
     """Return one problem for each place that a model refused, in file order.
 
     `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest known
     one, also of those that stand `beside` the model's, and missing keys an example. `unknown` paths and what
-    is below them are skipped.
+    is below them are skipped. `most` of pydantic's errors are looked at, None: all.
     """
-    return _problems(error.errors(include_url=False), marks, prefix, model, beside=beside, unknown=unknown)
-
-
-def _problems(
-    errors: Iterable[ErrorDetails],
-    marks: Marks,
-    prefix: KeyPath,
-    model: type[BaseModel] | None,
-    *,
-    beside: Collection[str] = (),
-    unknown: Set[KeyPath] = frozenset(),
-) -> list[Problem]:
     found: dict[KeyPath, list[_Error]] = {}
-    for details in errors:
-        error = _Error(details, marks, prefix, model, beside)
-        if error.meant and not any(error.path[:end] in unknown for end in range(len(error.path) + 1)):
-            found.setdefault(error.path, []).append(error)
+    for details in error.errors(include_url=False)[:most]:
+        one = _Error(details, marks, prefix, model, beside)
+        if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
+            found.setdefault(one.path, []).append(one)
     problems = [_merged(errors, marks) for errors in found.values()]
     return sorted(problems, key=lambda problem: problem.mark)
 
@@ -68,12 +57,11 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
 
     `what` is what the data are called: `posvel of head has no velocities; add ...`.
     """
-    errors = error.errors(include_url=False)[:most]
     places: dict[KeyPath, Mark] = {}
-    for details in errors:
+    for details in error.errors(include_url=False)[:most]:
         location = [part for part in details["loc"] if not str(part).startswith("<")]  # which of a union
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
-    problems = _problems(errors, Marks(what, places, places), (what,), model)
+    problems = problems_of(error, Marks(what, places, places), (what,), model=model, most=most)
     return [f"{problem.what}; {problem.fix}" for problem in problems]
 
 

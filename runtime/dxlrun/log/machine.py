@@ -59,7 +59,7 @@ class MachineSampler:
 
     def sample(self, t_ns: int) -> bytes | None:
         """Return a message about the time since the last call, None at the first; `t_ns`: the run's clock."""
-        now, before = self._counters(t_ns), self._before
+        now, before = _Counters(t_ns, self._ticks(), self._pressure_s(), self._of_process()), self._before
         self._before = now
         if before is None:
             return None
@@ -79,9 +79,6 @@ class MachineSampler:
             (now.pressure_s - before.pressure_s) / seconds if seconds > 0 else math.nan,
             *(process[name] for name in _PROCESS),
         )
-
-    def _counters(self, t_ns: int) -> _Counters:
-        return _Counters(t_ns, self._ticks(), self._pressure_s(), self._of_process())
 
     def _ticks(self) -> Floats:
         try:

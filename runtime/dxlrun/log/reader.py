@@ -252,10 +252,8 @@ class LogFollower:
     def new(self) -> Log:
         """Return what the file has in addition, as a log of its own."""
         self._walk.file.damage.clear()
-        slices: list[Log] = []
         with _readable(self._path):
-            for messages in self._walk.messages():
-                slices.append(self._made().take(messages))
+            slices = [self._made().take(messages) for messages in self._walk.messages()]
             return joined(self._made().about(), slices)
 
     def _made(self) -> Slicer:

@@ -13,7 +13,7 @@ import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.messages import JointState, String
+from dxlrun.messages import Header, JointState, Quaternion, String, Time, Vector3
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -62,16 +62,8 @@ def bus_topic(bus: str) -> str:
     return f"{BUS_PREFIX}{bus}"
 
 
-_TIME = f"""{RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_HEADER = f"""{RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_TIME}"""
+_TIME = f"{RULE}\nMSG: builtin_interfaces/Time\n{declared_message(Time, '').type.text}"
+_HEADER = f"{RULE}\nMSG: std_msgs/Header\n{declared_message(Header, '').type.text}"
 
 JOINT_STATE = declared_message(JointState, "").type
 STRING = declared_message(String, "").type
@@ -122,16 +114,9 @@ geometry_msgs/Vector3 translation
 geometry_msgs/Quaternion rotation
 {RULE}
 MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-{RULE}
+{declared_message(Vector3, "").type.text}{RULE}
 MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-""",
+{declared_message(Quaternion, "").type.text}""",
 )
 
 _FOREVER = "sec: 9223372036\n    nsec: 854775807"

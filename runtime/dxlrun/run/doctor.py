@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -92,10 +93,6 @@ class _Check:
         return Finding(self.what, "missing", found, self.why, fix)
 
 
-def _open_to_us(path: Path) -> bool:
-    return os.access(path, os.R_OK | os.W_OK)
-
-
 def may_schedule() -> bool:
     """Return whether the kernel really gives a real-time policy: a container's group may have no share of it.
 
@@ -128,7 +125,7 @@ class Machine:
     compiled: str = ""
     """Why what is compiled, the exchange with servos and the gate, cannot be used; empty: it can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
-    may_write: Callable[[Path], bool] = field(default=_open_to_us)
+    may_write: Callable[[Path], bool] = field(default=partial(os.access, mode=os.R_OK | os.W_OK))
 
     @classmethod
     def this(cls) -> Machine:
