@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -99,7 +100,7 @@ def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again
 def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back():
     rig = make_wheel("MX-28", 1.0)
     servo = rig.servo(1)
-    servo.turn_by_hand(7.8 * math.tau)
+    turn_by_hand(servo, 7.8 * math.tau)
     standing = servo.position
     change(rig, Mode.POSITION, 60)
     assert servo.position == pytest.approx(standing, abs=0.1)

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import truncate_next
+from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -221,12 +221,12 @@ def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_tor
     plan = rig.plans[0].servos[2]
     with rig.away(13, 20) as servo:
         servo.reset()
-        servo.turn_by_hand((plan.upper_tick + 30) * plan.rad_per_tick)
+        turn_by_hand(servo, (plan.upper_tick + 30) * plan.rad_per_tick)
         servo.silence(False)
         rig.cycles(100)
         assert rig.torque() == [True, True, False, True]
         assert "outside its limits" in rig.events.texts(EventCode.SERVO_LOST)[-1]
-        servo.turn_by_hand(plan.upper_tick * plan.rad_per_tick)
+        turn_by_hand(servo, plan.upper_tick * plan.rad_per_tick)
     assert rig.torque() == [True] * 4
 
 

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import truncate_next
+from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
@@ -362,7 +362,7 @@ def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fa
     arm = make_one("XM430-W350", 2.0, lower=-1.0, upper=1.0)
     servo, plan = arm.servo(1), arm.plans[0].servos[0]
     change(arm, Mode.EFFORT)
-    servo.turn_by_hand((plan.upper_tick + beyond) * plan.rad_per_tick)
+    turn_by_hand(servo, (plan.upper_tick + beyond) * plan.rad_per_tick)
     change(arm, Mode.POSITION)
     assert arm.torque() == [True, True]
     assert servo.registers["goal_position"] == plan.upper_tick
@@ -376,7 +376,7 @@ def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_t
     servo.poke("operating_mode", 16)
     servo.poke("goal_pwm", 0)
     servo.poke("torque_enable", 1)
-    servo.turn_by_hand((plan.servos[1].lower_tick - 30) * plan.servos[1].rad_per_tick)
+    turn_by_hand(servo, (plan.servos[1].lower_tick - 30) * plan.servos[1].rad_per_tick)
     with pytest.raises(StartUpError, match=r"ID 2 on bus main.* stands outside its limits"):
         rig.hardware.start()
     assert rig.torque() == [False, False]

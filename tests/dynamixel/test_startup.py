@@ -3,7 +3,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import corrupt_next, delay_next, truncate_next
+from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
@@ -173,7 +173,7 @@ def test_a_joint_may_stand_one_tick_outside_its_limits_and_no_more(end, beyond, 
     rig = make_rig(plan)
     servo = plan.servos[0]
     out = beyond if end == "upper_tick" else -beyond
-    rig.servo(1).turn_by_hand((getattr(servo, end) + out) * servo.rad_per_tick)
+    turn_by_hand(rig.servo(1), (getattr(servo, end) + out) * servo.rad_per_tick)
     if not starts:
         (problem,) = refusal(rig)
         assert "main_1_joint (ID 1 on bus main) stands at" in problem
@@ -202,7 +202,7 @@ def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(jum
     """Between them pass 5.7 ms for eight servos: at 11.9 rad/s that is 0.07 rad."""
     rig = make_rig()
     servo = rig.servo(6)
-    after_first_state(rig, 6, lambda: servo.turn_by_hand(servo.position + jump))
+    after_first_state(rig, 6, lambda: turn_by_hand(servo, servo.position + jump))
     if starts:
         rig.hardware.start()
         assert rig.torque() == [True] * 8
@@ -217,7 +217,7 @@ def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_t
     rig = make_rig(plan)
     outside = (plan.servos[1].upper_tick + 30) * plan.servos[1].rad_per_tick
     gets_torque = b"\x01\x04\x03\x18\x01"  # the first one
-    rig.when(lambda data: data[2:7] == gets_torque, lambda: rig.servo(2).turn_by_hand(outside))
+    rig.when(lambda data: data[2:7] == gets_torque, lambda: turn_by_hand(rig.servo(2), outside))
     with pytest.raises(StartUpError, match=r"ID 2 on bus main.* left them before torque was switched on"):
         rig.hardware.start()
     assert [packet for packet in rig.into_bus() if packet[2:5] == b"\x02\x07\x03"] == []
@@ -229,7 +229,7 @@ def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=3.14, lower=-1.0, upper=1.0)
     rig = make_rig(plan, position=3.1)
     rig.servo(1).poke("operating_mode", 16)
-    rig.servo(1).turn_by_hand((plan.servos[0].upper_tick + 30) * plan.servos[0].rad_per_tick)
+    turn_by_hand(rig.servo(1), (plan.servos[0].upper_tick + 30) * plan.servos[0].rad_per_tick)
     with pytest.raises(StartUpError, match=r"ID 1 on bus main.* stands outside its limits"):
         rig.hardware.start()
     assert rig.torque() == [False, False]

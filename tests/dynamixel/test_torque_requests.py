@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
@@ -114,7 +115,7 @@ def test_one_joint_is_limp_while_the_others_hold(protocol):
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_torque_on_holds_a_joint_where_a_person_has_put_it(protocol):
     arm = Arm(protocol).let_go()
-    arm.servo.turn_by_hand(2.4)
+    turn_by_hand(arm.servo, 2.4)
     arm.follow(5)
     begun = len(arm.rig.into_bus())
     assert arm.told(arm.switch(True)) == ""
@@ -363,7 +364,7 @@ def test_requests_on_a_line_that_is_gone_are_answered():
 def test_a_servo_out_of_its_limits_gets_no_torque():
     arm = Arm().let_go()
     plan = arm.plan.servos[1]
-    arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+    turn_by_hand(arm.servo, (plan.upper_tick + 40) * plan.rad_per_tick)
     arm.follow(10)
     problem = arm.told(arm.switch(True))
     assert "outside its limits" in problem
@@ -399,7 +400,7 @@ def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_a
 @pytest.mark.parametrize("limp", [(12,), IDS])
 def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(protocol, limp):
     arm = Arm(protocol, limp=limp)
-    arm.servo.turn_by_hand(3.0)
+    turn_by_hand(arm.servo, 3.0)
     arm.start()
     assert not any(on for servo, on in arm.torque_bytes() if servo in limp)
     arm.follow(30)
@@ -416,7 +417,7 @@ def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(protocol, li
 def test_a_limp_joint_may_stand_outside_its_limits_at_the_start():
     for arm in (Arm(limp=(12,)), Arm()):
         plan = arm.plan.servos[1]
-        arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+        turn_by_hand(arm.servo, (plan.upper_tick + 40) * plan.rad_per_tick)
         if not plan.torque_at_start:
             arm.start()
             assert arm.rig.torque() == [True, False, True]

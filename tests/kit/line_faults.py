@@ -1,10 +1,11 @@
-"""Faults of single packets on a simulated bus, and another host on its line."""
+"""Faults of single packets on a simulated bus, another host on its line, and a hand at a shaft."""
 
 from __future__ import annotations
 
 from dxlrun.simulation.bus.ledger import OTHER_HOST
 from dxlrun.simulation.bus.line import Transmission, flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import InstructionReceiver
 
 
@@ -42,3 +43,10 @@ def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool =
             bus._execute(instruction, end_ns)
 
     bus.at(at_ns, send)
+
+
+def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
+    """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
+    servo.note(f"servo {servo.servo_id}: turned by hand to {angle} rad")
+    servo.shaft.rest_at(angle)
+    servo.shaft.plan(servo.shaft.items.aims)

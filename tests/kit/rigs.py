@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from tests.kit.decoded import decode_packets
 from tests.kit.line_faults import corrupt_next, truncate_next
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table

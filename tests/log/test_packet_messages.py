@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys.store import Typestore
+from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log import log_writer, schemas
 from dxlrun.log.columns import PacketColumns

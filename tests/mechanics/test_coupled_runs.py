@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import Events
 
 from dxlrun.channels.answers import Done, Refusal
@@ -95,9 +96,9 @@ def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan,
 def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(plan, tmp_path):
     robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
     (bus,) = robot.buses
-    bus.servo(5).turn_by_hand(math.radians(200))
-    bus.servo(1).turn_by_hand(math.radians(200))
-    bus.servo(7).turn_by_hand(math.radians(270))
+    turn_by_hand(bus.servo(5), math.radians(200))
+    turn_by_hand(bus.servo(1), math.radians(200))
+    turn_by_hand(bus.servo(7), math.radians(270))
     present = {servo.servo_id: round(servo.position / math.tau * TURN) for servo in bus.servos}
     robot.run()
     for servo, tick in present.items():
@@ -236,7 +237,7 @@ def test_joints_that_get_no_torque_may_stand_outside_their_limits(plan, moved):
     )
     robot = VirtualRobot(plan(*limp, idle, duration_s=0.3))
     for servo, angle in moved.items():
-        robot.buses[0].servo(servo).turn_by_hand(math.radians(angle))
+        turn_by_hand(robot.buses[0].servo(servo), math.radians(angle))
     assert robot.run().reason == "ended"
     assert not any(robot.buses[0].servo(servo).torque_on for servo in moved)
 
@@ -254,7 +255,7 @@ def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(pla
 def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan):
     robot = VirtualRobot(plan())
     for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
-        robot.buses[0].servo(servo).turn_by_hand(math.radians(180 + angle))
+        turn_by_hand(robot.buses[0].servo(servo), math.radians(180 + angle))
     with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) stands at 80.0 deg, outside"):
         robot.run()
 
@@ -331,7 +332,7 @@ def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypa
     (bus,) = robot.buses
     ask_torque(robot, joint, (300, "false"), (1000, "true"))
     for servo, angle in moved.items():
-        bus.at(600_000_000, partial(bus.servo(servo).turn_by_hand, math.radians(angle)))
+        bus.at(600_000_000, partial(turn_by_hand, bus.servo(servo), math.radians(angle)))
     robot.run()
     answer = robot.inbox.answers[2]
     assert isinstance(answer, Refusal)

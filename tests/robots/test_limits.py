@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.clients import Ask, steered
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
@@ -182,7 +183,7 @@ def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hol
     def push(robot: VirtualRobot) -> None:
         shaft.watch(robot, 0.6)
         servo = robot.buses[0].servo(1)
-        robot.buses[0].at(300_000_000, lambda: servo.turn_by_hand(math.pi + LIMIT + 0.5))
+        robot.buses[0].at(300_000_000, lambda: turn_by_hand(servo, math.pi + LIMIT + 0.5))
 
     file = driven(tmp_path, 0.02, 100, "type: joint_group_effort_controller", ", on_exit: hold")
     run = steered(tmp_path, file, 0.5, before=push)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.channels.answers import Done, Refusal
 from dxlrun.channels.commands import Command
@@ -88,7 +89,7 @@ def test_a_servo_that_is_mounted_the_other_way_round_is_refused_before_any_torqu
     truth = simulation_of(replace(plan, buses=(replace(bus, servos=turned),)))
     monkeypatch.setattr(virtual_run, "simulation_of", lambda plan: truth)
     robot = VirtualRobot(plan)
-    robot.buses[0].servo(1).turn_by_hand(math.pi - 0.2)  # the hip is not at 0, or none could see it
+    turn_by_hand(robot.buses[0].servo(1), math.pi - 0.2)  # the hip is not at 0, or none could see it
     with pytest.raises(DxlrunError, match=r"the servos of hip disagree by 22\.9 deg"):
         robot.run()
     assert not any(servo.torque_on for servo in robot.buses[0].servos)

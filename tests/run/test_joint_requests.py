@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.totals import totals_of
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal
@@ -88,7 +89,7 @@ def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run):
     one = run()
     servo = one.robot.buses[0].servo(2)
     off = one.ask(400, "torque", joints=["elbow"], on=False, release=True)
-    one.at(700, lambda: servo.turn_by_hand(2.5))
+    one.at(700, lambda: turn_by_hand(servo, 2.5))
     on = one.ask(1000, "torque", joints=["elbow"], on=True)
     back = one.ask(1300, "switch", activate=["arm"], deactivate=[])
     log = one.run()
@@ -262,7 +263,7 @@ def test_torque_comes_back_softly_while_a_controller_goes_on(run):
     bus = one.robot.buses[0]
     servo = bus.servo(2)
     one.at(400, servo.reboot)
-    one.at(1200, lambda: servo.turn_by_hand(2.5))
+    one.at(1200, lambda: turn_by_hand(servo, 2.5))
     on = one.ask(1400, "torque", joints=["elbow"], on=True)
     log = one.run()
     assert isinstance(one.answer(on), Done)

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.events import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
-from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.packets import packet1
 
 from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
@@ -81,7 +82,7 @@ def test_a_host_that_sends_within_the_return_delay_is_received():
 
 def test_two_servos_with_one_id_garble_what_differs():
     bus = new_bus(ids=(1, 1))
-    bus.servos[1].turn_by_hand(3.0)
+    turn_by_hand(bus.servos[1], 3.0)
     bus.receive(PING_1, 0)
     assert bus.take(10**9) == PONG_1  # equal bytes, in step: nothing to be seen
     bus.receive(READ_1, 10**9)

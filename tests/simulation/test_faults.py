@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.errors import InputError, PortError
 from dxlrun.simulation.faults.fault import parse_fault
@@ -341,7 +342,7 @@ def test_a_loose_cable_has_no_contact_within_its_angles(line):
     inject(line, "loose servo=1 low=100deg high=120deg")
     heard = []
     for angle in (99.0, 101.0, 119.0, 121.0):
-        line.servo(1).turn_by_hand(math.radians(angle))
+        turn_by_hand(line.servo(1), math.radians(angle))
         heard.append(ping(line) == PONG[1])
     assert heard == [True, False, False, True]
     assert ping(line, 2) == PONG[2]

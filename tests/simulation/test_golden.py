@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 
 TICK = math.tau / 4096
 
@@ -65,7 +66,7 @@ def test_a_servo_that_is_listed_twice_answers_a_bulk_read_once(make_line):
 
 def turn(line: Any, positions: dict[int, int]) -> None:
     for servo_id, ticks in positions.items():
-        line.servo(servo_id).turn_by_hand(ticks * TICK)
+        turn_by_hand(line.servo(servo_id), ticks * TICK)
 
 
 def test_sync_read_of_protocol_2(make_line2):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.servo.making import make_servo
@@ -107,7 +108,7 @@ def test_another_protocol_type_is_the_end_of_replies(line2):
 
 def far(line: Any, turns: int = 3) -> None:
     line.servo().poke("operating_mode", 4)
-    line.servo().turn_by_hand(turns * 4096 * line.servo().registers.table.rad_per_tick + 0.1)
+    turn_by_hand(line.servo(), turns * 4096 * line.servo().registers.table.rad_per_tick + 0.1)
 
 
 def test_clear_brings_the_position_into_one_turn(line2):
@@ -279,12 +280,12 @@ def test_a_lower_limit_takes_the_goal_with_it(line2):
 
 
 def test_switching_the_torque_on_brings_a_position_into_one_turn(line2):
-    line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
+    turn_by_hand(line2.servo(), 2 * 6.283185307 + 1.0)
     assert line2.get("present_position") > 2 * 4096
     line2.set("torque_enable", 1)
     assert line2.get("present_position") < 4096
     line2.put(torque_enable=0, operating_mode=4)
-    line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
+    turn_by_hand(line2.servo(), 2 * 6.283185307 + 1.0)
     line2.set("torque_enable", 1)
     assert line2.get("present_position") > 2 * 4096 - 100  # many turns are what this mode is for
 
@@ -295,7 +296,7 @@ def test_switching_the_torque_on_brings_a_position_into_one_turn(line2):
 def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line2):
     line = make_line2((1,), "YM070-210-M001")
     turn = round(6.283185307 / line.servo().registers.table.rad_per_tick)
-    line.servo().turn_by_hand(3 * 6.283185307 + 0.5)
+    turn_by_hand(line.servo(), 3 * 6.283185307 + 0.5)
     line.servo().reset()
     assert line.get("present_position") > 3 * turn
     line.servo().poke("torque_enable", 1)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation.registers.memory import Memory
@@ -266,7 +267,7 @@ def test_goals_of_multi_turn_mode_count_turns(make_line):
     errors = [line.write(1, 30, *low_high(goal)) for goal in goals]
     assert errors == [0, ErrorBit.RANGE, 0, ErrorBit.RANGE]
     assert line.read(1, 30, 2) == goals[2]
-    line.servo().turn_by_hand(-3.0)
+    turn_by_hand(line.servo(), -3.0)
     assert line.read(1, 36, 2) == pytest.approx((1 << 16) - 3.0 / math.tau * 4096, abs=2)
 
 

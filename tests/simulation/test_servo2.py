@@ -6,6 +6,7 @@ import math
 from unittest.mock import ANY
 
 import pytest
+from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.simulation.servo.protocol2_servo import HardwareError
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
@@ -237,7 +238,7 @@ def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2):
     resting = line2.get("present_position")
     assert line2.servo().shaft.mechanics.still, "this test is about a servo at rest"
     assert line2.get("present_position") == resting
-    line2.servo().turn_by_hand(line2.servo().position + 0.5)
+    turn_by_hand(line2.servo(), line2.servo().position + 0.5)
     turned = line2.get("present_position")
     assert turned == pytest.approx(resting + 0.5 / 0.001534, abs=2)
     line2.wait(1.0)

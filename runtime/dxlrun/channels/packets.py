@@ -200,14 +200,6 @@ def salvage(desk: memoryview, head: int, writer: Appender) -> int:
     return (words[_CYCLE] >> _MARK_BITS) - 1
 
 
-def decode_packets(payload: Payload) -> list[LoggedPacket]:
-    """Return the packets of one committed batch, oldest first. Raises ValueError when it is not one."""
-    return [
-        LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
-        for _, bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload)
-    ]
-
-
 BatchedPacket = tuple[int, int, int, int, int, int, bytes]
 """Cycle, and the fields of LoggedPacket, as plain values."""
 

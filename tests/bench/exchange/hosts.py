@@ -21,8 +21,8 @@ from dxlrun.channels.packets import (
     PacketBatch,
     PacketKind,
     PacketLog,
-    decode_packets,
     packet_capacity,
+    split_packets,
 )
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
 from dxlrun.clock import MonotonicClock
@@ -157,9 +157,9 @@ class Ours:
             if isinstance(record, Gap):
                 return ()  # bytes are counted: without some of them there is no result
             found += [
-                (packet.first_ns, len(packet.data))
-                for packet in decode_packets(record.payload)
-                if packet.kind is PacketKind.INSTRUCTION
+                (first_ns, len(data))
+                for _, _, kind, _, first_ns, _, data in split_packets(record.payload)
+                if kind == PacketKind.INSTRUCTION
             ]
         return found
 

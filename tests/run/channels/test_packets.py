@@ -8,6 +8,7 @@ import struct
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.packets import (
     DESK_SIZE,
@@ -16,7 +17,6 @@ from dxlrun.channels.packets import (
     PacketBatch,
     PacketKind,
     PacketLog,
-    decode_packets,
     packet_capacity,
     salvage,
     split_packets,

@@ -235,12 +235,6 @@ class SimulatedServo(SimulatedNode):
 
         self.shaft.mechanics.turn(self.shaft.index, by, duration_ns, gives_way)
 
-    def turn_by_hand(self, angle: float) -> None:
-        """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
-        self.note(f"servo {self.servo_id}: turned by hand to {angle} rad")
-        self.shaft.rest_at(angle)
-        self.shaft.plan(self.shaft.items.aims)
-
 
 class Protocol1Servo(SimulatedServo):
     """AX, DX, EX, RX, and MX with their first firmware: error bits, Torque Limit 0, and the EEPROM's lock."""
