@@ -37,7 +37,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
-from dxlrun.channels.packets import PacketBatch, split_packets
+from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, split_packets
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.description.modes import Mode
@@ -190,7 +190,7 @@ class Side:
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
-            Handover(lambda _, payload: self.log.extend(packet[1:] for packet in split_packets(payload))),
+            Handover(lambda _, payload: self.log.extend(_decoded(payload))),
             desk or memoryview(bytearray(1 << 20)),
         )
         count = sum(len(plan.servos) for plan in plans)
@@ -326,7 +326,8 @@ class Side:
         hardware = self.hardware
         return {
             "packets": [
-                [packet for packet in self.log if packet[0] == index] for index in range(len(hardware._pairs))
+                [packet for packet in self.log if packet.bus == index]
+                for index in range(len(hardware._pairs))
             ],
             "sent": [line.sent for line in self.lines.ports],
             "motion": self.states.motion.tobytes(),
@@ -342,6 +343,11 @@ class Side:
             "failures": [str(bus.failure) for bus in hardware._buses],
             "events": sorted(self.events.list, key=itemgetter(2)),  # in order for each source, as packets are
         }
+
+
+def _decoded(payload):
+    """Return the packets of one batch."""
+    return [LoggedPacket(bus, PacketKind(kind), *rest) for _, bus, kind, *rest in split_packets(payload)]
 
 
 def replies(transaction, dialect, rng, drift, standing):
