@@ -33,7 +33,7 @@ def sources(commit: str) -> Iterator[tuple[str, str]]:
 
     tracked = git("ls-tree", "-r", "--name-only", commit) if commit else git("ls-files")
     for path in tracked.splitlines():
-        if path.endswith((".py", ".c")) and path.startswith(("runtime/", "plugins/", "tests/")):
+        if path.endswith((".py", ".pyi", ".c")) and path.startswith(("runtime/", "plugins/", "tests/")):
             yield path, git("show", f"{commit}:{path}") if commit else (ROOT / path).read_text()
 
 

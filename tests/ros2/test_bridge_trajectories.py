@@ -19,7 +19,8 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from control_msgs.msg import JointTolerance
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-from dxlrun_ros2.trajectories import WrongTrajectory, tolerances, wanted
+from dxlrun.errors import InputError
+from dxlrun_ros2.trajectories import tolerances, wanted
 
 def at(seconds, **values):
     duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
@@ -30,11 +31,11 @@ def trajectory(joints, *points, stamp=0):
     found.header.stamp = Time(sec=stamp)
     return found
 
-def code(call):
+def why(call):
     try:
         return call()
-    except WrongTrajectory as error:
-        return [error.code, str(error)]
+    except InputError as error:
+        return str(error)
 
 JOINTS = ("pan", "tilt", "roll")
 """
@@ -67,30 +68,29 @@ def test_a_stamp_says_when_it_begins() -> None:
 points = [at(1, positions=[0.1]), at(3, positions=[0.2])]
 plans = [wanted(trajectory(["pan"], *points, stamp=100), JOINTS, now) for now in (98.0, 102.0)]
 print(json.dumps([[one.start_in, *one.times.tolist()] for one in plans]
-    + [code(lambda: wanted(trajectory(["pan"], *points, stamp=100), JOINTS, 104.0))]))""")
+    + [why(lambda: wanted(trajectory(["pan"], *points, stamp=100), JOINTS, 104.0))]))""")
     assert ahead == [2.0, 1.0, 3.0]
     assert late == [0.0, 1.0]
-    assert past == [-3, "all its points are in the past"]
+    assert past == "all its points are in the past"
 
 
 WRONG = {
-    'trajectory(["nose"], at(1, positions=[0]))': (-2, "nose: not among its joints, pan, tilt, roll"),
-    'trajectory(["pan", "pan"], at(1, positions=[0, 0]))': (-2, "each joint once"),
-    "trajectory([], at(1, positions=[]))": (-2, "at least one"),
-    'trajectory(["pan"], at(1, positions=[0, 1]))': (-1, "point 1 has 2 positions for 1 joints"),
-    'trajectory(["pan"], at(1, velocities=[0]))': (-1, "point 1 has 0 positions"),
-    'trajectory(["pan"], at(1, positions=[0], accelerations=[0, 1]))': (-1, "2 accelerations"),
-    'trajectory(["pan"], at(1, positions=[float("nan")]))': (-1, "not finite"),
-    'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': (-1, "grow from point to point"),
-    'trajectory(["pan"], at(-1, positions=[0]))': (-1, "at least 0"),
+    'trajectory(["nose"], at(1, positions=[0]))': "nose: not among its joints, pan, tilt, roll",
+    'trajectory(["pan", "pan"], at(1, positions=[0, 0]))': "each joint once",
+    "trajectory([], at(1, positions=[]))": "at least one",
+    'trajectory(["pan"], at(1, positions=[0, 1]))': "point 1 has 2 positions for 1 joints",
+    'trajectory(["pan"], at(1, velocities=[0]))': "point 1 has 0 positions",
+    'trajectory(["pan"], at(1, positions=[0], accelerations=[0, 1]))': "2 accelerations",
+    'trajectory(["pan"], at(1, positions=[float("nan")]))': "not finite",
+    'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': "grow from point to point",
+    'trajectory(["pan"], at(-1, positions=[0]))': "at least 0",
 }
 
 
-def test_what_is_wrong_is_refused_with_its_code() -> None:
-    calls = ", ".join(f"code(lambda: wanted({wrong}, JOINTS, 1.0))" for wrong in WRONG)
-    for found, (code, why) in zip(result_of(f"print(json.dumps([{calls}]))"), WRONG.values(), strict=True):
-        assert found[0] == code
-        assert why in found[1]
+def test_what_is_wrong_is_refused_with_its_reason() -> None:
+    calls = ", ".join(f"why(lambda: wanted({wrong}, JOINTS, 1.0))" for wrong in WRONG)
+    for found, why in zip(result_of(f"print(json.dumps([{calls}]))"), WRONG.values(), strict=True):
+        assert why in found
 
 
 def test_tolerances_name_the_joint_that_is_farthest_beyond() -> None:
@@ -100,11 +100,11 @@ most = tolerances(given, JOINTS)
 errors = [([0.1, 0.2, 9], [0, 0.5, 0]), ([0.3, -0.5, 9], [9, 0, 0]), ([0, 0, 0], [0, -0.6, 0])]
 errors += [([np.nan] * 3, [0, 0, 0])]
 print(json.dumps([most.violated(JOINTS, np.array(one, float)) for one in errors]
-    + [code(lambda: tolerances(given, ("pan",)))]))""")
+    + [why(lambda: tolerances(given, ("pan",)))]))""")
     assert within == unchecked == ""
     assert position == "tilt is off by 0.5 in position, 0.2 is allowed"
     assert velocity == "tilt is off by 0.6 in velocity, 0.5 is allowed"
-    assert unknown == [-2, "a tolerance names tilt, which is not moved"]
+    assert unknown == "a tolerance names tilt, which is not moved"
 
 
 def test_the_desired_state_is_that_of_the_controllers_spline() -> None:

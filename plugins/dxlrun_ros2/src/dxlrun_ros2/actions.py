@@ -13,23 +13,22 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
-from dxlrun import DxlrunError, Floats, GoalState, Refused, RemoteGoal, RemoteRobot, connect
+from dxlrun import DxlrunError, Floats, GoalState, InputError, Refused, RemoteGoal, RemoteRobot, connect
 from dxlrun.remote.requests.replies import ControllerInfo
 from dxlrun_controllers.laws.spline import SplineSample
 from dxlrun_ros2 import CLIENT
 from dxlrun_ros2.manager import info_of
 from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.trajectories import (
-    Result,
     Tolerances,
     Wanted,
-    WrongTrajectory,
     point,
     seconds_of,
     tolerances,
     wanted,
 )
 
+Result = FollowJointTrajectory.Result
 FEEDBACK_S = 0.05
 GOAL_TIME_S = 1.0
 """How long after its end a goal with tolerances may still come inside them, where it does not say."""
@@ -139,9 +138,9 @@ class FollowTrajectory(Action):
     kind, name = FollowJointTrajectory, "follow_joint_trajectory"
 
     def check(self, request: FollowJointTrajectory.Goal) -> None:
-        """Raise WrongTrajectory for a goal that is not accepted."""
+        """Raise InputError for a goal that is not accepted."""
         if request.multi_dof_trajectory.points:
-            raise WrongTrajectory(Result.INVALID_JOINTS, "it has no joints with several degrees of freedom")
+            raise InputError("it has no joints with several degrees of freedom")
         for given in (request.path_tolerance, request.goal_tolerance):
             tolerances(given, self.controller.joints)
         if request.trajectory.points:

@@ -7,22 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from dxlrun import Floats, InputError
 from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, SplineSample, Trajectory, flatten
-
-Result = FollowJointTrajectory.Result
-
-
-class WrongTrajectory(InputError):
-    """A trajectory that is not taken, with the code of control_msgs/FollowJointTrajectory."""
-
-    def __init__(self, code: int, why: str) -> None:
-        super().__init__(why)
-        self.code = code
 
 
 @dataclass(frozen=True)
@@ -79,15 +68,13 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
     """Return what a trajectory wants of some of a controller's joints; `now`: s of the clock of its stamp.
 
     A first point at time 0 is where the joints are already, so it is left out where others follow. Raises
-    WrongTrajectory.
+    InputError.
     """
     named = tuple(message.joint_names)
     if unknown := [name for name in named if name not in joints]:
-        raise WrongTrajectory(
-            Result.INVALID_JOINTS, f"{', '.join(unknown)}: not among its joints, {', '.join(joints)}"
-        )
+        raise InputError(f"{', '.join(unknown)}: not among its joints, {', '.join(joints)}")
     if not named or len({*named}) < len(named):
-        raise WrongTrajectory(Result.INVALID_JOINTS, "joint_names must name each joint once, at least one")
+        raise InputError("joint_names must name each joint once, at least one")
     points, times = np.zeros((len(message.points), 3, len(named))), np.zeros(len(message.points))
     orders = []
     for index, point in enumerate(message.points):
@@ -97,13 +84,13 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
             zip(("positions", "velocities", "accelerations"), given, strict=True)
         ):
             if len(values) not in ((len(named),) if row == 0 else (0, len(named))):
-                raise _invalid(f"point {index + 1} has {len(values)} {what} for {len(named)} joints")
+                raise InputError(f"point {index + 1} has {len(values)} {what} for {len(named)} joints")
             points[index, row] = values if len(values) else 0.0
         orders.append(LINEAR if not given[1] else QUINTIC if given[2] else CUBIC)
     if not np.isfinite(points).all():
-        raise _invalid("it has numbers that are not finite")
+        raise InputError("it has numbers that are not finite")
     if (np.diff(times, prepend=-1e-12) <= 0).any():
-        raise _invalid("time_from_start must be at least 0, and grow from point to point")
+        raise InputError("time_from_start must be at least 0, and grow from point to point")
     stamp = seconds_of(message.header.stamp)
     start_in = stamp - now if stamp else 0.0
     if start_in < 0:
@@ -111,14 +98,10 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
     ahead = times > 0
     if not ahead.any():
         if stamp:
-            raise WrongTrajectory(Result.OLD_HEADER_TIMESTAMP, "all its points are in the past")
+            raise InputError("all its points are in the past")
         ahead[-1] = True
     chosen = tuple(order for order, is_ahead in zip(orders, ahead, strict=True) if is_ahead)
     return Wanted(named, times[ahead], points[ahead], chosen, start_in)
-
-
-def _invalid(why: str) -> WrongTrajectory:
-    return WrongTrajectory(Result.INVALID_GOAL, why)
 
 
 @dataclass(frozen=True)
@@ -141,12 +124,10 @@ class Tolerances:
 
 
 def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> Tolerances:
-    """Return the tolerances of a goal; 0 and below: not checked here. Raises WrongTrajectory."""
+    """Return the tolerances of a goal; 0 and below: not checked here. Raises InputError."""
     rows: Mapping[str, JointTolerance] = {one.name: one for one in given}
     if unknown := [name for name in rows if name not in joints]:
-        raise WrongTrajectory(
-            Result.INVALID_JOINTS, f"a tolerance names {', '.join(unknown)}, which is not moved"
-        )
+        raise InputError(f"a tolerance names {', '.join(unknown)}, which is not moved")
     found = np.full((2, len(joints)), np.inf)
     for row, name in enumerate(joints):
         if name in rows:
