@@ -27,7 +27,7 @@ from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
 """Before the name of a robot: POST starts it, GET asks whether it runs; 200: it does."""
-_MOST_TOLD = 4096
+_MOST_TOLD, _LINES_TOLD = 4096, 6
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
@@ -60,8 +60,8 @@ class Starter:
             if method == "GET":
                 output.seek(max(0, os.fstat(output.fileno()).st_size - _MOST_TOLD))
                 told = output.read().decode(errors="replace").split("\n")
-                last = [line for line in told if line.strip()][-1:]
-                return 410, f"it does not run; {path_out} ends with: {''.join(last) or 'nothing'}"
+                last = [line for line in told if line.strip()][-_LINES_TOLD:] or ["nothing"]
+                return 410, "\n  ".join([f"it does not run; {path_out} ends with:", *last])
             output.truncate(0)
             self._runs.append(
                 subprocess.Popen(
