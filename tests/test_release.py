@@ -95,7 +95,11 @@ def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
 @pytest.mark.timeout(600)
 def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path]) -> None:
     elffile = importlib.import_module("elftools.elf.elffile")
-    sources = {str(path.relative_to(ROOT / "runtime")) for path in (ROOT / "runtime/dxlrun").rglob("*.py")}
+    sources = {
+        str(path.relative_to(ROOT / "runtime"))
+        for path in (ROOT / "runtime/dxlrun").rglob("*.py*")
+        if path.suffix in {".py", ".pyi"}
+    }
     for path in built[1:]:
         with zipfile.ZipFile(path) as wheel:
             assert sources - {*wheel.namelist()} == set()

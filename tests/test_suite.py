@@ -134,7 +134,7 @@ MOST_ROOMS = 18
 
 def entries(folder: Path) -> list[Path]:
     """Return what a reader finds in a folder: its modules, with what they have in C, and rooms."""
-    made = {"__init__.py", "py.typed", "__pycache__"}
+    made = {"__init__.py", "__init__.pyi", "py.typed", "__pycache__"}
     found = [path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"]
     return [path for path in found if path.suffix != ".c" or not path.with_suffix(".py").exists()]
 
@@ -151,7 +151,9 @@ def test_no_folder_of_the_package_is_crowded() -> None:
 def imports() -> dict[str, set[str]]:
     """Return which of our modules each module imports: also in functions, and for type checking only."""
     modules: dict[str, Path] = {}
-    for path in (RUNTIME / "dxlrun").rglob("*.py"):
+    for path in (RUNTIME / "dxlrun").rglob("*.py*"):
+        if path.suffix not in {".py", ".pyi"}:
+            continue
         modules[".".join(path.relative_to(RUNTIME).with_suffix("").parts).removesuffix(".__init__")] = path
     found: dict[str, set[str]] = {name: set() for name in modules}
     for name, path in modules.items():

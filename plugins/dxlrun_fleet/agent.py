@@ -59,7 +59,7 @@ class Starter:
                 return (409, "it runs already") if method == "POST" else (200, "it runs")
             if method == "GET":
                 output.seek(max(0, os.fstat(output.fileno()).st_size - _MOST_TOLD))
-                told = output.read().decode(errors="replace").split("\n")
+                told = output.read().decode(errors="replace").split("\n")[output.tell() > _MOST_TOLD :]
                 last = [line for line in told if line.strip()][-_LINES_TOLD:] or ["nothing"]
                 return 410, "\n  ".join([f"it does not run; {path_out} ends with:", *last])
             output.truncate(0)

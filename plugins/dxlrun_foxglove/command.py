@@ -77,11 +77,11 @@ def foxglove(
 
     with connect(robot, "dxlrun foxglove") as running:
         name = running.name
+    served = FoxgloveServer(name, (APP, *origin), control=control)
+    tls, listener = tls_of(cert, key), listening(listen, port, PORT)
     with suppress(OSError):
         os.nice(NICENESS)
-    served = FoxgloveServer(name, (APP, *origin), control=control)
-    tls = tls_of(cert, key)
-    asyncio.run(_serve(served, listening(listen, port, PORT), tls))
+    asyncio.run(_serve(served, listener, tls))
     return 0
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
-with open(f"{__file__}i", encoding="utf-8") as _names:
-    _lines = [_line.split() for _line in _names if _line.startswith("from ")]
-_HOME = {words[-1]: words[1] for words in _lines}
+with open(f"{__file__.rpartition('.')[0]}.pyi", encoding="utf-8") as _names:
+    _HOME = {_line.split()[-1]: _line.split()[1] for _line in _names if _line.startswith("from ")}
 __all__ = sorted(_HOME, key=lambda name: (not name.isupper(), name))  # noqa: PLE0605  a list it is
 
 

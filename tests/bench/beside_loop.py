@@ -171,9 +171,13 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
     words = parser.parse_args()
+    if not BESIDE[words.beside].command:
+        parser.error("DXLRUN_ROS2_PYTHON names no Python that has rclpy and dxlrun_ros2")
     duration = 2 * (2 * words.blocks + 1) * words.seconds + 120
     with tempfile.TemporaryDirectory() as folder:
-        os.environ |= started.environment(Path(folder))
+        environment = started.environment(Path(folder))
+        os.environ.clear()
+        os.environ.update(environment)
         ran = [DXLRUN, words.robot.resolve(), "--duration", str(duration)]
         with subprocess.Popen(ran, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as robot:
             while not dxlrun.running():

@@ -33,11 +33,14 @@ from operator import itemgetter
 from pathlib import Path
 from zlib import crc32
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 import numpy as np
 from msgspec.structs import replace
+from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
-from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, split_packets
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.description.modes import Mode
@@ -190,7 +193,7 @@ class Side:
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
-            Handover(lambda _, payload: self.log.extend(_decoded(payload))),
+            Handover(lambda _, payload: self.log.extend(decode_packets(payload))),
             desk or memoryview(bytearray(1 << 20)),
         )
         count = sum(len(plan.servos) for plan in plans)
@@ -343,11 +346,6 @@ class Side:
             "failures": [str(bus.failure) for bus in hardware._buses],
             "events": sorted(self.events.list, key=itemgetter(2)),  # in order for each source, as packets are
         }
-
-
-def _decoded(payload):
-    """Return the packets of one batch."""
-    return [LoggedPacket(bus, PacketKind(kind), *rest) for _, bus, kind, *rest in split_packets(payload)]
 
 
 def replies(transaction, dialect, rng, drift, standing):

@@ -58,9 +58,9 @@ def free_port() -> int:
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file of a fleet of one robot that an agent starts, and one whose network hangs; with all keys."""
-    for name in ("XDG_CONFIG_HOME", "XDG_RUNTIME_DIR"):
-        (tmp_path / name).mkdir(mode=0o700)
-        monkeypatch.setenv(name, str(tmp_path / name))
+    for name, place in (("XDG_CONFIG_HOME", "c"), ("XDG_RUNTIME_DIR", "r")):  # a socket's path has 107 bytes
+        (tmp_path / place).mkdir(mode=0o700)
+        monkeypatch.setenv(name, str(tmp_path / place))
     authority.issue("lab3", None, 30, keys_place())
     authority.issue("joint", None, 30, keys_place())
     authority.issue("me", Role.ADMIN, 30, keys_place())

@@ -14,11 +14,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from tests.kit.line_faults import OTHER_HOST
+
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
-from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST, LedgerEntry
+from dxlrun.simulation.bus.ledger import FAULT, LedgerEntry
 from dxlrun.simulation.faults.fault import Fault, parse_fault
 from dxlrun.simulation.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun_analysis.plan import plan_of

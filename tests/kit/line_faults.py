@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dxlrun.simulation.bus.ledger import OTHER_HOST
 from dxlrun.simulation.bus.line import Transmission, flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import InstructionReceiver
+
+OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
 
 
 def corrupt_next(bus: SimulatedBus, servo_id: int, index: int = -1, flip: int = 0x01) -> None:
@@ -48,5 +49,6 @@ def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool =
 def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
     """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
     servo.note(f"servo {servo.servo_id}: turned by hand to {angle} rad")
-    servo.shaft.rest_at(angle)
+    servo.shaft.mechanics.place(servo.shaft.index, angle)
+    servo.shaft._forget()
     servo.shaft.plan(servo.shaft.items.aims)

@@ -73,7 +73,7 @@ def frames(
     return 0
 
 
-def _tree(plan: Plan, robot: RobotPath) -> FrameTree:
+def _tree(plan: Plan, robot: Path) -> FrameTree:
     from dxlrun.description.frames.tree import FrameTree  # as above
 
     if plan.urdf is None or plan.frames is None:

@@ -213,7 +213,7 @@ class _Documented(GenerateJsonSchema):
         return found
 
 
-@cache  # the source of a class is looked up once a schema, not once for each class below it
+@cache  # finding a class in its source takes long, and each class below it needs it
 def _docstrings(kind: type) -> dict[str, str]:
     """Return the docstrings below the fields of a class, by field; of a class without source none."""
     with suppress(OSError, TypeError, SyntaxError):

@@ -161,7 +161,11 @@ class FollowTrajectory(Action):
             state, _ = self.wait(handle, robot, stopped(robot, self.run, self.controller), lambda _: "")
             handle.succeed()
             return Result(error_string=f"stopped in place: {state.status}")
-        plan = self._wanted(request)
+        try:
+            plan = self._wanted(request)
+        except InputError as error:  # since it was accepted, its last point has passed
+            handle.abort()
+            return self.failed(str(error), Result.OLD_HEADER_TIMESTAMP)
         watch = Watch(self.run, plan, tolerances(request.path_tolerance, plan.joints))
         self.run.seen.add(watch.see)
         try:

@@ -57,9 +57,10 @@ def view(
     source = _source(what)
     try:
         with listening(listen, port, PORT) as listener:
-            address, taken = listener.getsockname()
+            address, taken = listener.getsockname()[:2]
+            address = "127.0.0.1" if address == ANY else f"[{address}]" if ":" in address else address
             page = Page(source, listener, hosts=hosts_of(listen, taken), control=control)
-            url = f"http://{'127.0.0.1' if address == ANY else address}:{taken}/?token={page.token}"
+            url = f"http://{address}:{taken}/?token={page.token}"
             server = server_of(page)
 
             def end(number: int, frame: FrameType | None) -> None:

@@ -332,7 +332,7 @@ def _line(sentence: Sentence, width: int) -> Text:
 
 
 def compact(table: Table) -> RenderableType:
-    """Return a table without rules, cut at the right where there is no room."""
+    """Return a table without rules, whose texts give way first where there is no room."""
     from rich.table import Table as RichTable
     from rich.text import Text
 

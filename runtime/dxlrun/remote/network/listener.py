@@ -77,7 +77,7 @@ class Listener(socket.socket):
 def listening(host: str, port: int | None, usual: int) -> Listener:
     """Return a listening socket; without a port on the usual one, or if that is taken on any.
 
-    Raises InputError, with the option that helps.
+    For verbs with the options --port and --listen: raises InputError, with the one that helps.
     """
     try:
         return Listener(host, usual if port is None else port)

@@ -22,8 +22,6 @@ FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
 
 FAULT = "fault: "  # How the note of a fault that happens begins; its text follows
 
-OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
-
 
 class LedgerEntry(NamedTuple):
     """Bytes that passed the wire together, or a note about something that was done to the bus."""

@@ -68,11 +68,6 @@ class Shaft(ABC):
         """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
         return self.memory.get("torque_enable") == 1 and self.memory.get("torque_limit", 1) > 0
 
-    def rest_at(self, angle: float) -> None:
-        """Put the shaft somewhere, at rest; what is commanded counts from the next `plan`."""
-        self.mechanics.place(self.index, angle)
-        self._forget()
-
     def recount(self, angle: float) -> None:
         """Put the shaft to rest where it is, its angle counted in another turn."""
         self.mechanics.recount(self.index, angle)
