@@ -9,12 +9,12 @@ import pytest
 from msgspec import structs
 from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
-from tests.kit.line_faults import other_host
+from tests.kit.line_faults import OTHER_HOST, other_host
 
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation.bus.ledger import OTHER_HOST, LedgerEntry
+from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import simulated_robot
 
 THREE = {"main": (2.0, 3)}
