@@ -90,11 +90,11 @@ async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
+    from dxlrun.remote.network.listener import in_url
+
     async with await served.serve(listener, tls):
         host, taken = listener.getsockname()[:2]
-        url = (
-            f"{'wss' if tls else 'ws'}://{f'[{host}]' if ':' in host else host}:{taken}/?token={served.token}"
-        )
+        url = f"{'wss' if tls else 'ws'}://{in_url(host)}:{taken}/?token={served.token}"
         app = f"{APP}/~/view?ds=foxglove-websocket&ds.url={quote(url, safe='')}"
         show(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends this, not the robot.")
         await ended.wait()

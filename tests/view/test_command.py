@@ -56,16 +56,20 @@ def refused(process: subprocess.Popen[str]) -> tuple[int, str]:
     return process.returncode, said
 
 
-def test_a_log_is_served_until_ctrl_c(view: View, log: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_a_log_is_served_until_ctrl_c(view: View, log: Path, tmp_path: Path, host: str) -> None:
     (tmp_path / "logs").mkdir()
     shutil.copy(log, tmp_path / "logs/bioloid_torso.mcap")
     (command,) = [one for one in COMMANDS if one.endswith(".mcap")]
-    process = view(*command.split()[1:], "--no-browser", "--port", "0")
+    process = view(*command.split()[1:], "--no-browser", "--port", "0", "--listen", host.strip("[]"))
     assert process.stdout is not None
     line = process.stdout.readline()
-    address = re.search(r"127\.0\.0\.1:(\d+)/\?token=\S{20}", line)
-    assert address, line + (process.stderr.read() if process.stderr else "")
-    connection = http.client.HTTPConnection("127.0.0.1", int(address[1]), timeout=20)
+    address = re.search(rf"{re.escape(host)}:(\d+)/\?token=\S{{20}}", line)
+    said = "" if address or not process.stderr else process.stderr.read()
+    if host == "[::1]" and "cannot be listened on" in said:
+        pytest.skip(said)  # this system has no IPv6
+    assert address, line + said
+    connection = http.client.HTTPConnection(host.strip("[]"), int(address[1]), timeout=20)
     connection.request("GET", "/")
     answer = connection.getresponse()
     assert answer.status == 200

@@ -25,7 +25,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun import DxlrunError, InputError
-from dxlrun.remote.network.listener import Listener
+from dxlrun.remote.network.listener import Listener, in_url
 from dxlrun_view.actions import Action, act
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.shown import LiveEvent, Shown, Source
@@ -220,7 +220,7 @@ def hosts_of(address: str, port: int) -> tuple[str, ...]:
     if address == ANY:
         names.append(socket.gethostname())
         names += [str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
-    return tuple(f"{name}:{port}" for name in dict.fromkeys([*names, address]))
+    return tuple(f"{in_url(name)}:{port}" for name in dict.fromkeys([*names, address]))
 
 
 class Server(uvicorn.Server):

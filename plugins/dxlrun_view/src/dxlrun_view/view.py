@@ -51,16 +51,16 @@ def view(
     if port is not None and not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port is a number up to 65535")
     leave_real_time()
-    from dxlrun.remote.network.listener import listening
+    from dxlrun.remote.network.listener import in_url, listening
     from dxlrun_view.server import ANY, PORT, Page, hosts_of, server_of
 
     source = _source(what)
     try:
         with listening(listen, port, PORT) as listener:
             address, taken = listener.getsockname()[:2]
-            address = "127.0.0.1" if address == ANY else f"[{address}]" if ":" in address else address
             page = Page(source, listener, hosts=hosts_of(listen, taken), control=control)
-            url = f"http://{address}:{taken}/?token={page.token}"
+            host = in_url("127.0.0.1" if address == ANY else address)
+            url = f"http://{host}:{taken}/?token={page.token}"
             server = server_of(page)
 
             def end(number: int, frame: FrameType | None) -> None:

@@ -74,6 +74,11 @@ class Listener(socket.socket):
         self._unproved.pop((peer[0], peer[1]), None)
 
 
+def in_url(host: str) -> str:
+    """Return a host as a URL has it: an address of IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
 def listening(host: str, port: int | None, usual: int) -> Listener:
     """Return a listening socket; without a port on the usual one, or if that is taken on any.
 
