@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -33,6 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--logs", type=int, default=100)
     count = parser.parse_args().logs
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # else the server shows each request
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         (place / "logs").mkdir()
