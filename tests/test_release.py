@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import email
 import importlib
-import importlib.util
 import re
 import shutil
 import subprocess
@@ -18,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from tests.kit.loaded import loaded
 
 ROOT = Path(__file__).parents[1]
 OBJECTS = {
@@ -46,12 +46,7 @@ VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["versi
 def release() -> ModuleType:
     for module in ("ziglang", "twine"):
         importlib.import_module(module)
-    spec = importlib.util.spec_from_file_location("release_of_dxlrun", ROOT / "release/build.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(ROOT / "release/build.py")
 
 
 def tree(place: Path, umask: int = 0o022) -> Path:

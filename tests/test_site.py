@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import http.server
-import importlib.util
 import re
 import threading
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from types import ModuleType
 
 import pytest
 from tests.kit.browser import CHROMIUM, Browser
+from tests.kit.loaded import loaded
 
 import dxlrun
 from dxlrun.cli.verbs import names as names_of_verbs
@@ -23,12 +23,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def site() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("site_of_dxlrun", ROOT / "docs/site.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(ROOT / "docs/site.py")
 
 
 @pytest.fixture(scope="module")

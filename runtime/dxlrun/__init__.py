@@ -10,7 +10,8 @@ from importlib import import_module
 
 with open(f"{__file__.rpartition('.')[0]}.pyi", encoding="utf-8") as _names:
     _HOME = {_line.split()[-1]: _line.split()[1] for _line in _names if _line.startswith("from ")}
-__all__ = sorted(_HOME, key=lambda name: (not name.isupper(), name))  # noqa: PLE0605  a list it is
+del _names
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> object:

@@ -25,9 +25,12 @@ import tempfile
 import time
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from tests.kit.loaded import loaded
+
 HERE = Path(__file__).parents[2]
-sys.path.insert(0, str(HERE / "release"))
-from build import build  # noqa: E402  it lies beside, and is no package
+build = loaded(HERE / "release/build.py").build
 
 PLATFORMS = ("manylinux_2_17_aarch64", "manylinux2014_aarch64", "manylinux_2_28_aarch64")
 BINFMT = Path("/proc/sys/fs/binfmt_misc")

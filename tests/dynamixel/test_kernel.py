@@ -1,7 +1,6 @@
 """The compiled kernel does what the parser does, whatever arrives; and what it promises by itself."""
 
 import ctypes
-import importlib.util
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ from threading import Thread
 
 import numpy as np
 import pytest
+from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
@@ -377,9 +377,7 @@ def answer(terminal, size, replies):
 @pytest.fixture
 def build(tmp_path, monkeypatch):
     """The build, in a folder that has the sources."""
-    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded(ROOT / "hatch_build.py")
     for source in module.SOURCES:
         (tmp_path / "runtime" / source).parent.mkdir(parents=True)
         shutil.copy(ROOT / "runtime" / source, tmp_path / "runtime" / source)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,12 @@ from dxlrun_foxglove.command import foxglove
 
 
 @pytest.fixture(autouse=True)
-def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No robot runs; what is refused leaves this process its share of the processor."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    before = os.nice(0)
+    yield
+    assert os.nice(0) == before
 
 
 def test_the_network_is_served_with_tls_alone() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, Flag, check_report, write_report
+from dxlrun.cli.inputs import DebugFlag, JsonOfItsOwn, check_report, write_report
 from dxlrun.errors import InputError, LogError, counted, missing_extra
 from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
@@ -36,7 +36,7 @@ def analyze(
     *logs: Annotated[Path, Parameter(name="log", converter=_log)],
     report: Path | None = None,
     worst: int = 0,
-    as_json: Annotated[Flag, Parameter(name="--json")] = False,
+    as_json: JsonOfItsOwn = False,
     debug: DebugFlag = False,
 ) -> int:
     """Analyze a log: latency, duration of each step, skipped periods, packets and errors per servo.

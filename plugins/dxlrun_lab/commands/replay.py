@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag, parse_assignments
+from dxlrun.cli.inputs import AssignmentOfItsOwn, DebugFlag, JsonFlag, parse_assignments
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import print_warning, show, show_json
 from dxlrun_lab.commands.on_robot import Chosen
@@ -26,7 +26,7 @@ Settings = Annotated[
 def replay(
     log: Path,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: AssignmentOfItsOwn,
     settings: Settings = (),
     played_on: PlayedOn = NOWHERE,
     part: RecordedPart = ALL_OF_IT,

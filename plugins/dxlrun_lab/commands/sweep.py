@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import (
+    AssignmentOfItsOwn,
     DebugFlag,
     JsonFlag,
     Motions,
@@ -41,7 +42,7 @@ _MOST_DRAWN = 2
 def sweep(
     robot: Path,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: AssignmentOfItsOwn,
     play: Motions = (),
     over: Ranges = (),
     sort: By = "rms",

@@ -23,17 +23,18 @@ if TYPE_CHECKING:
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 """An option without a value."""
-JsonFlag = Annotated[Flag, Parameter(name="--json", help="Print the result as JSON.")]
-"""`--json`."""
+JsonOfItsOwn = Annotated[Flag, Parameter(name="--json")]
+JsonFlag = Annotated[JsonOfItsOwn, Parameter(help="Print the result as JSON.")]
+"""`--json`; `JsonOfItsOwn` where the docstring of a verb tells more of it."""
 DebugFlag = Annotated[Flag, Parameter(help="Print the traceback of an error.")]
 """`--debug`."""
 RobotPath = Annotated[Path, Parameter(help="The robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, where several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
 """Motion files; the option may be given several times."""
+AssignmentOfItsOwn = Annotated[str, Parameter(name="arg:=value")]
 Assignment = Annotated[
-    str,
-    Parameter(name="arg:=value", help="Arguments of the robot file, for example port:=/dev/ttyUSB0."),
+    AssignmentOfItsOwn, Parameter(help="Arguments of the robot file, for example port:=/dev/ttyUSB0.")
 ]
 """An argument of the robot file."""
 

@@ -11,7 +11,7 @@ import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from dxlrun.cli.inputs import Flag, check_ledger, compiled, leave_real_time
+from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, check_ledger, compiled, leave_real_time
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
     Mistakes,
@@ -44,7 +44,7 @@ Seed = Annotated[int, Parameter(show_default=False)]
 def sim(
     robot: Path | None = None,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: AssignmentOfItsOwn,
     servo: Words = (),
     baud: int | None = None,
     protocol: float | None = None,
@@ -58,7 +58,7 @@ def sim(
     split: Split | None = None,
     echo: Flag = False,
     absent: Absent | None = None,
-    as_json: Annotated[Flag, Parameter(name="--json")] = False,
+    as_json: JsonOfItsOwn = False,
     debug: Flag = False,
 ) -> int:
     """Serve simulated servos on pseudo-terminals: for any program that speaks Dynamixel, until Ctrl-C.
