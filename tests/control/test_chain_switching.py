@@ -7,7 +7,7 @@ import pytest
 from tests.kit.loops import PERIOD_NS, Robot, on_update
 
 from dxlrun.channels.answers import Code, Done, Waiting
-from dxlrun.channels.cycle import Clamp
+from dxlrun.channels.cycle import Clamp, Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import ControllerFault
 
@@ -92,6 +92,12 @@ def test_three_in_a_chain_enter_from_the_bottom_and_leave_from_the_top(story, ac
     story.three(active=active).run(4, {} if active else {1: story.switches(["top"])})
     assert story.order("activate") == ["lower", "middle", "top"]
     assert story.order("deactivate") == ["top", "middle", "lower"]
+
+
+def test_run_ends_with_upper_controllers_first_and_the_last_in_the_file_before_others(story):
+    story.controller("upper", joints=("j0",), **UPPER).controller("lower", joints=("j0",), **LOWER)
+    story.controller("beside", joints=("j1",)).run(4)
+    assert story.order("deactivate") == ["beside", "upper", "lower"]
 
 
 @pytest.mark.parametrize(
@@ -275,6 +281,20 @@ def test_which_fallback_takes_over_in_a_chain_of_three(broken, fallbacks, others
     assert left is None or story.order("deactivate")[: len(left)] == left
 
 
+@pytest.mark.parametrize("limp", [["j0"], ["j0", "j1"]])
+def test_fallback_of_a_limp_joint_leaves_the_fault_to_the_next_fallback_or_to_the_policy(limp):
+    story = Story(joints=3).controller("lower", joints=("j2",), fallback="near", **LOWER)
+    story.controller("upper", joints=("j2",), fallback="far", **UPPER)
+    story.controller("near", joints=("j0",), **OFF).controller("far", joints=("j1",), **OFF).build()
+    for joint in limp:
+        story.record.states.torque[story.names.index(joint)] = Torque.OFF
+    story.run(8, {3: story.breaks("lower")})
+    refused = [text.split(";")[0] for text in story.events.texts(EventCode.COMMAND_REFUSED)]
+    both = ["near does not take over: j0 has no torque", "far does not take over: j1 has no torque"]
+    assert refused == both[: len(limp)]
+    story.ends(*(["far"] if len(limp) == 1 else []), reason="ended" if len(limp) == 1 else "fault")
+
+
 def test_a_lower_end_that_fails_to_activate_keeps_the_upper_one_out(story):
     story.chain(active=False, fallback="still").controller("still", **OFF)
     story.breaks("lower", "activate")()
@@ -378,6 +398,15 @@ def test_while_a_chain_waits_neither_end_can_be_taken_from_the_other():
     assert story.answer(2)[0] == Code.COMMANDED
     assert story.answer(3) == (Code.NOT_ACTIVE_YET, {"controller": "lower"})
     assert story.active(13) == ["lower", "upper", "second"]
+
+
+def test_waiting_chain_can_be_restarted_as_a_whole():
+    story, both = effort_chain(4), ["lower", "upper"]
+    story.run(14, {2: story.switches(["upper"], ["direct"]), 4: story.switches(both, both)})
+    assert story.answer(1) == (Code.SWITCHED_AGAIN, {"controller": "lower"})
+    assert isinstance(story.answer(2), Done)
+    assert story.active(13) == both
+    assert story.order("activate") == ["direct", *both]
 
 
 def test_a_chain_whose_modes_do_not_come_is_given_up_as_a_whole():

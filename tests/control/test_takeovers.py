@@ -147,6 +147,18 @@ def test_joints_in_another_mode_come_first(story):
     assert story.hardware.asked[-1] == [Mode.EFFORT] * 2
 
 
+def test_takeover_over_a_lower_controller_that_waits_for_its_mode_is_refused(story):
+    story.controller("soft", 0.0, command=("effort",), reference=("position",), **SPARE)
+    story.controller("safe", 0.5, into=("soft",), **SPARE)
+    story.controller("watch", None, falls, joints=(), command=(), takeovers=("safe",)).build()
+    story.hardware.mode_cycles = lambda: 4
+    story.run(10, {2: story.switches(["soft"])})
+    why = "takeover by safe refused: soft is not active yet: its joints change their modes"
+    assert story.events.texts(EventCode.COMMAND_REFUSED) == [f"{why} (requested because of it falls)"]
+    assert story.active(9) == ["soft", "watch"]
+    assert story.order("activate") == ["watch", "soft"]
+
+
 def test_a_controller_ends_the_run_by_the_policy_for_faults(story):
     story.controller("walk", 0.1).watched(lambda context: context.end_run("the battery is empty"))
     assert story.result.reason == "fault"
