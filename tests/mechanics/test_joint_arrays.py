@@ -195,6 +195,15 @@ def test_nothing_moves_at_the_start_and_servos_that_disagree_a_little_are_brough
     assert arrays.servo_goals.position[1:3] == pytest.approx([0.22, 0.22])
 
 
+def test_wrist_that_was_limp_at_the_start_gets_the_goal_of_its_joints(arrays: JointArrays) -> None:
+    arrays.servo_goals.position[:] = [0.1, 0.2, 0.2, 0.0, math.nan, math.nan]
+    arrays.begin()
+    assert np.isnan(arrays.goals.position[[PITCH, ROLL]]).all()
+    arrays.goals.position[[PITCH, ROLL]] = 0.5, 0.2
+    arrays.write()
+    assert arrays.servo_goals.position[4:6] == pytest.approx([0.7, 0.3])
+
+
 def test_three_servos_on_one_joint_disagree_by_the_largest_difference() -> None:
     third = 1 / 3
     coupling = CouplingPlan(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
+from msgspec.structs import replace
 from tests.kit.rigs import Events
 
 from dxlrun.channels.cycle import Commands, States, Torque
@@ -24,6 +26,7 @@ class Servos:
     def __init__(self) -> None:
         self.switched: list[tuple[int, bool]] = []
         self.done: list[Callable[..., None]] = []
+        self.rows: list[int] = []  # servos whose registers were requested
 
     def read(self) -> None:
         pass
@@ -33,7 +36,15 @@ class Servos:
         self.done.append(done)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+        self.rows.append(row)
         self.done.append(done)
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        self.rows.append(row)
+        self.done.append(done)
+
+    def write(self) -> None:
+        pass
 
 
 class Joints:
@@ -45,8 +56,8 @@ class Joints:
         arrays.servo_states.motion[:], arrays.servo_states.valid[:] = 0.0, True
         self.torque[:], arrays.servo_states.mode[:] = Torque.ON, Mode.POSITION
         self.servos, self.events = Servos(), Events()
-        together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, self.events)
-        self.hardware = JointHardware(self.servos, plan.mechanics, arrays, together, 20_000_000)
+        self.together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, self.events)
+        self.hardware = JointHardware(self.servos, plan.mechanics, arrays, self.together, 20_000_000)
         self.answers: list[str] = []
 
 
@@ -64,6 +75,14 @@ def test_a_servo_without_torque_takes_it_from_its_partner_once(joints: Joints, p
     ((name, text),) = joints.events.of(EventCode.TORQUE_OFF)
     assert name == "hip"
     assert "ID 2 on bus main has no torque, so ID 3 on bus main loses its own" in text
+
+
+@pytest.mark.parametrize("partner", [Torque.LOST, Torque.REBOOTING, Torque.UNKNOWN])
+def test_partner_without_certain_torque_is_not_switched_off(joints: Joints, partner: Torque) -> None:
+    joints.torque[HIP_SERVOS] = Torque.OFF, partner
+    joints.hardware.read()
+    assert joints.servos.switched == []
+    assert not joints.events.of(EventCode.TORQUE_OFF)
 
 
 def test_it_does_so_while_another_mechanism_is_switched(joints: Joints) -> None:
@@ -91,6 +110,69 @@ def test_a_register_is_answered_with_what_any_servo_refused(
     for done, problem, value in zip(joints.servos.done, problems, (7, 8), strict=True):
         done(problem, value)
     assert found == [("".join(problems), 7)]
+
+
+@pytest.mark.parametrize("first", [7, 8])
+def test_servos_of_a_joint_that_differ_in_a_register_are_named_with_their_values(
+    joints: Joints, first: int
+) -> None:
+    found: list[tuple[str, int | None]] = []
+    joints.hardware.read_register(HIP, "led", lambda *answer: found.append(answer))
+    assert joints.servos.rows == HIP_SERVOS
+    for done, value in zip(joints.servos.done, (first, 8), strict=True):
+        done("", value)
+    differ = f"its servos differ: ID 2 on bus main has {first}, ID 3 on bus main has 8"
+    assert found == [(differ if first != 8 else "", first)]
+
+
+@pytest.mark.parametrize("servo", range(6))
+def test_row_after_the_joints_is_the_register_of_a_single_servo(joints: Joints, servo: int) -> None:
+    found: list[tuple[str, int | None]] = []
+    joints.hardware.read_register(5 + servo, "led", lambda *answer: found.append(answer))
+    joints.hardware.set_register(5 + servo, "led", 1, lambda *answer: found.append(answer))
+    assert joints.servos.rows == [servo, servo]
+    for done in joints.servos.done:
+        done("", 3)
+    assert found == [("", 3), ("", 3)]
+
+
+def test_start_offset_of_two_servos_is_gone_after_one_second_of_writes(joints: Joints) -> None:
+    goals = joints.arrays.servo_goals.position
+    goals[:] = 0.0
+    goals[HIP_SERVOS] = 0.20, 0.24
+    joints.arrays.begin()
+    joints.arrays.servo_states.mode[:] = Mode.POSITION
+    spread = []
+    for _ in range(50):  # 20 ms each
+        joints.hardware.write()
+        spread.append(goals[2] - goals[1])
+    assert spread[24] == pytest.approx(0.02)
+    assert spread[49] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("limp", [(1,), (2,), (1, 2)])
+def test_joint_gets_no_torque_at_the_start_outside_its_limits_unless_all_its_servos_are_to_be_limp(
+    plan: Callable[..., Plan], limp: tuple[int, ...]
+) -> None:
+    made = plan()
+    (bus,) = made.buses
+    servos = tuple(replace(one, torque_at_start=one.row not in limp) for one in bus.servos)
+    joints = Joints(replace(made, buses=(replace(bus, servos=servos),)))
+    joints.arrays.servo_states.position[HIP_SERVOS] = 2.0
+    found = [text.split(":")[0] for text in joints.together.at_start()]
+    outside = "hip (ID 2 and 3 on bus main) stands at 114.6 deg, outside its limits -60.0 deg..60.0 deg"
+    assert found == [outside] * (len(limp) == 1)
+
+
+@pytest.mark.parametrize(("ticks", "fits"), [(0.9, True), (1.1, False)])
+def test_joint_of_unlike_servos_may_stand_a_tick_of_the_coarser_one_beyond_its_limits(
+    plan: Callable[..., Plan], ticks: float, fits: bool
+) -> None:
+    first = ("XM430-W350, reference: 180 deg, direction: 1,", "XL430-W250, reference: 180 deg, direction: 1,")
+    second = ("{id: 3, direction: -1}", "{id: 3, model: XL-320, reference: 150 deg}")
+    joints = Joints(plan(first, second))
+    joints.arrays.servo_states.position[HIP_SERVOS] = math.radians(60 + ticks * 300 / 1023)
+    assert (joints.together.at_start() == []) is fits
 
 
 @pytest.mark.parametrize("position", [2.0, -2.0])
