@@ -123,6 +123,20 @@ def test_what_refuses_nothing_is_reported(protocol, change, sentence):
     assert sentence in text
 
 
+@pytest.mark.parametrize(("raw", "refused", "reported"), [(1, 1, 0), (2, 0, 1), (3, 1, 1)])
+def test_each_bit_of_startup_configuration_counts_beside_the_other(raw, refused, reported):
+    found = look(2.0, {"startup_configuration": raw})
+    assert ["torque on by itself" in text for text in found.problems] == [True] * refused
+    texts = [text for _, text in found.texts(EventCode.REGISTER_DIFFERS)]
+    assert ["RAM comes from the backup" in text for text in texts] == [True] * reported
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_any_bit_of_hardware_error_status_refuses_the_servo(bit):
+    (problem,) = look(2.0, {"hardware_error_status": 1 << bit}).problems
+    assert "Hardware Error Status (70): " in problem
+
+
 def test_a_servo_with_torque_is_accepted_when_the_robot_is_taken_over():
     assert look(2.0, {"torque_enable": 1}, take_over=True).problems == []
 

@@ -286,6 +286,20 @@ def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset(s
     assert servo.registers["bus_watchdog"] == 10
 
 
+@pytest.mark.parametrize("ratio", [0.25, 3.0])
+def test_shaft_of_a_geared_servo_returns_at_the_speed_of_any_other(ratio):
+    rig = start_rig(arm(ratio=ratio, lower=-2.5 * ratio, upper=2.5 * ratio))
+    servo = rig.servo(12)
+    rig.goals.position[:], rig.goals.velocity[:] = 2.0 * ratio, 0.2 * ratio
+    rig.cycles(5)
+    servo.silence()
+    rig.cycles(5)
+    trip(servo)
+    servo.silence(False)
+    rig.goals.velocity[:] = 10.0 * ratio
+    assert fastest(rig, servo, 100) == pytest.approx(RETURN_SPEED, rel=0.1)
+
+
 def test_a_lost_servo_that_its_watchdog_stopped_comes_back():
     rig = start_rig(every_servo(arm(), torque_on_return=True))
     with rig.away(13, 30) as servo:

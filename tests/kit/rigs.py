@@ -308,6 +308,7 @@ def make_plan(
             upper=change.get("upper", MIDDLE),
             continuous=change.get("continuous", False),
             start_mode=change.get("start_mode"),
+            ratio=change.get("ratio", 1.0),
         )
         for index, servo_id in enumerate(ids)
     ]
