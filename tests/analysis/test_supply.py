@@ -38,7 +38,9 @@ def read(volts: Floats) -> Floats:
     return held
 
 
-def findings(volts: Floats, errors: int | list[int] = 0, heat: float = 30.0) -> list[tuple[str, str, str]]:
+def findings(
+    volts: Floats, errors: int | list[int] = 0, heat: float = 30.0, model: str = "XM430-W350"
+) -> list[tuple[str, str, str]]:
     kinds = [(name, np.float64, COUNT) for name in ("temperature", "voltage", "effort")]
     cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds, ("hardware_error", np.uint8, COUNT)])
     cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
@@ -52,7 +54,7 @@ def findings(volts: Floats, errors: int | list[int] = 0, heat: float = 30.0) -> 
             metadata={},
             cycles=cycles[begin : begin + 300],
             joints=names,
-            attachments={"plan.json": json.dumps(PLAN).encode()},
+            attachments={"plan.json": json.dumps(PLAN).replace("XM430-W350", model).encode()},
         )
         trends.take(part)
     return [(one.code, one.subject, one.sentence) for one in trends.findings([])]
@@ -146,3 +148,18 @@ def test_a_voltage_that_most_servos_report_is_that_of_their_bus() -> None:
 def test_a_temperature_that_no_servo_has_is_its_sensors(heat: float, code: str) -> None:
     ((found, subject, _),) = findings(volts(), heat=heat)
     assert (found, subject) == (code, "j1")
+
+
+ERRORS = {  # e-Manual, Shutdown of each model, and Error Code (153) of the Y series
+    "XM430-W350": (12.0, {0x01: "undervoltage", 0x04: "hot_joint", 0x20: "overload", 0x10: None}),
+    "XL-320": (7.5, {0x01: "overload", 0x02: "hot_joint", 0x04: "undervoltage"}),
+    "YM070-210-M001": (24.0, {2: "undervoltage", 3: "hot_joint", 4: "hot_joint", 5: "overload", 13: None}),
+}
+
+
+@pytest.mark.parametrize("model", ERRORS)
+def test_a_hardware_error_is_what_the_model_means_by_it(model: str) -> None:
+    supply, expected = ERRORS[model]
+    for value, code in expected.items():
+        told = [one[:2] for one in findings(volts(None, 12.0 - supply), errors=value, model=model)]
+        assert told == ([] if code is None else [(code, "j1")]), value

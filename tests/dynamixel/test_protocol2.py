@@ -184,8 +184,6 @@ def test_an_error_number_is_a_refusal_and_the_alert_bit_alone_is_not():
     assert "alert" in p2.describe_error(0x80)
     assert p2.describe_error(0x84) == f"{p2.describe_error(0x80)}; {p2.describe_error(4)}"
     assert p2.describe_error(0) == "no error"
-    assert p2.describe_hardware_error(0x24) == "overheating error; overload error"
-    assert p2.describe_hardware_error(0) == "no hardware error"
 
 
 def test_reads_of_several_servos_take_the_shorter_packet():

@@ -8,7 +8,6 @@ from unittest.mock import ANY
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.simulation.servo.protocol2_servo import HardwareError
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 0x10
@@ -124,7 +123,7 @@ def test_overload_latches_until_a_reboot(line2):
     line2.set("torque_enable", 1)
     line2.servo().trigger_overload()
     answer = line2.request(1, READ, b"\x46\x00\x01\x00")
-    assert answer == (1, ALERT, bytes((HardwareError.OVERLOAD,)))
+    assert answer == (1, ALERT, bytes((0x20,)))
     assert line2.get("torque_enable") == 0
     assert line2.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
     line2.set("goal_position", 1000)
@@ -164,7 +163,7 @@ def test_what_shutdown_does_not_list_is_only_reported(line2):
     line2.put(shutdown=0, torque_enable=1)
     line2.servo().set_temperature(81)
     assert line2.request(1, PING).error == ALERT
-    assert line2.get("hardware_error_status") == HardwareError.OVERHEATING
+    assert line2.get("hardware_error_status") == 0x04
     assert line2.get("torque_enable") == 1
     line2.servo().set_temperature(40)
     assert line2.request(1, PING).error == 0
@@ -173,7 +172,7 @@ def test_what_shutdown_does_not_list_is_only_reported(line2):
 def test_voltage_is_watched_and_shown(line2):
     line2.servo().set_voltage(9.0)
     assert line2.get("present_input_voltage") == 90
-    assert line2.get("hardware_error_status") == HardwareError.VOLTAGE
+    assert line2.get("hardware_error_status") == 0x01
 
 
 def test_an_xl320_orders_its_hardware_errors_otherwise(make_line2):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.control_table import ControlTable, Fault, HardwareErrors, control_table
 from dxlrun.log.reader import Log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
@@ -44,6 +44,14 @@ class PlannedJoint:
     softness: float = 1.0  # So many times lower than its model's is the gain in the robot file, from 1 to 3
     alike: str = ""  # Models and registers: joints that have the same ones follow alike
     logged: JointPlan = UNKNOWN_JOINT
+    errors: tuple[HardwareErrors, ...] = ()  # Of the models of its servos, each once
+
+    def faults(self, value: int) -> frozenset[Fault]:
+        """Return the faults that a value of `hardware_error` reports.
+
+        The value of a joint with servos of several models is ambiguous: a fault of any of them counts.
+        """
+        return frozenset(fault for errors in self.errors for fault in errors.faults(value))
 
 
 def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
@@ -77,18 +85,26 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 max(_softness(one) for one in mine),
                 ", ".join(sorted(f"{one.servo.model} {one.servo.registers}" for one in mine)),
                 joint,
+                tuple({one.servo.model: table.errors for one in mine if (table := _table(one))}.values()),
             )
         )
     return tuple(found)
 
 
+def _table(one: Mover) -> ControlTable | None:
+    try:
+        return control_table(one.servo.model, one.bus.protocol)
+    except LookupError:  # a plug-in's model that is not installed here
+        return None
+
+
 def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: bool = False) -> float:
     """Return the first register that the robot file declares, or `shipped` the model, in its unit."""
     declared = {each.name: each.value for each in one.servo.registers}
-    try:
-        items = control_table(one.servo.model, one.bus.protocol).items
-    except LookupError:  # a plug-in's model that is not installed here
+    table = _table(one)
+    if table is None:
         return otherwise
+    items = table.items
     for name in names:
         value = declared.get(name, items[name].initial if shipped and name in items else None)
         if value:

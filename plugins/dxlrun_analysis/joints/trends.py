@@ -2,9 +2,8 @@
 
 What they show: a joint that gets hot or is overloaded, and a supply that is too high, too low or sags under
 load: that of the bus, where the voltages of most servos fall together, or of one servo, where the others
-stay. Limits are those of the models' control tables as shipped, or of the robot file's `registers`. Bits of
-the hardware error: ROBOTIS e-Manual, Protocol 2.0, Hardware Error Status (70); Protocol 1.0, Error of the
-status packet.
+stay. Limits are those of the models' control tables as shipped, or of the robot file's `registers`; a control
+table also has the meaning of hardware errors.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
+from dxlrun.dynamixel.control_table import Fault
 from dxlrun.log.reader import Log
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins, Series
@@ -28,7 +28,6 @@ Numbers = NDArray[np.int64]
 
 _QUANTITIES = ("temperature", "voltage", "effort")
 
-_VOLTAGE, _HEAT, _OVERLOAD = 0x01, 0x04, 0x20
 _NONSENSE_C = 120.0
 _NEAR_LIMIT_C = 10.0  # The run warns at this distance from Temperature Limit, too
 _SAG = 0.03  # Part of its voltage by which a supply that sags falls
@@ -69,7 +68,7 @@ class Trends:
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
         self._bins = Bins()
-        self._errors = np.zeros(0, np.int64)
+        self._faults: list[set[Fault]] = []  # Of each joint
         self._volts = np.zeros(0)
         self._samples: list[_Sample] = []
 
@@ -81,11 +80,13 @@ class Trends:
         if not self._bins.begin_ns:
             self._joints = planned_joints(log)
             self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
-            self._errors = np.zeros(len(log.joints), np.int64)
+            self._faults = [set() for _ in log.joints]
             self._volts = np.full(len(log.joints), np.nan)
         values = [np.abs(cycles[name]) if name == "effort" else cycles[name] for name in _QUANTITIES]
         self._bins.take(cycles["read_ns"], np.array(values))
-        self._errors |= np.bitwise_or.reduce(cycles["hardware_error"], axis=0).astype(np.int64)
+        for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
+            for value in np.unique(values).tolist():
+                faults.update(joint.faults(value))
         self._supply(cycles)
 
     def _supply(self, cycles: NDArray[np.void]) -> None:
@@ -141,7 +142,7 @@ class Trends:
     def _joint(
         self, index: int, joint: PlannedJoint, coldest: float, hottest: float, *, moves_badly: bool
     ) -> Iterable[Finding]:
-        error = int(self._errors[index])
+        faults = self._faults[index]
         where = f"{joint.name} ({joint.servos})"
         if hottest - coldest > _NONSENSE_C or hottest > _NONSENSE_C:
             yield cause(
@@ -152,8 +153,8 @@ class Trends:
             )
             return
         limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
-        if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
-            shut = ", and reported overheating" if error & _HEAT else ""
+        if "overheating" in faults or hottest >= joint.hottest - _NEAR_LIMIT_C:
+            shut = ", and reported overheating" if "overheating" in faults else ""
             measured = f"was hot, at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
             yield cause(
                 "hot_joint",
@@ -161,7 +162,7 @@ class Trends:
                 f"{where} {measured}{shut}.",
                 "Let it cool; give it less load, pauses or air, and look for what makes it work at rest.",
             )
-        if error & _OVERLOAD and not moves_badly:
+        if "overload" in faults and not moves_badly:
             yield cause(
                 "overload",
                 joint.name,
@@ -174,7 +175,7 @@ class Trends:
     ) -> Iterable[Finding]:
         """Name the supply of a bus or of one servo; voltages in shape (bins, members)."""
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
-        reported = self._errors[members] & _VOLTAGE != 0
+        reported = np.array(["voltage" in self._faults[index] for index in members])
         joints = [self._joints[index] for index in members]
         above = highest > np.array([joint.highest_volts for joint in joints]) + _STEP_V / 2
         if 2 * above.sum() > len(members):
@@ -250,7 +251,7 @@ class Trends:
         loads = [[one.load for one in mine if (one.volts < level) == low] for low in (True, False)]
         falls = np.count_nonzero(dips[1:] & ~dips[:-1])
         loaded = falls > 1 and all(loads) and np.mean(loads[0]) > _LOADED * np.mean(loads[1])
-        if self._errors[index] & _VOLTAGE and not loaded:
+        if "voltage" in self._faults[index] and not loaded:
             return None
         return cause(
             "own_supply",

@@ -143,7 +143,7 @@ def _cycle_text() -> str:
         "# effort: Nm, A or the fraction of maximum; pwm: fraction of the full voltage; deg C, V.",
         "# NaN = not known or not commanded. active, published: bit i is controller i. clamped:",
         "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite, 32 effort, 64 pwm, 128 outward.",
-        "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
+        "# hardware_error: of the model's error item, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
         "# reference: in the order of the metadata's references. torque: 0 not known, 1 on, 2 in doubt,",
         "# 3 off, 4 switched off on request, 5 lost, 6 reboots on request. source_state, device_command:",

@@ -155,7 +155,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
     goal: GoalLayout
     torque_address: int  # Where torque enable stands, one byte
     hardware_error_address: int | None
-    """Where hardware error status stands, one byte; None where the model has none."""
+    """Address of the byte that reports hardware errors; None in Protocol 1.0, whose replies contain them."""
     torque_limit: TorqueLimit | None = None  # None where the model has none that limits position control
     registers: tuple[RegisterValue, ...] = ()
     """What the robot file declares, in the order in which it is written: EEPROM first."""

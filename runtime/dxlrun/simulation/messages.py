@@ -35,7 +35,7 @@ class ServoLook(msgspec.Struct, frozen=True):
     present: float  # rad
     temperature: float  # degrees C
     voltage: float  # V
-    error: int  # that stands: the error byte (Protocol 1.0), hardware error status (Protocol 2.0)
+    error: int  # present error: the error byte (Protocol 1.0), or the value of the error item
     heard: int  # instruction packets to it since the start
     answered: int  # status packets from it since the start
 

@@ -242,7 +242,7 @@ def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
             present=servo.position,
             temperature=servo.temperature,
             voltage=servo.voltage,
-            error=servo.registers.get("hardware_error_status", servo.counts.last_error),
+            error=servo.registers.get(servo.registers.table.errors.item, servo.counts.last_error),
             heard=servo.counts.received,
             answered=servo.counts.replied,
         )

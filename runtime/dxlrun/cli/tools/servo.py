@@ -19,7 +19,7 @@ from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlItem
+    from dxlrun.dynamixel.control_table import ControlItem, ControlTable
     from dxlrun.dynamixel.control_table.device_table import DeviceTable
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -157,15 +157,19 @@ def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) 
         show_json(result | {"registers": asked.registers})
         return
     if verb == "get":
-        show(_registers(asked.registers, one.table.items))
+        show(_registers(asked.registers, one.table))
     show(*(f"{one.called}: {sentence}" for sentence in asked.done))
     if asked.declined:
         show("nothing was changed")
 
 
-def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> Table:
+def _registers(values: Mapping[str, int], table: ControlTable | DeviceTable) -> Table:
+    from dxlrun.dynamixel.control_table import ControlTable
     from dxlrun.dynamixel.servo.registers import meaning
     from dxlrun.output.table import Column, Table
+
+    items: Mapping[str, ControlItem] = table.items
+    errors = table.errors if isinstance(table, ControlTable) else None
 
     columns = [
         Column("item", "name"),
@@ -176,8 +180,9 @@ def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> T
         Column("is", "name"),
     ]
     rows = [
-        (name, items[name].address, items[name].area, items[name].access, value, meaning(items[name], value))
+        (name, item.address, item.area, item.access, value, meaning(item, value, errors))
         for name, value in values.items()
+        for item in (items[name],)
     ]
     return Table.of("", columns, rows)
 

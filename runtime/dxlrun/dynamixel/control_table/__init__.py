@@ -4,6 +4,8 @@
 Each model has a data file in `tables/`.
 """
 
+from dxlrun.dynamixel.control_table.hardware_errors import Fault as Fault
+from dxlrun.dynamixel.control_table.hardware_errors import HardwareErrors as HardwareErrors
 from dxlrun.dynamixel.control_table.models import add_control_table as add_control_table
 from dxlrun.dynamixel.control_table.models import added_control_tables as added_control_tables
 from dxlrun.dynamixel.control_table.models import all_tables as all_tables

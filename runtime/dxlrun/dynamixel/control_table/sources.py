@@ -13,6 +13,7 @@ from typing import TypeAlias, get_args, get_type_hints
 
 import msgspec
 
+from dxlrun.dynamixel.control_table.hardware_errors import STATUS_BYTE, HardwareErrors, error_item
 from dxlrun.dynamixel.control_table.table import (
     CAPABILITIES,
     DERIVED,
@@ -172,6 +173,7 @@ def build_table(data: Entry) -> ControlTable:
         max_speed_tick=(1 << SIGN_BIT) - 1 if speed.encoding == "sign_magnitude" else speed.maximum,
         effort_per_tick=by_name[effort].scale,
         effort_unit=_effort_unit(by_name[effort]),
+        errors=_hardware_errors(data, by_name),
         max_speed=_figure(data, "no_load_speed", "rad/s"),
         stall_torque=_figure(data, "stall_torque", "Nm"),
         fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
@@ -180,6 +182,21 @@ def build_table(data: Entry) -> ControlTable:
         stall_current=_figure({"stall_current": "0 A", **data}, "stall_current", "A"),
         nominal_voltage=_figure({"nominal_voltage": "0 V", **data}, "nominal_voltage", "V"),
     )
+
+
+def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareErrors:
+    """Return the errors of a model; raises ValueError for values that are not distinct bits or codes."""
+    item = error_item(items)
+    entries = section(data.get("errors", STATUS_BYTE if not item else {}))
+    values = {name: whole(entries, name) for name in entries}
+    errors = HardwareErrors(item, MappingProxyType(values))
+    for name, value in values.items():
+        if not 0 < value < 0x100 or (not errors.has_codes and value & (value - 1)):
+            kind = "a code" if errors.has_codes else "one bit"
+            raise ValueError(f"errors: {name} = {value} is not {kind} of a byte")
+    if len(set(values.values())) < len(values):
+        raise ValueError("errors: two errors have the same value")
+    return errors
 
 
 def _figure(data: Entry, key: str, unit: str) -> float:

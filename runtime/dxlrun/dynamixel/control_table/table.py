@@ -9,6 +9,8 @@ from typing import Generic, Literal, TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from dxlrun.dynamixel.control_table.hardware_errors import HardwareErrors, error_item
+
 Access = Literal["R", "RW"]
 Area = Literal["EEPROM", "RAM"]
 Encoding = Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
@@ -134,6 +136,8 @@ class ControlTable(Table[ControlItem], frozen=True, kw_only=True):
     rad_s_per_tick: float
     max_speed_tick: int  # Highest value of a goal speed without its direction
     effort_per_tick: float  # `effort_unit` per tick of `effort_item`
+    errors: HardwareErrors = HardwareErrors()
+    """Where the model reports hardware errors, and what they mean."""
     effort_unit: EffortUnit
     """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
     max_speed: float  # No-load speed, rad/s, at `nominal_voltage`
@@ -162,7 +166,7 @@ CAPABILITIES: Mapping[str, str] = {
     "bulk_write": "bulk write",
     "fast_sync_read": "fast sync read and fast bulk read, from `fast_sync_read_firmware` on",
     "indirect": "indirect addresses",
-    "hardware_error": "hardware error status, and the alert bit in its replies",
+    "hardware_error": "hardware error status or error code, and the alert bit in its replies",
     "operating_mode": "operating modes chosen by an item instead of by the angle limits",
     "posvel": "goal speed and goal position stand side by side: one write sets both",
     "reboot": "the reboot instruction",
@@ -182,7 +186,7 @@ def derived_capabilities(
     """Return the capabilities that follow from which items there are and where they stand."""
     has = {
         "operating_mode": "operating_mode" in items or "control_mode" in items,
-        "hardware_error": "hardware_error_status" in items,
+        "hardware_error": error_item(items) != "",
         "indirect": "indirect_address_1" in items,
         "posvel": len(side_by_side((items[goal_speed], items["goal_position"]))) == 1,
         "state_block": len(side_by_side(items[name] for name in (effort, present_speed, "present_position")))

@@ -173,7 +173,7 @@ def _servo(joint: Wiring) -> ServoPlan:
     # inwards, so that no goal is outside; 1e-6 ticks forgive the rounding of degrees
     lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
     upper = math.floor(min(ends[1], reach[1]) + 1e-6)
-    hardware_error = table.items.get("hardware_error_status")
+    hardware_error = table.items.get(table.errors.item)
     # a torque in Nm is the joint's; a current or a share of the maximum remains what the servo has
     effort = 1.0 / joint.ratio if table.effort_unit == "Nm" else 1.0
     modes = tuple(

@@ -15,7 +15,7 @@ import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, decoded
+from dxlrun.dynamixel.control_table import ControlItem, HardwareErrors, decoded
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
@@ -23,8 +23,7 @@ from dxlrun.dynamixel.plan.reads import servo_read
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.registers import shown, tripped
-from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
-from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.wire.protocol1 import describe_error
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply
 
@@ -32,10 +31,8 @@ RETURN_ALL = 2  # Status Return Level: every instruction is answered
 PINGS = 3  # Two servos of one ID collide in most of three answers
 LISTEN_NS = 2_000_000
 """After a ping: a second servo of the same ID may answer with another return delay, at most 0.508 ms."""
-FORBIDDEN = StatusError.INPUT_VOLTAGE | StatusError.OVERHEATING | StatusError.OVERLOAD
-"""Error bits of Protocol 1.0 with which a servo gets no torque; the others concern one instruction."""
 STATUS_ERROR = "status_error"
-"""Stands in for a control item: the error byte of Protocol 1.0; in 2.0 Hardware Error Status has it."""
+"""Stands in for a control item: the error byte of Protocol 1.0; in 2.0 an item has the hardware errors."""
 
 _BLOCKS: Mapping[float, tuple[tuple[str, str], ...]] = MappingProxyType(
     {
@@ -67,6 +64,7 @@ _BLOCKS: Mapping[float, tuple[tuple[str, str], ...]] = MappingProxyType(
                 "torque_enable",
                 "status_return_level",
                 "hardware_error_status",
+                "error_code",
                 "bus_watchdog",
             )
         ),
@@ -97,6 +95,7 @@ class Inspected(msgspec.Struct, frozen=True):
     items: Mapping[str, ControlItem]
     values: Mapping[str, int]
     """By item; where the robot file declares a register, what the start will have written."""
+    errors: HardwareErrors
     take_over: bool
 
     def title(self, name: str) -> str:
@@ -184,8 +183,8 @@ def _watchdog_sentence(found: Inspected, raw: int) -> str:
 CHECKS: tuple[Check, ...] = (
     Check(
         STATUS_ERROR,
-        lambda _, error: bool(error & FORBIDDEN),
-        lambda _, error: f"reports an error: {describe_error(error & FORBIDDEN)}",
+        lambda found, error: bool(error & found.errors.mask),
+        lambda found, error: f"reports an error: {describe_error(error & found.errors.mask)}",
     ),
     Check(
         "model_number",
@@ -230,13 +229,22 @@ CHECKS: tuple[Check, ...] = (
         lambda *_: "Startup Configuration bit 1 is set: RAM comes from the backup at power-up",
         refuses=False,
     ),
+    *(
+        Check(
+            item,
+            lambda found, raw: raw != 0 and not found.errors.is_warning(raw),
+            lambda found, raw: (
+                f"reports in {found.title(found.errors.item)}: {found.errors.describe(raw)}; find the cause, "
+                "then reboot it"
+            ),
+        )
+        for item in ("hardware_error_status", "error_code")
+    ),
     Check(
-        "hardware_error_status",
-        lambda _, raw: raw != 0,
-        lambda found, raw: (
-            f"reports in {found.title('hardware_error_status')}: {describe_hardware_error(raw)}; find the "
-            "cause, then reboot it"
-        ),
+        "error_code",
+        lambda found, raw: found.errors.is_warning(raw),
+        lambda found, raw: f"reports in {found.title(found.errors.item)}: {found.errors.describe(raw)}",
+        refuses=False,
     ),
     Check(  # the start clears what an earlier run left; reported where this run arms none itself
         "bus_watchdog",
@@ -320,7 +328,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
             values[STATUS_ERROR] = reply.error
     text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
     found.note(EventCode.SETUP, Severity.INFO, servo.joint, text)
-    inspected = Inspected(plan, servo, items, values, take_over)
+    inspected = Inspected(plan, servo, items, values, one.table.errors, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
             sentence = check.sentence(inspected, values[check.item])

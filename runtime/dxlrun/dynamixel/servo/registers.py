@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import ControlItem
+from dxlrun.dynamixel.control_table import ControlItem, HardwareErrors
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.retry import ATTEMPTS
 from dxlrun.dynamixel.servo.access import Access, first_reach
@@ -110,12 +110,20 @@ def shown(item: ControlItem, raw: int) -> str:
     return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
 
 
-def meaning(item: ControlItem, value: int) -> str:
-    """Return a value of an item with its unit; empty for what has none."""
+def meaning(item: ControlItem, value: int, errors: HardwareErrors | None = None) -> str:
+    """Return a value of an item with its unit; empty for what has none.
+
+    Args:
+        errors: the model's hardware errors; None for a device.
+    """
     if tripped(item, value):
         return "tripped"
-    if not item.unit and item.encoding != "float32":
-        return ""
+    if errors is not None and item.name == errors.item:
+        return errors.describe(value)
+    return _quantity(item, value) if item.unit or item.encoding == "float32" else ""
+
+
+def _quantity(item: ControlItem, value: int) -> str:
     quantity = item.value(value.to_bytes(item.size, "little", signed=item.signed))
     if not item.unit:
         return f"{quantity:.6g}"

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.devices import Devices
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.offline import Offline
@@ -27,7 +27,6 @@ from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.errors import counted
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
@@ -54,7 +53,8 @@ class Servos:
         self._bus = idle.bus
         self._events = idle.events
         self._samples = samples
-        self._shown = states.hardware_error  # of the robot: Hardware Error Status, or the error byte of 1.0
+        self._shown = states.hardware_error  # of the robot: the model's error item, or the error byte of 1.0
+        self._hardware_errors = [control_table(servo.model, plan.protocol).errors for servo in plan.servos]
         self._rows = [servo.row for servo in plan.servos]
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count
@@ -73,6 +73,7 @@ class Servos:
         self.requests = Requests(self._offline)  # Torque and reboots that clients request
         self._slow = SlowReads(self.life, self._reboots, states)
         self._reported_errors = [0] * count  # error byte of each servo
+        self._read_errors = [0] * count  # value of each servo's error item as last read
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
         self._strained: list[int] = []  # of Protocol 1.0, servos that may have shut down
@@ -212,9 +213,9 @@ class Servos:
                 if error & ~before & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
                 elif not error & self._dialect.ALERT:
-                    self._shown[self._rows[index]] = 0
+                    self._shown[self._rows[index]] = self._read_errors[index] = 0
             else:
-                self._shown[self._rows[index]] = error & FORBIDDEN
+                self._shown[self._rows[index]] = error & self._hardware_errors[index].mask
                 if error & ~before and index not in self._strained:
                     # Shutdown (18) may list any error, and a goal that is a torque limit would revive it
                     self._strained.append(index)
@@ -348,11 +349,16 @@ class Servos:
         if not reply.answered:
             return
         self._alerts.remove(index)
-        error = reply.parameters[0]
-        if error == self._shown[self._rows[index]]:
+        value, errors = reply.parameters[0], self._hardware_errors[index]
+        if value == self._read_errors[index]:
             return
-        self._shown[self._rows[index]] = error
+        self._read_errors[index] = value
+        title = self.life.reach(index).items[errors.item].title
+        text = f"has {title} = {value}: {errors.describe(value)}"
+        if errors.is_warning(value):  # the states have none: a joint with an error gets no torque
+            self._shown[self._rows[index]] = 0
+            self.life.report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
+            return
+        self._shown[self._rows[index]] = value
         self.life.on(index, ServoEvent.DOUBT)
-        address = self._plan.servos[index].hardware_error_address
-        text = f"has Hardware Error Status ({address}) = {error}: {describe_hardware_error(error)}"
         self.life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)

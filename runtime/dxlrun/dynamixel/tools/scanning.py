@@ -15,7 +15,7 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.control_table import ControlItem, all_tables, models_by_number
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
@@ -223,8 +223,20 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     if table is None:
         remarks.append(f"no control table has its model number {number}: a plug-in can add one")
         return replace(servo, model_number=number, firmware=firmware, remarks=tuple(remarks))
+    if reply.error and (named := (yield from _hardware_error(line, servo_id, table))):
+        remarks = [named]
     servo = replace(servo, model=table.model, model_number=number, firmware=firmware, remarks=tuple(remarks))
     return (yield from _look_closer(line, table.items, servo))
+
+
+def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[str]:
+    """Read the item that reports hardware errors; return its meaning, or nothing where it reports none."""
+    item = table.items.get(table.errors.item)
+    if item is None:
+        return ""
+    reply = yield from retry(line.read(servo_id, item.address, item.size))
+    value = reply.parameters[0] if reply.answered else 0
+    return f"{item.title} is {value}: {table.errors.describe(value)}" if value else ""
 
 
 def _look_closer(line: Line, table: Mapping[str, ControlItem], servo: FoundServo) -> Program[FoundServo]:

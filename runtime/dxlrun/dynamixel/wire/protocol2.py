@@ -9,7 +9,7 @@ everything before it, stuffing included: CRC-16 of polynomial 8005, not reflecte
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from enum import IntEnum, IntFlag, unique
+from enum import IntEnum, unique
 
 from fastcrc import crc16
 
@@ -33,7 +33,7 @@ PING_LENGTH = 3  # Parameters of the answer to a ping: model number (2), firmwar
 MOST_GOAL_BYTES = 1024
 """Parameters of a sync write behind address and length: stuffed, they still fit a batch of the log."""
 STATUS = 0x55
-ALERT = 0x80  # Bit of the error byte: read Hardware Error Status; it comes with good data
+ALERT = 0x80  # Bit of the error byte: read `ControlTable.errors`; it comes with good data
 _MOST_PARAMETERS = 0xFFFF - 3
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
@@ -75,17 +75,6 @@ class ErrorNumber(IntEnum):
 
 
 @unique
-class HardwareError(IntFlag):
-    """Bits of Hardware Error Status (e-Manual XM430-W350, (70))."""
-
-    INPUT_VOLTAGE = 0x01
-    OVERHEATING = 0x04
-    ENCODER = 0x08
-    ELECTRICAL_SHOCK = 0x10
-    OVERLOAD = 0x20
-
-
-@unique
 class Reset(IntEnum):
     """What a factory reset keeps."""
 
@@ -103,31 +92,16 @@ _NUMBERS: Mapping[int, str] = {
     ErrorNumber.LIMIT: "data limit error: a written value is beyond a limit that the servo is set to",
     ErrorNumber.ACCESS: "access error: the address cannot be written or read, or EEPROM while torque is on",
 }
-_BITS: Mapping[HardwareError, str] = {
-    HardwareError.INPUT_VOLTAGE: "input voltage error",
-    HardwareError.OVERHEATING: "overheating error",
-    HardwareError.ENCODER: "motor encoder error",
-    HardwareError.ELECTRICAL_SHOCK: "electrical shock error",
-    HardwareError.OVERLOAD: "overload error",
-}
 
 
 def describe_error(error: int) -> str:
     """Return the e-Manual's words for an error byte; `no error` for 0."""
     words = []
     if error & ALERT:
-        words.append("alert: the servo has a hardware error; see Hardware Error Status")
+        words.append("alert: the servo has a hardware error")
     if number := error & ~ALERT:
         words.append(_NUMBERS.get(number, f"error number {number}, which Protocol 2.0 does not define"))
     return "; ".join(words) or "no error"
-
-
-def describe_hardware_error(status: int) -> str:
-    """Return the e-Manual's words for every bit of Hardware Error Status; `no hardware error` for 0."""
-    words = [sentence for bit, sentence in _BITS.items() if status & bit]
-    if unknown := status & ~sum(HardwareError):
-        words.append(f"bits {unknown:02x}, which the manual does not define")
-    return "; ".join(words) or "no hardware error"
 
 
 def refused(error: int, length: int, awaited: int) -> bool:

@@ -154,7 +154,7 @@ def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mappin
     """Return an item with its value as clients get it: the integer on the wire, and what it means."""
     _, table, _ = _servo(plan, name, item)
     entry = table.items[item]
-    shown = "" if value is None else meaning(entry, value)
+    shown = "" if value is None else meaning(entry, value, table.errors)
     return {"joint": name, "item": item, "title": entry.title, "area": entry.area} | {
         "value": value,
         "is": shown,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from enum import IntFlag, unique
 
 from dxlrun.dynamixel.control_table import ControlItem
 from dxlrun.simulation.motion.shaft import Shaft
@@ -23,29 +22,11 @@ TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuratio
 TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal switches the torque on
 
 
-@unique
-class HardwareError(IntFlag):
-    """Hardware Error Status (70) and Shutdown (63)."""
-
-    VOLTAGE = 0x01
-    OVERHEATING = 0x04
-    ENCODER = 0x08
-    SHOCK = 0x10
-    OVERLOAD = 0x20
-
-
 _LIMITS = frozenset(("pwm_limit", "current_limit"))
 _SPEAKS = (2, 20, 21, 22)
 """Values of Protocol Type (13) with which a servo obeys Protocol 2.0: without a remote control on the line it
 falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
 
-_XL320_BIT = {HardwareError.OVERLOAD: 0x01, HardwareError.OVERHEATING: 0x02, HardwareError.VOLTAGE: 0x04}
-"""The XL-320 orders them otherwise (e-Manual, XL-320, Shutdown (18))."""
-
-_ERROR_CODE = {HardwareError.OVERLOAD: 0x05, HardwareError.OVERHEATING: 0x04}
-_OVER_VOLTAGE, _LOW_VOLTAGE = 0x01, 0x02
-"""Error Code (153) of the Y series; the other codes are not modelled. Source: the maker's ROS package
-dynamixel_hardware_interface, ErrorCodeTable."""
 _HISTORY = 16
 _INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Controller State (152) of the Y series
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
@@ -61,9 +42,9 @@ class Protocol2Servo(SimulatedServo):
     """X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
-        self._has_error_code = "error_code" in memory
+        self._errors = memory.table.errors
+        self._has_error_code = self._errors.has_codes
         """True for the Y series, which keeps its turns without power, too."""
-        self._alarm_item = "error_code" if self._has_error_code else "hardware_error_status"
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
@@ -169,7 +150,7 @@ class Protocol2Servo(SimulatedServo):
 
     def _state(self) -> int:
         """Return the alert bit while Hardware Error Status or Error Code shows something."""
-        return ALERT if self.registers.get(self._alarm_item) else 0
+        return ALERT if self.registers.get(self._errors.item) else 0
 
     def protect(self, refused: int = 0) -> None:
         """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
@@ -178,7 +159,7 @@ class Protocol2Servo(SimulatedServo):
         if self._has_error_code:
             self._show_error_code(wrong)
         latched = registers.get("hardware_error_status") if self._shut_down else 0
-        shown = sum(_XL320_BIT[each] if "control_mode" in registers else each for each in wrong)
+        shown = 0 if self._has_error_code else sum(wrong)
         registers.show("hardware_error_status", shown | latched)
         listed = bool(wrong) if self._has_error_code else shown & registers.get("shutdown")
         if listed and not self._shut_down:
@@ -262,23 +243,24 @@ class Protocol2Servo(SimulatedServo):
         self.registers["goal_position"] = self.shaft.position_tick(angle)
         self.shaft.plan(("goal_position",))
 
-    def _wrong(self) -> tuple[HardwareError, ...]:
-        registers = self.registers
-        wrong = [HardwareError.OVERLOAD] if self.overload else []
+    def _wrong(self) -> tuple[int, ...]:
+        """Return the bits or codes of the errors whose cause is there now."""
+        registers, errors = self.registers, self._errors
+        wrong = [errors.value_of("overload")] if self.overload else []
         if "max_voltage_limit" in registers:
             volts = round(self.voltage * 10)
-            if not registers["min_voltage_limit"] <= volts <= registers["max_voltage_limit"]:
-                wrong.append(HardwareError.VOLTAGE)
+            if volts < registers["min_voltage_limit"]:
+                wrong.append(errors.value_of("low_voltage", "input_voltage"))
+            elif volts > registers["max_voltage_limit"]:
+                wrong.append(errors.value_of("over_voltage", "input_voltage"))
         limit = "motor_temperature_limit" if self._has_error_code else "temperature_limit"
         if round(self.temperature) > registers.get(limit, 255):
-            wrong.append(HardwareError.OVERHEATING)
+            wrong.append(errors.value_of("motor_overheating", "overheating"))
         return tuple(wrong)
 
-    def _show_error_code(self, wrong: tuple[HardwareError, ...]) -> None:
+    def _show_error_code(self, codes: tuple[int, ...]) -> None:
         """Show the newest error; the same one does not count twice, and the history holds the last 16."""
         registers = self.registers
-        low = round(self.voltage * 10) < registers["min_voltage_limit"]
-        codes = [_ERROR_CODE.get(each, _LOW_VOLTAGE if low else _OVER_VOLTAGE) for each in wrong]
         names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
         history = [registers[name] for name in names if registers[name]]
         for code in codes:

@@ -261,12 +261,12 @@ class Protocol1Servo(SimulatedServo):
 
     def _state(self) -> int:
         """Return the error bits that last as long as their cause."""
-        registers = self.registers
-        error = int(ErrorBit.OVERLOAD) if self.overload else 0
+        registers, errors = self.registers, self.registers.table.errors
+        error = errors.value_of("overload") if self.overload else 0
         if not registers["min_voltage_limit"] <= round(self.voltage * 10) <= registers["max_voltage_limit"]:
-            error |= ErrorBit.VOLTAGE
+            error |= errors.value_of("input_voltage")
         if round(self.temperature) > registers["temperature_limit"]:
-            error |= ErrorBit.OVERHEATING
+            error |= errors.value_of("overheating")
         return error
 
     def protect(self, refused: int = 0) -> None:

@@ -1,0 +1,78 @@
+"""Hardware errors of a model: the item that reports them, and the meaning of its bits or codes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+import msgspec
+
+Fault = Literal["voltage", "overheating", "overload"]
+"""Faults that the analysis names, whatever the model's own words and values are."""
+
+STATUS_BYTE: Mapping[str, int] = {"input_voltage": 0x01, "overheating": 0x04, "overload": 0x20}
+"""Errors in the error byte of Protocol 1.0, the same for every model; the other bits concern one instruction.
+
+Source: e-Manual, "DYNAMIXEL Protocol 1.0", Error."""
+
+
+class HardwareErrors(msgspec.Struct, frozen=True):
+    """The error item of a model, and what its values mean."""
+
+    item: str = ""
+    """`hardware_error_status`, `error_code` (Y series), or empty: the error byte of each reply."""
+    values: Mapping[str, int] = MappingProxyType({})
+    """The e-Manual's name of an error in snake_case -> its bit, or its code where `has_codes`."""
+
+    @property
+    def has_codes(self) -> bool:
+        """True when the item holds the code of the newest error instead of a bit for each."""
+        return self.item == "error_code"
+
+    @property
+    def mask(self) -> int:
+        """All bits that are errors; only for an item of bits."""
+        return sum(self.values.values())
+
+    def names(self, value: int) -> tuple[str, ...]:
+        """Return the names of the errors in a value of the item."""
+        if self.has_codes:
+            return tuple(name for name, code in self.values.items() if code == value)
+        return tuple(name for name, bit in self.values.items() if value & bit)
+
+    def describe(self, value: int) -> str:
+        """Return the e-Manual's words for a value of the item; `no hardware error` for 0."""
+        if not value:
+            return "no hardware error"
+        names = self.names(value)
+        words = [(name if is_warning(name) else f"{name} error").replace("_", " ") for name in names]
+        if self.has_codes:
+            return words[0] if words else f"code {value}, which the control table does not define"
+        if unknown := value & ~self.mask:
+            words.append(f"bits {unknown:02x}, which the control table does not define")
+        return "; ".join(words)
+
+    def is_warning(self, value: int) -> bool:
+        """Check whether a value is only a warning, with which the servo still takes torque and goals."""
+        names = self.names(value)
+        return bool(names) and all(map(is_warning, names))
+
+    def faults(self, value: int) -> frozenset[Fault]:
+        """Return the faults that a value of the item reports."""
+        kinds: tuple[Fault, ...] = ("voltage", "overheating", "overload")
+        return frozenset(kind for kind in kinds for name in self.names(value) if name.endswith(kind))
+
+    def value_of(self, *names: str) -> int:
+        """Return bit or code of the first of these errors that the model has; 0: it has none of them."""
+        return next((self.values[name] for name in names if name in self.values), 0)
+
+
+def is_warning(name: str) -> bool:
+    """Check whether an error is a warning by its name (e-Manual, Y series, Error Code (153))."""
+    return name.endswith("_warning")
+
+
+def error_item(items: Mapping[str, object]) -> str:
+    """Return the item of a model that reports its hardware errors; empty when it has none."""
+    return next((name for name in ("hardware_error_status", "error_code") if name in items), "")

@@ -1,0 +1,217 @@
+"""Hardware errors of every model: named as in its manual, in a run, at its start, and by tools."""
+
+from __future__ import annotations
+
+import pytest
+from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig
+
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table, read_control_table
+from dxlrun.dynamixel.servo.registers import meaning
+from dxlrun.dynamixel.tools.scanning import Search, scan
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.errors import StartUpError
+from dxlrun.plan.simulation_plan import ServoConfig
+
+X = {
+    0x01: "input voltage",
+    0x04: "overheating",
+    0x08: "motor encoder",
+    0x10: "electrical shock",
+    0x20: "overload",
+}
+PRO = {**X, 0x02: "motor hall sensor"}
+Y = {1: "over voltage", 2: "low voltage", 3: "inverter overheating", 4: "motor overheating", 5: "overload"}
+MANUALS = {  # e-Manual, section Shutdown of each model, or Error Code (153)
+    "AX-12A": {0x01: "input voltage", 0x04: "overheating", 0x20: "overload"},
+    "MX-64": X,
+    "XL-320": {0x01: "overload", 0x02: "overheating", 0x04: "input voltage"},
+    "XL330-M288": X,
+    "XM430-W350": X,
+    "PH54-200-S500": PRO,
+    "H54-200-S500-R": PRO,
+    "RH-P12-RN": X,
+    "YM070-210-M001": {
+        **Y,
+        7: "inverter",
+        13: "encoder",
+        14: "hall sensor",
+        17: "following",
+        19: "over speed",
+    },
+}
+FAULTS = {
+    "overload": (lambda servo: servo.trigger_overload(), ("overload error",)),
+    "overheat": (
+        lambda servo: servo.set_temperature(200.0),
+        ("overheating error", "motor overheating error"),
+    ),
+    "low voltage": (lambda servo: servo.set_voltage(0.5), ("input voltage error", "low voltage error")),
+    "high voltage": (lambda servo: servo.set_voltage(90.0), ("input voltage error", "over voltage error")),
+}
+"""Faults that the simulation can set -> how to set one, and the names that are right for it"""
+TABLES = all_tables()
+IDS = tuple(range(1, len(FAULTS) + 1))
+every_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: f"{table.model} {table.protocol}")
+reporting = pytest.mark.parametrize(
+    "table",
+    [table for table in TABLES if table.errors.item],
+    ids=lambda table: f"{table.model} {table.protocol}",
+)
+
+
+def rig_of(table: ControlTable, ids: tuple[int, ...] = IDS) -> Rig:
+    middle = (table.min_tick + table.max_tick) / 2 * table.rad_per_tick
+    plan = make_plan(
+        ids,
+        protocol=table.protocol,
+        model=table.model,
+        reference=middle,
+        lower=-0.02,
+        upper=0.02,
+        return_delay_ns=0,
+    )
+    return make_rig(
+        plan, position=middle or 1e-9, firmware=max(table.firmware, 45) if table.protocol == 2.0 else 24
+    )
+
+
+def poke_error(rig: Rig, servo_id: int, value: int) -> None:
+    servo = rig.servo(servo_id)
+    servo.registers[servo.registers.table.errors.item] = value
+
+
+@every_table
+def test_each_simulated_fault_is_reported_by_its_name(table):
+    rig = rig_of(table)
+    rig.hardware.start()
+    rig.cycles(3)
+    rig.events.list.clear()
+    for servo_id, (hurt, _) in zip(IDS, FAULTS.values(), strict=True):
+        hurt(rig.servo(servo_id))
+    rig.cycles(12)
+    for servo_id, (fault, (_, names)) in zip(IDS, FAULTS.items(), strict=True):
+        told = [
+            text
+            for source, text in rig.events.of(EventCode.SERVO_ERROR)
+            if source == f"main_{servo_id}_joint"
+        ]
+        told = told[-1].partition(" on bus main) ")[2]
+        word = (
+            told.rpartition(": ")[2] if table.errors.item else told.removeprefix("reports ").partition(":")[0]
+        )
+        assert word in names, (fault, told)
+        if table.errors.item:
+            assert told.startswith(f"has {table.items[table.errors.item].title} = ")
+
+
+@every_table
+def test_an_error_item_is_read_where_the_model_has_it(table):
+    assert table.errors.item in table.items or table.protocol == 1.0
+    assert table.errors.values
+    address = rig_of(table, (1,)).plans[0].servos[0].hardware_error_address
+    assert address == (table.items[table.errors.item].address if table.errors.item else None)
+
+
+@pytest.mark.parametrize("model", MANUALS)
+def test_bits_and_codes_are_those_of_the_manual(model):
+    table = control_table(model, 1.0 if model == "AX-12A" else 2.0)
+    for value, name in MANUALS[model].items():
+        assert table.errors.describe(value) == f"{name} error"
+    assert table.errors.has_codes == model.startswith("Y")
+    if not table.errors.has_codes:
+        assert sorted(table.errors.values.values()) == sorted(MANUALS[model])
+
+
+@reporting
+def test_each_error_refuses_the_start_by_its_name(table):
+    for name, value in table.errors.values.items():
+        rig = rig_of(table, (1,))
+        rig.stick(1, table.errors.item, value)
+        if name.endswith("_warning"):
+            rig.hardware.start()
+            (text,) = rig.events.texts(EventCode.REGISTER_DIFFERS)
+            assert text.endswith(f"in {table.items[table.errors.item].title}: {name.replace('_', ' ')}")
+            continue
+        with pytest.raises(StartUpError) as caught:
+            rig.hardware.start()
+        title = table.items[table.errors.item].title
+        assert f"reports in {title}: {name.replace('_', ' ')} error; find the cause" in str(caught.value)
+
+
+@reporting
+def test_scan_names_the_error_of_a_servo(table):
+    rate = 57_600
+    line = VirtualLine(ServoConfig(1, table.model, 0.0))
+    (servo,) = line.bus.servos
+    servo.trigger_overload()
+    (found,) = scan(ToolLine(line), Search((2.0,), (rate,))).servos
+    item = table.items[table.errors.item]
+    value = servo.registers[table.errors.item]
+    assert found.remarks == (f"{item.title} is {value}: overload error",)
+
+
+def test_a_second_error_is_named_besides_the_first():
+    errors = control_table("XL-320").errors
+    assert errors.describe(0x03) == "overload error; overheating error"
+    assert errors.describe(0) == "no hardware error"
+    assert errors.describe(0x28) == "bits 28, which the control table does not define"
+    assert (
+        control_table("YM070-210-M001").errors.describe(6)
+        == "code 6, which the control table does not define"
+    )
+
+
+def test_a_register_that_reports_errors_is_shown_by_its_meaning():
+    for model, value, words in (("XL-320", 2, "overheating error"), ("YM070-210-M001", 9, "battery warning")):
+        table = control_table(model)
+        assert meaning(table.items[table.errors.item], value, table.errors) == words
+        assert meaning(table.items["id"], 1, table.errors) == ""
+
+
+def test_a_warning_neither_takes_the_goals_nor_marks_the_joint_as_broken():
+    rig = rig_of(control_table("YM070-210-M001"), (1, 2))
+    rig.hardware.start()
+    rig.cycles(3)
+    rig.events.list.clear()
+    poke_error(rig, 1, 9)
+    rig.cycles(120)
+    told = [(severity, text) for code, severity, _, text in rig.events.list if code is EventCode.SERVO_ERROR]
+    assert [text for severity, text in told if severity is Severity.WARNING] == [
+        "main_1_joint (ID 1 on bus main) has Error Code (153) = 9: battery warning"
+    ]
+    assert rig.states.hardware_error.tolist() == [0, 0]
+    since = len(rig.into_bus())
+    rig.goals.position[:] += 0.01
+    rig.cycles(1)
+    assert [ids for _, ids in rig.goals_sent(since)] == [[1, 2]]
+
+
+WRONG = {
+    "overload = 3": "overload = 3 is not one bit of a byte",
+    "overload = 256": "overload = 256 is not one bit of a byte",
+    "overload = 1\noverheating = 1": "two errors have the same value",
+    'overload = "1"': "overload is not a whole number",
+}
+
+
+@pytest.mark.parametrize("entries", WRONG)
+def test_errors_that_cannot_be_are_refused(entries, plain_table):
+    with pytest.raises(ValueError, match=WRONG[entries]):
+        read_control_table(f"{plain_table}\n[errors]\n{entries}\n")
+
+
+def test_a_table_without_errors_names_none(plain_table):
+    errors = read_control_table(plain_table).errors
+    assert errors.describe(0x20) == "bits 20, which the control table does not define"
+
+
+@pytest.fixture
+def plain_table():
+    """The text of a table of Protocol 2.0 that names no errors, as a plug-in may have it."""
+    path = "XM/XM430-W350.toml"
+    from dxlrun.dynamixel.control_table import sources
+
+    text = (sources._TABLES / "protocol2" / path).read_text("utf-8")
+    before, _, rest = text.partition("[errors]")
+    return f"{before}[items]{rest.partition('[items]')[2]}"
