@@ -223,6 +223,10 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._commanded_ns = time_ns
         self._aim()
 
+    def on_hold(self, time_ns: int) -> None:
+        """Decelerate to a standstill."""
+        self._command = self._target = (0.0, 0.0)
+
     def _aim(self) -> None:
         """Make the command the target, slowed down along its curve to what base and wheels may do."""
         linear, angular = self._linear.within(self._command[0]), self._angular.within(self._command[1])

@@ -99,6 +99,11 @@ class JointLimiter(Controller[LimiterParameters]):
         """Take new positions."""
         np.copyto(self._setpoint, data)
 
+    def on_hold(self, time_ns: int) -> None:
+        """Stop as soon as the limits allow."""
+        limiter = self._limiter
+        np.copyto(self._setpoint, limiter.stopping_point(limiter.position, limiter.velocity))
+
     def update(self, time_ns: int, period_ns: int) -> None:
         """Go on towards the reference."""
         limiter, references, commands = self._limiter, self.context.references, self.context.commands

@@ -191,6 +191,10 @@ class PidController(Controller[PidParameters]):
             self._output.fill(0.0)
         pid.reset(finite_or(before, 0.0), self._error, self._bias)
 
+    def on_hold(self, time_ns: int) -> None:
+        """Hold the joints where they are."""
+        self.on_activate(time_ns)
+
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new set-points."""
         np.copyto(self._setpoint, data)

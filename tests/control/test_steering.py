@@ -272,11 +272,59 @@ def test_a_run_ends_when_it_is_asked_to(steered):
 def test_a_stream_that_ends_without_a_word_is_held_until_the_next_command(steered):
     stream = steered.posts("left", "position", b"", 2 * PERIOD_NS)
     steered.run(15, {1: stream, 2: stream, 3: stream, 9: steered.posts("left", "position")})
-    assert steered.steps("left") == [0, 1, 2, 3, 4, 5, 9, 10, 11, 12, 13, 14]
+    assert steered.steps("left") == list(range(15)), "it is updated all the same"
+    again = [call.cycle for call in steered.calls if (call.name, call.step) == ("left", "activate")]
+    assert again == [-1, 9], "its commands are of another time"
     held = ("left", "the stream of commands ended; its joints are held")
     assert steered.events.of(EventCode.STALE_COMMAND) == [held]
     assert np.isnan(steered.sink.cycles[7]["position"]).tolist() == [True, False]
     assert steered.active(7) == ["left", "right"]
+
+
+class Holding(Scripted):
+    """Holds by commands of its own when its stream ends."""
+
+    def on_hold(self, time_ns):
+        self.act("hold", time_ns, self.context.commands.position.copy())
+
+
+def hold_at(self, step, time_ns, value):
+    if step != "activate":
+        self.context.commands.position[:] = 0.5 if step == "hold" else self.context.commands.position
+    if step == "command":
+        self.context.commands.position[:] = 0.1
+
+
+def test_a_controller_holds_by_commands_of_its_own():
+    robot = Robot()
+    seen = []
+
+    def act(self, step, time_ns, value):
+        seen.append((step, robot.record.cycle))
+        if step == "hold":
+            assert np.isnan(value).all(), "it begins without commands"
+        hold_at(self, step, time_ns, value)
+
+    robot.add("left", type("OneHolding", (Holding,), {"act": act}))
+    robot.run(8, {1: robot.posts("left", "position", b"", PERIOD_NS), 6: robot.posts("left", "position")})
+    assert [cycle for step, cycle in seen if step == "hold"] == [3]
+    assert [cycle for step, cycle in seen if step == "activate"] == [-1], "its commands were not withheld"
+    assert [one["position"][0] for one in robot.sink.cycles[1:]] == [0.1] * 2 + [0.5] * 3 + [0.1] * 2
+
+
+def test_a_controller_that_breaks_its_contract_when_it_is_to_hold_is_ended():
+    robot = Robot()
+
+    def act(self, step, time_ns, value):
+        hold_at(self, step, time_ns, value)
+        if step == "hold":
+            raise RuntimeError("broken")
+
+    robot.add("left", type("OneHolding", (Holding,), {"act": act}))
+    result = robot.run(8, {1: robot.posts("left", "position", b"", PERIOD_NS)})
+    assert (result.reason, result.cycles) == ("fault", 4)
+    assert "raised in on_hold: RuntimeError: broken" in result.detail
+    assert np.isnan(robot.sink.cycles[3]["position"]).all()
 
 
 @pytest.mark.parametrize("happens", ["taken out", "began anew", "commanded by the motion file", "nothing"])

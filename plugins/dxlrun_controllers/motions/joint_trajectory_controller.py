@@ -52,7 +52,7 @@ SPEED_SLOPE: Final = 2.0
 """1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
 FEEDBACK_NS: Final = 100_000_000
 _LEFT: Final = 3
-"""Periods without an update: the stream of chunks has ended, and the joints are held at their goals."""
+"""Periods without an update: a joint was lost, and all joints are held at their goals since."""
 _STILL: Final = 1e-3
 """A speed of the trajectory so near to 0 is none: its time stands still."""
 
@@ -264,6 +264,12 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest from their desired velocity; the goal ends when they are."""
         self._stop_from(time_ns)
+
+    def on_hold(self, time_ns: int) -> None:
+        """Bring the joints to rest from their desired velocity, and hold them there."""
+        self._anchor_ns, self._moves = None, True
+        if not self._still.all():
+            self._stop_from(time_ns)
 
     @property
     def _moving(self) -> bool:

@@ -54,6 +54,7 @@ class ControllerMethod(IntEnum):
     ON_GOAL = 7
     ON_CANCEL = 8
     ON_PARAMETERS = 9
+    ON_HOLD = 10
 
     def __str__(self) -> str:
         return "__init__" if self is ControllerMethod.INIT else self.name.lower()

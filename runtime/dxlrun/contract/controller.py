@@ -352,6 +352,14 @@ class Controller(ABC, Generic[P]):
     def on_parameters(self, time_ns: int) -> None:
         """Take changed live parameters: `self.parameters` has them already, all of one request together."""
 
+    def on_hold(self, time_ns: int) -> None:
+        """Hold the joints by commands until the next command: the stream of commands ended.
+
+        Called as `on_activate` is: `context.commands` is NaN, and a joint whose command stays NaN is held by
+        the gate. A controller without this method is updated, but its commands are withheld: positions stay,
+        velocities, efforts and PWM are 0. Before the next command it is activated again.
+        """
+
     @abstractmethod
     def update(self, time_ns: int, period_ns: int) -> None:
         """Write `context.commands` from `context.states`.

@@ -155,7 +155,7 @@ class Steering:
             self._log_stale("loop", f"no client ended the pause; {ends or what}")
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
-                manager.hold(name)
+                manager.hold(name, time_ns)
             self._log_stale(name, f"the stream of commands ended; {ends or 'its joints are held'}")
         return count
 

@@ -1,10 +1,9 @@
 """Managed: one controller of a running robot: its state, its arrays, its calls.
 
-                 await                    enter                expire
-    INACTIVE ------------> ENTERING ---------------> ACTIVE ----------> HELD
-        |    enter                                   ^  ^                |
-        '--------------------------------------------'  '----------------'
-                                                             command
+                 await                    enter
+    INACTIVE ------------> ENTERING ---------------> ACTIVE
+        |    enter                                     ^
+        '----------------------------------------------'
     leave, fault: from every state back to INACTIVE
 
 Which controllers are updated, and which have their claims, follows from the state, and is changed nowhere
@@ -52,8 +51,6 @@ class State(Enum):
     ENTERING = "entering"
     """It has its claims, and is active as soon as its joints are in the modes that it needs."""
     ACTIVE = "active"
-    HELD = "held"
-    """Active, but its stream of commands ended: it commands nothing until the next command."""
 
 
 @unique
@@ -63,29 +60,16 @@ class Event(Enum):
     AWAIT = "a wait for modes"  # It is to be active; joints must change their modes first
     ENTER = "an entry"  # It took its joints over
     COMMAND = "a command"  # It was given a command, or one above it commands it now
-    EXPIRE = "expire"  # Its stream of commands ran out
     LEAVE = "leave"  # It is deactivated, or need not wait any more
     FAULT = "fault"  # It broke its contract
 
 
 _OUT = {Event.LEAVE: State.INACTIVE, Event.FAULT: State.INACTIVE}
-_TAKES_PART = {Event.COMMAND: State.ACTIVE, Event.EXPIRE: State.HELD, **_OUT}
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
     {
-        State.INACTIVE: {
-            Event.AWAIT: State.ENTERING,
-            Event.ENTER: State.ACTIVE,
-            Event.EXPIRE: State.INACTIVE,
-            **_OUT,
-        },
-        State.ENTERING: {
-            Event.AWAIT: State.ENTERING,
-            Event.ENTER: State.ACTIVE,
-            Event.EXPIRE: State.ENTERING,
-            **_OUT,
-        },
-        State.ACTIVE: {Event.AWAIT: State.ACTIVE, **_TAKES_PART},
-        State.HELD: {Event.AWAIT: State.HELD, **_TAKES_PART},
+        State.INACTIVE: {Event.AWAIT: State.ENTERING, Event.ENTER: State.ACTIVE, **_OUT},
+        State.ENTERING: {Event.AWAIT: State.ENTERING, Event.ENTER: State.ACTIVE, **_OUT},
+        State.ACTIVE: {Event.AWAIT: State.ACTIVE, Event.COMMAND: State.ACTIVE, **_OUT},
     }
 )
 """Every legal transition. Another one is a mistake of this program, which ends the controller: only what is
@@ -145,6 +129,9 @@ class Managed:
         """True when it broke its contract."""
         self.waiting = False
         """True while one of the joints that it claims is lost."""
+        self.withheld = False
+        """True while its commands are kept from the robot: its stream of commands ended, and it has no
+        `on_hold`. It is updated all the same."""
         self.runs = False
         """True when it is updated in the cycles in which it is due."""
         self.uppers: tuple[Managed, ...] = ()
@@ -248,17 +235,22 @@ class Managed:
 
     @property
     def active(self) -> bool:
-        """True when it is active, held or not."""
-        return self.state in (State.ACTIVE, State.HELD)
+        """True when it is active."""
+        return self.state is State.ACTIVE
 
     def activate(self, time_ns: int) -> None:
         """Let the controller take over its joints. Raises ControllerFault."""
-        self._outputs.forget()
-        self._inputs.gather()
-        self._call(ControllerMethod.ON_ACTIVATE, "", self.controller.on_activate, time_ns)
+        self._call_anew(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
         self._last_ns = -1
         self.due_cycle = self.until_ns = 0
         self.on(Event.ENTER)
+
+    def _call_anew(self, method: ControllerMethod, call: Callable[[int], None], time_ns: int) -> None:
+        """Call a method that begins with fresh states and without commands. Raises ControllerFault."""
+        self.withheld = False
+        self._outputs.forget()
+        self._inputs.gather()
+        self._call(method, "", call, time_ns)
 
     def deactivate(self, time_ns: int, why: str = "") -> None:
         """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
@@ -279,11 +271,18 @@ class Managed:
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Hand over a prepared command, which never runs out. Raises ControllerFault."""
-        self.on(Event.COMMAND)
-        self.until_ns = 0
+        self._begin_command(time_ns)
         if self._inputs.gathered:
             self._inputs.gather()
         self._call(ControllerMethod.ON_COMMAND, kind, self.controller.on_command, kind, data, time_ns)
+
+    def _begin_command(self, time_ns: int) -> None:
+        """End the stream of before; activate the controller again if its commands were withheld, as they are
+        of another time. Raises ControllerFault."""
+        self.on(Event.COMMAND)
+        self.until_ns = 0
+        if self.withheld:
+            self._call_anew(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -298,9 +297,8 @@ class Managed:
 
     def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64], time_ns: int) -> None:
         """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
-        self.on(Event.COMMAND)
-        self.until_ns = 0
         self._goal = goal
+        self._begin_command(time_ns)
         self._inputs.gather()
         on_goal = self.controller.on_goal
         self._call(ControllerMethod.ON_GOAL, goal.kind, on_goal, goal, data, time_ns)
@@ -323,19 +321,23 @@ class Managed:
         self.controller.parameters = with_values(self.controller.parameters, values)
         self._call(ControllerMethod.ON_PARAMETERS, "", self.controller.on_parameters, time_ns)
 
-    def hold(self) -> None:
-        """Take its commands out of the robot's, and update it no more, until the next command.
+    def hold(self, time_ns: int) -> None:
+        """Hold its joints: the stream of commands ended. It is updated all the same. Raises ControllerFault.
 
-        A goal that it has still would never end: it is aborted.
+        A controller without an `on_hold` of its own may go on with the last command, so its commands are
+        withheld until the next one, and the gate holds the joints. A goal would never end: it is aborted.
         """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, "the stream of commands ended")
-        self.on(Event.EXPIRE)
+        if type(self.controller).on_hold is Controller.on_hold:
+            self.withheld = True
+            self._outputs.withdraw()
+        else:
+            self._call_anew(ControllerMethod.ON_HOLD, self.controller.on_hold, time_ns)
 
     def follow(self, time_ns: int) -> None:
         """End what clients had it do: one above commands its references now. Raises ControllerFault."""
-        self.on(Event.COMMAND)
-        self.until_ns = 0
+        self._begin_command(time_ns)
         if (goal := self.goal) is not None and not goal.cancelling:
             self.cancel(goal, time_ns)
 
@@ -370,8 +372,9 @@ class Managed:
         outputs = self._outputs
         if outputs.own.tobytes() != outputs.taken:
             outputs.check()
-        for own, merged, place in outputs.parts:
-            merged[place] = own
+        if not self.withheld:
+            for own, merged, place in outputs.parts:
+                merged[place] = own
         if self.provided is not None:
             self.provided.take()
 

@@ -256,10 +256,10 @@ class Manager:
             del self.streams[managed.place]
         return [managed.plan.name for managed in sorted(stale, key=lambda one: one.place)]
 
-    def hold(self, controller: str) -> None:
-        """Withdraw what a controller commands until it gets another command; it stays active."""
+    def hold(self, controller: str, time_ns: int) -> None:
+        """Let a controller hold its joints until it gets another command; it stays active."""
         if (managed := self._named.get(controller)) is not None:
-            managed.hold()
+            self._attempt(managed, time_ns, managed.hold, time_ns)
 
     def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
         """Hold every controller that claims a lost joint, of these rows, as long as it is lost, and those

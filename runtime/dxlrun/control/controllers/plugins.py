@@ -51,6 +51,7 @@ _METHODS = (
     "on_goal",
     "on_cancel",
     "on_parameters",
+    "on_hold",
     "update",
     "on_deactivate",
 )
