@@ -7,11 +7,13 @@ import shutil
 import subprocess
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
-from threading import Thread
+from threading import Thread, Timer
 
 import numpy as np
 import pytest
+from tests.kit.line_faults import turn_by_hand
 from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
@@ -203,6 +205,48 @@ def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
     assert rig.states.valid.tolist() == [False, False, True]
 
 
+def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
+    rig = make_rig(make_plan((1,), first_row=1), make_plan((2,), name="other", first_row=0))
+    shafts = {rig.servo(1): 1.0, rig.servo(2, bus=1): 4.0}
+    for servo, angle in shafts.items():
+        turn_by_hand(servo, angle)
+    rig.hardware.start()
+    rig.cycles(5)
+    assert rig.hardware._by_kernel
+    before = rig.states.position.tolist()
+    for servo, angle in zip(shafts, reversed(shafts.values()), strict=True):
+        turn_by_hand(servo, angle)
+    rig.hardware.read()
+    assert rig.states.valid.tolist() == [False, False]
+    assert rig.states.position.tolist() == before
+
+
+def test_line_that_is_gone_gets_no_second_packet_with_goals():
+    plans, _ = fuzz.robot("two layouts", 1)
+    side = fuzz.Side(plans)
+    (line,) = side.lines.ports
+    side.goals.values[:] = 0.1
+    line.lost = True
+    side.hardware.write()
+    assert len(line.sent) == 1
+    assert side.hardware._buses[0].failure is not None
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.2])
+def test_servo_that_missed_a_reply_gets_its_goal_as_soon_as_its_torque_was_read(moved):
+    rig = start_rig(make_plan((1, 2)))
+    rig.cycles(8)
+    rig.servo(2).silence()
+    rig.cycle()
+    rig.goals.position[1] += moved  # nothing is sent to it in this state
+    rig.servo(2).silence(False)
+    since = len(rig.into_bus())
+    rig.cycles(6)
+    assert any(2 in ids for _, ids in rig.goals_sent(since))
+    rig.cycles(30)
+    assert rig.states.position[1] == pytest.approx(rig.goals.position[1], abs=0.01)
+
+
 def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire():
     rig = start_rig(make_plan((1, 2)))
     rig.cycles(5)
@@ -348,6 +392,26 @@ class TestOnDescriptors:
         sent, first, _ = rig.packets.list
         assert sent.first_ns <= sent.last_ns <= first.first_ns
         assert hardware._servos[0].reads._calm == CALM_CYCLES  # the parser has read none
+
+    def test_line_that_takes_no_bytes_is_lost_and_does_not_stop_the_loop(self, line):
+        _, hardware, ours, _, _ = line
+        (port,) = hardware._lines.ports.ports
+        emptied, full = os.pipe2(os.O_NONBLOCK)  # a terminal makes room by itself
+        for size in (4096, 1):
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(full, bytes(size))
+        os.dup2(full, port.descriptor)
+        hardware._servos[0].life.torqued[:] = True
+        hardware._goals.position[:] = 0.1
+        end = Timer(5.0, os.read, (emptied, 1 << 20))  # of a write that has none itself
+        end.start()
+        hardware.write()
+        end.cancel()
+        for descriptor in (emptied, full):
+            os.close(descriptor)
+        (bus,) = hardware._buses
+        assert "takes no more bytes" in str(bus.failure)
 
     def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives(self, line):
         _, hardware, _, states, rig = line

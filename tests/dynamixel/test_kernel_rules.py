@@ -350,3 +350,27 @@ def test_a_line_that_is_gone_is_left_to_the_parser_at_once(line, monkeypatch):
     assert line.cycle() == (False, [False] * 4)
     assert str(line.side.hardware._buses[0].failure) == "it is gone"
     assert len(looks) == 2  # the kernel's, and the parser's, which has the reason
+
+
+@every
+def test_reply_is_awaited_from_when_the_host_had_sent_its_request(line):
+    line.line.stall_ns = 50_000_000  # longer than any reply is awaited
+
+    def pieces(packets):
+        return [(line.line.stall_ns + AT_NS, b"".join(packets))]
+
+    assert line.cycle(pieces=pieces) == (True, GOOD)
+
+
+@every
+def test_reply_that_came_while_the_host_stood_still_is_taken(line, monkeypatch):
+    wait = line.side.lines.wait
+
+    def late(deadline_ns):
+        if deadline_ns:
+            line.side.lines.clock.wait_until(deadline_ns + 30_000_000)
+            return []
+        return wait(0)
+
+    monkeypatch.setattr(line.side.lines, "wait", late)
+    assert line.cycle() == (True, GOOD)

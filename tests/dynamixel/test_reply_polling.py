@@ -91,6 +91,15 @@ def test_no_more_than_a_share_of_a_core_is_polled_even_for_replies_that_never_co
     assert 0 < line.polled_ns <= share * 2_001 * CYCLE_NS
 
 
+@pytest.mark.parametrize("ahead_ns", [-50_000, 0, 10_000, 100_000])
+def test_one_reply_is_polled_for_no_longer_than_the_longest_time(ahead_ns):
+    line = Line(300_000)
+    line.polling.credit_ns = line.polling.saved_ns
+    start = line.now_ns
+    until = line.await_until(start + line.polling.margin_ns + ahead_ns, 1 << 62)
+    assert start < until <= start + sum(line.naps) + 300_000
+
+
 def test_without_credit_a_reply_is_neither_slept_nor_polled_for():
     line = Line()
     assert line.await_until(line.now_ns + 400_000, 1 << 62) == 0
