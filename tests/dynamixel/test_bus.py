@@ -5,6 +5,7 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.errors import PortError
 from dxlrun.plan.transaction import Outcome, ProgramJob, Reply
 
 LINE = Line(1_000_000, 0, 500_000)
@@ -252,3 +253,66 @@ def test_a_program_keeps_a_reply_whatever_comes_next():
         job.advance(Reply(Outcome.OK, 0, memoryview(buffer), 0, 0, False))
     buffer[:] = b"\5\6"
     assert job.result == (b"\1\2", b"\3\4")
+
+
+class Quiet:
+    """Drops the packets of the log."""
+
+    def packet(self, *_):
+        pass
+
+
+def begin(line):
+    """Return the lines and the bus of servo 7."""
+    lines = Lines([make_plan((7,))], line, line.clock, Quiet())
+    return lines, lines.buses[0]
+
+
+def ask(lines):
+    """Read the state of servo 7."""
+
+    def program():
+        return (yield READ).parameters
+
+    (parameters,) = lines.run([program()])
+    return parameters
+
+
+@pytest.mark.parametrize("renewed", [False, True], ids=["on the same line", "on a line that came back"])
+def test_rest_of_a_reply_to_a_dropped_request_does_not_answer_the_next(renewed):
+    stale = protocol1.status_packet(7, 0, b"------")
+    line = ScriptedLine([(600_000, stale[:7])], [(600_000, stale[7:]), (800_000, GOOD)])
+    lines, bus = begin(line)
+    bus.load(ProgramJob(listen_to(READ)))
+    bus.step(line.clock.now_ns())
+    line.clock.wait_until(line.clock.now_ns() + 650_000)
+    bus.hear()
+    if renewed:
+        bus.fail(PortError("it is gone"))
+        bus.renew(line)
+    assert ask(lines) == b"abcdef"
+
+
+def listen_to(transaction):
+    yield transaction
+
+
+def test_reply_is_awaited_from_when_the_host_had_sent_its_request():
+    line = ScriptedLine([(50_700_000, GOOD)])
+    write = line.write
+
+    def slow_write(data):
+        write(data)
+        line.clock.wait_until(line.clock.now_ns() + 50_000_000)
+
+    line.write = slow_write
+    assert ask(begin(line)[0]) == b"abcdef"
+
+
+def test_reply_is_awaited_from_when_its_request_left_behind_the_bytes_before_it():
+    stale = protocol1.status_packet(7, 0, b"------")
+    queued = bytes(1000)  # takes 10 ms at 1 Mbit/s
+    line = ScriptedLine([], [(9_000_000, stale), (10_700_000, GOOD)])
+    lines, bus = begin(line)
+    bus.send(queued)
+    assert ask(lines) == b"abcdef"

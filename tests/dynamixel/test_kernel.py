@@ -394,7 +394,7 @@ class TestOnDescriptors:
         assert hardware._servos[0].reads._calm == CALM_CYCLES  # the parser has read none
 
     def test_line_that_takes_no_bytes_is_lost_and_does_not_stop_the_loop(self, line):
-        _, hardware, ours, _, _ = line
+        hardware = line[1]
         (port,) = hardware._lines.ports.ports
         emptied, full = os.pipe2(os.O_NONBLOCK)  # a terminal makes room by itself
         for size in (4096, 1):

@@ -227,6 +227,14 @@ def test_of_a_fast_status_ids_and_head_are_checked_beside_the_crcs(line):
         assert line.spoil(victim, lambda _, parts=parts: fast(parts)) == [one < victim for one in range(4)]
 
 
+@fast_sync
+@pytest.mark.parametrize("victim", range(3))
+def test_parts_of_a_fast_status_in_another_order_are_of_no_servo(line, victim):
+    parts = parts_of(line.replies()[0][0])
+    parts[victim : victim + 2] = reversed(parts[victim : victim + 2])
+    assert line.spoil(victim, lambda _: fast(parts)) == [one < victim for one in range(4)]
+
+
 def parts_of(read):
     return [(one.servo_id, 0, DATA.ljust(one.length, b"\0")) for one in read.awaited]
 

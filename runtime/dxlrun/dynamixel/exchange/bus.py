@@ -145,7 +145,6 @@ class Bus:
         self._port = port
         self.retry()
         self.drop()
-        self.receiver.flush()  # the lost line may have brought half a packet
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
         """Send a prepared packet without a reply, between two jobs; does not wait.
