@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
+from dxlrun.channels.events import RUN_ENDED, EventCode, EventGroup, GoalReport, Severity
 from dxlrun.errors import counted
 from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
 from dxlrun_analysis.tally import RunTotals
@@ -42,7 +42,6 @@ _REASONS = {
 }
 """By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
 _RELEASED = "torque off: "
-_RUN_ENDED = "the run ended"  # The text of a goal that was aborted because of it
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100
 
@@ -125,11 +124,12 @@ def _at(t_ns: int, begin_ns: int) -> str:
 
 def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
     for report in totals.conduct.failed[:_MOST_NAMED]:
-        if report.text == _RUN_ENDED:
+        if report.text == RUN_ENDED:
             yield f"the run ended before {_goal(report)} did"
         else:
             status = "missed its goal" if report.status == "missed" else report.status
-            yield f"{_goal(report)} {status}{_off(report)}"
+            joint = totals.plan.joint(report.joint)
+            yield f"{_goal(report)} {status}{_off(report, linear=joint.linear)}"
 
 
 def _goal(report: GoalReport) -> str:
@@ -137,11 +137,13 @@ def _goal(report: GoalReport) -> str:
     return f"{place} of {report.controller}" if place else f"{report.kind} of {report.controller}"
 
 
-def _off(report: GoalReport) -> str:
+def _off(report: GoalReport, *, linear: bool) -> str:
     if not report.joint:
         return ""
-    off = "" if report.error is None else f" {math.degrees(abs(report.error)):.1f} deg off"
-    return f" ({report.joint}{off})"
+    if report.error is None:
+        return f" ({report.joint})"
+    far = abs(report.error)
+    return f" ({report.joint} {f'{far * 1e3:.1f} mm' if linear else f'{math.degrees(far):.1f} deg'} off)"
 
 
 def _takeovers(totals: RunTotals) -> Iterator[str]:

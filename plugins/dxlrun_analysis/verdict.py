@@ -10,6 +10,7 @@ was not good when
   client requested do not count;
 - more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
   least;
+- a goal of a played motion was missed or aborted;
 - an error was logged, a servo reported one, or the log is not whole.
 
 All else is reported and tolerated: a lost packet is data. Wake-ups are *rough* when more than 1 % are later
@@ -72,7 +73,7 @@ class Verdict(msgspec.Struct, frozen=True):
     """What the robot did, then findings, the most severe first."""
 
     good: bool  # Nothing was found that a run may not have
-    word: str  # The verdict in words: good; good, with fallbacks; not good
+    word: str  # The verdict in words: good; good, with fallbacks; good, with missed goals; not good
     sentences: tuple[str, ...]  # Of the findings, with their remedies
     findings: tuple[Finding, ...]
 
@@ -106,7 +107,11 @@ def judge(totals: RunTotals) -> Verdict:
     judged = accused(totals, found)
     ordered = sorted(judged, key=lambda finding: finding.order)
     good = all(finding.rank >= Rank.CAUSE for finding in ordered)
-    word = "not good" if not good else "good, with fallbacks" if totals.conduct.takeovers else "good"
+    word = "good" if good else "not good"
+    if good and totals.conduct.takeovers:
+        word = "good, with fallbacks"
+    elif good and any(report.failed for report in totals.conduct.failed):
+        word = "good, with missed goals"
     findings = (robot_line(totals, word, ordered), *ordered)
     return Verdict(good, word, tuple(finding.line for finding in findings), findings)
 
@@ -120,9 +125,9 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
         yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
     planned = {one.origin for one in totals.plan.loop.commands}
     for report in totals.conduct.failed:
-        if report.status == "missed" and report.origin in planned:
-            sentence = f"{report.controller} missed the goal of its {report.kind}: {report.text}."
-            yield Finding("goal_missed", report.joint or report.controller, sentence, rank=Rank.ERROR)
+        if report.failed and report.origin in planned:
+            subject = report.joint or report.controller
+            yield Finding("goal_missed", subject, f"{report.sentence}.", rank=Rank.ERROR)
 
 
 def _beyond(totals: RunTotals) -> Iterable[Finding]:

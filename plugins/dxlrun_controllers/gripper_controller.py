@@ -31,6 +31,7 @@ from dxlrun import (
     Duration,
     Floats,
     Goal,
+    GoalTolerances,
     Interfaces,
     Length,
     LinearVelocity,
@@ -84,7 +85,7 @@ class GripperParameters(ParametersModel):
     speed: Annotated[Speed, Field(gt=0), LIVE] = 2.0
     """rad/s, of a linear joint m/s, at which it closes and opens"""
     tolerance: Annotated[Way, Field(gt=0)] = 0.02
-    """rad, of a linear joint m; nearer to its goal it has reached it"""
+    """rad, of a linear joint m; nearer to its goal, and at rest, it has reached it"""
     stall_speed: Annotated[Speed, Field(gt=0)] = 0.05
     """rad/s, of a linear joint m/s; slower ..."""
     stall_time: Annotated[Duration, Field(gt=0)] = 200_000_000
@@ -317,13 +318,14 @@ class GripperController(Controller[GripperParameters]):
         position = float(self.context.states.position[0])
         error = abs(self._target - position)
         if error <= self.parameters.tolerance:
-            self._end(Outcome.REACHED, "reached")
+            left_ns = self.parameters.timeout - (time_ns - self._began_ns)
+            self._hand_over(f"at {self._place(position)}", self.parameters.tolerance, np.nan, left_ns)
             return
         if self._stands_still(position, time_ns):
             self._stalled = True
             if self.parameters.effort is None:
                 self._stay()
-            self._end(Outcome.REACHED, "stalled, holds something")
+            self._hand_over(f"stalled, holds something at {self._place(position)}", np.inf, np.inf, 0)
             return
         if time_ns - self._began_ns >= self.parameters.timeout:
             self._end(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
@@ -354,10 +356,21 @@ class GripperController(Controller[GripperParameters]):
         if goal is None:
             return
         position = float(self.context.states.position[0])
+        error = abs(self._target - position)
+        goal.end(outcome, f"{text} at {self._place(position)}", self.parameters.joint, error)
+
+    def _hand_over(self, text: str, tolerance: float, rest_speed: float, settle_ns: int) -> None:
+        """Let the goal be judged: by its position as it was asked, or as a stall."""
+        goal, self._goal = self._goal, None
+        if goal is not None:
+            tolerances = GoalTolerances(np.array([tolerance]), np.array([rest_speed]), settle_ns)
+            goal.judge(np.array([self._target]), tolerances=tolerances, text=text)
+
+    def _place(self, position: float) -> str:
+        """Return a position of the joint, and how far the gripper is open there."""
         width = self._width(position)
-        at = f"{position:.4g} {self._unit}"
-        at = at if np.isnan(width) else f"{at}, {width * 1e3:.4g} mm"
-        goal.end(outcome, f"{text} at {at}", self.parameters.joint, abs(self._target - position))
+        place = f"{position:.4g} {self._unit}"
+        return place if np.isnan(width) else f"{place}, {width * 1e3:.4g} mm"
 
     def _width(self, angle: float) -> float:
         return float(np.interp(angle, self._angles, self._widths)) if self._angles.size else float("nan")

@@ -10,6 +10,7 @@ from dxlrun.contract.controller import CommandModel as CommandModel
 from dxlrun.contract.controller import Context as Context
 from dxlrun.contract.controller import Controller as Controller
 from dxlrun.contract.controller import Goal as Goal
+from dxlrun.contract.controller import GoalTolerances as GoalTolerances
 from dxlrun.contract.controller import Interfaces as Interfaces
 from dxlrun.contract.controller import JointLimits as JointLimits
 from dxlrun.contract.controller import Mismatch as Mismatch
@@ -38,7 +39,9 @@ from dxlrun.description.units import LinearAcceleration as LinearAcceleration
 from dxlrun.description.units import LinearJerk as LinearJerk
 from dxlrun.description.units import LinearVelocity as LinearVelocity
 from dxlrun.description.units import Mass as Mass
+from dxlrun.description.units import RestSpeed as RestSpeed
 from dxlrun.description.units import Time as Time
+from dxlrun.description.units import Tolerance as Tolerance
 from dxlrun.description.units import Voltage as Voltage
 from dxlrun.errors import ControllerFault as ControllerFault
 from dxlrun.errors import DxlrunError as DxlrunError

@@ -320,16 +320,16 @@ def test_a_nan_is_its_controller_s_and_not_its_fallback_s(tmp_path: Path) -> Non
     _, path = failing(tmp_path, ", fallback: hold", nan)
     log = read_log(path)
     verdict = judge(totals_of(path))
-    assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
+    assert (verdict.good, verdict.word) == (False, "not good"), "the played motion was aborted"
     first = verdict.sentences[0]
     assert first.startswith(
-        "Good, with fallbacks: leg failed (commanded knee/position = nan after a finite value) and fell back "
+        "Not good: leg failed (commanded knee/position = nan after a finite value) and fell back "
         "to hold at 0.5 s; squat of leg aborted"
     )
     gate = [event.text for event in log.events if event.code == EventCode.GATE]
     assert gate == ["knee: was not finite, the last goal is kept"]
     shown = json.loads(json_text(analyze(log)))["verdict"]
-    assert (shown["good"], shown["word"], shown["sentences"][0]) == (True, "good, with fallbacks", first)
+    assert (shown["good"], shown["word"], shown["sentences"][0]) == (False, "not good", first)
 
 
 def test_a_controller_that_fails_without_a_fallback_is_not_good(tmp_path: Path) -> None:

@@ -12,8 +12,17 @@ import msgspec
 import pytest
 from msgspec import structs
 from rich.console import Console
+from tests.kit.commands import Said
 
-from dxlrun.channels.events import EventCode, EventGroup, EventRing, EventTotals, Severity
+from dxlrun.channels.events import (
+    RUN_ENDED,
+    EventCode,
+    EventGroup,
+    EventRing,
+    EventTotals,
+    GoalReport,
+    Severity,
+)
 from dxlrun.errors import PortError
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
@@ -226,13 +235,21 @@ def test_the_loop_s_own_counts_make_the_verdict(  # noqa: PLR0917  fixtures
 def test_a_played_motion_that_missed_its_goal_fails_the_run(
     dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path
 ):
-    def missed(origin: str) -> int:
-        runs.answer = structs.replace(GOOD, events=EventTotals(missed=(origin,)))
-        return dxlrun(torso, "--play", three_parts).code
+    def ends(status: str, origin: str, text: str = "after 2 s, joint elbow is 9.00 deg off") -> Said:
+        failed = GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157)
+        runs.answer = structs.replace(GOOD, events=EventTotals(failed=(failed,) * failed.failed))
+        return dxlrun(torso, "--play", three_parts)
 
-    assert missed("a client") == 0
+    assert ends("missed", "a client").code == 0
     ((plan, _),) = runs.asked
-    assert missed(plan.loop.commands[0].origin) == 1
+    own = plan.loop.commands[0].origin
+    for status in ("missed", "aborted"):
+        said = ends(status, own)
+        assert said.code == 1
+        sentence = f"left_arm {status} the goal of its trajectory: after 2 s, joint elbow is 9.00 deg off."
+        assert sentence in said.out
+    assert ends("aborted", own, RUN_ENDED).code == 0
+    assert ends("reached", own).code == 0
 
 
 def test_a_controller_with_a_fallback_may_fail(torso: Path):

@@ -9,36 +9,33 @@ from typing import Any
 import numpy as np
 
 from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, ServoModel, States
+from dxlrun.channels.cycle import Torque
+from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.plan.loop_plan import JointPlan
 
 
-@dataclass
-class Goal:
-    """A goal as the runtime hands it over; keeps what its controller reports."""
+class Goal(RunningGoal):
+    """A goal as the runtime hands it over, and as its judge ends it; keeps what its controller reports."""
 
-    number: int
-    kind: str
-    progress: list[tuple[float, float]] = field(default_factory=list)
-    """Progress and error"""
-    outcome: Outcome | None = None
-    text: str = ""
-    joint: str = ""
-    error: float = np.nan
-    joints: Sequence[str] | None = None
+    def __init__(self, goals: Goals, number: int, kind: str) -> None:
+        super().__init__(goals, number, "tested", kind, "test")
+        self.progresses: list[tuple[float, float]] = []
+        """Progress and error"""
+        self.judged: Sequence[str] | None = None
+        """Joints by which it is judged"""
 
     def feedback(self, progress: float, error: float = float("nan")) -> None:
-        assert self.outcome is None, "feedback after the end"
-        self.progress.append((progress, error))
+        assert (self.outcome, self.is_judged) == (None, False), "feedback after the end"
+        self.progresses.append((progress, error))
 
-    def end(
-        self,
-        outcome: Outcome,
-        text: str = "",
-        joint: str = "",
-        error: float = float("nan"),
-        joints: Sequence[str] | None = None,
-    ) -> None:
+    def judge(self, positions: Any = None, *, joints: Sequence[str] | None = None, **more: Any) -> None:
+        assert (self.outcome, self.is_judged) == (None, False), "handed over twice"
+        self.judged = joints
+        super().judge(positions, joints=joints, **more)
+
+    def end(self, outcome: Outcome, text: str = "", *more: Any) -> None:
         assert self.outcome is None, f"ended twice: {self.outcome}, {outcome} {text}"
-        self.outcome, self.text, self.joint, self.error, self.joints = outcome, text, joint, error, joints
+        super().end(outcome, text, *more)
 
     @property
     def ended(self) -> list[tuple[Outcome, str, str, float]]:
@@ -48,7 +45,19 @@ class Goal:
     @property
     def steps(self) -> list[float]:
         """The progress that was reported."""
-        return [progress for progress, _ in self.progress]
+        return [progress for progress, _ in self.progresses]
+
+
+class _Record:
+    """What the judge of goals reads of a cycle."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.states, self.period_ns = stage.context.states, stage.context.period_ns
+
+    @property
+    def woken_ns(self) -> int:
+        return self._stage.time_ns
 
 
 @dataclass
@@ -123,7 +132,12 @@ class Stage:
         )
         self.states.motion[:] = 0.0
         self.states.position[:] = self.sent.position[:] = np.resize(self.present, count)
-        self.states.valid[:] = True
+        self.states.valid[:], self.states.torque[:] = True, Torque.ON
+        events = type("Events", (), {"emit": lambda self, *_: None})()
+        plans = [JointPlan(joint, -np.inf, np.inf, None) for joint in joints]
+        commanded = joints if self.interfaces.command else ()
+        positions = self.commands.position if "position" in self.interfaces.command else None
+        self.judge = Goals(_Record(self), events, plans, lambda _: (commanded, positions))  # type: ignore[arg-type]  # of a record it reads states and times alone
         self.controller.on_configure(self.context)
 
     def _publish(self, topic: str = "", message: object = None) -> None:
@@ -163,19 +177,25 @@ class Stage:
             return
         if self.goals and self.goal.outcome is None:
             self.goal.end(Outcome.PREEMPTED)
-        self.goals.append(Goal(len(self.goals) + 1, kind))
+        self.goals.append(Goal(self.judge, len(self.goals) + 1, kind))
+        self.judge.running[self.goal.number] = self.goal
         self.controller.on_goal(self.goal, data, self.time_ns)
 
     def cancel(self, at_s: float | None = None) -> None:
         self._at(at_s)
+        judged = self.goal.is_judged
         self.controller.on_cancel(self.goal, self.time_ns)
+        if judged:
+            self.goal.end(Outcome.CANCELLED, "stopped at its end")
 
     def update(self, at_s: float, *, follow: bool = True) -> np.ndarray:
         """Update; return the positions that are commanded, where the servos are then if they follow."""
         self._at(at_s)
+        self.judge.judge_running()
         self.controller.update(self.time_ns, 20_000_000)
         if follow:
             self.states.position[:] = self.commands.position
+            self.judge.judge_running()
         self.sent.values[:2] = self.commands.values[:2]
         return self.commands.position.copy()
 
@@ -194,6 +214,7 @@ class Stage:
         """Update `periods` after the last time; then what was commanded is sent."""
         period_ns = round(periods * self.period_s * 1e9)
         self.time_ns += period_ns
+        self.judge.judge_running()
         self.controller.update(self.time_ns, min(period_ns, 5 * self.context.period_ns))
         np.copyto(self.sent.values, self.commands.values)
 

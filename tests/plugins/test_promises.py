@@ -93,7 +93,7 @@ def test_no_memory_grows_in_the_loop(case: Case) -> None:
             stage.controller.update(stage.time_ns, story.period_ns)
             stage.messages.clear()
             for goal in stage.goals:
-                goal.progress.clear()
+                goal.progresses.clear()
         assert tracemalloc.get_traced_memory()[0] - before < 4000  # a float a cycle would be 9600
     finally:
         tracemalloc.stop()

@@ -233,6 +233,12 @@ class Trajectory:
         velocity, acceleration = self._first[1] * (order > LINEAR), self._first[2] * (order > CUBIC)
         return self._first[0], velocity, acceleration
 
+    @property
+    def end(self) -> Floats:
+        """Position of the last point, as it was asked, rad."""
+        position: Floats = self._last[0]
+        return position
+
     def first_way(self, now: SplineSample) -> Floats:
         """Return the way from `now` to the first point, rad."""
         way: Floats = self._first[0] - now.position

@@ -38,6 +38,8 @@ SHARE: Final = 0.05
 may."""
 _SAME: Final = 1e-6
 """rad, rad/s: goals so near to the commands were not clamped."""
+_NOT_LEARNED: Final = ("timeout", "goal_tolerance", "path_tolerance", "goal_time_tolerance")
+"""Fields of a trajectory that do not make it another motion."""
 _KEY_BYTES: Final = 6
 """Of each of the two numbers of a motion's key: a float64 holds them exactly."""
 
@@ -105,7 +107,7 @@ class IlcController(JointTrajectoryController):
         if command.splice:
             raise ValueError("a motion that is learned begins by itself; take splice out")
         # neither when it begins nor when it is given up is part of a motion: `dxlrun play` leads joints to it
-        motion = command.model_copy(update={"start_in": 0.0, "timeout": None})
+        motion = command.model_copy(update=dict.fromkeys(_NOT_LEARNED) | {"start_in": 0.0})
         digest = hashlib.sha256(super().prepare(kind, motion, parameters).tobytes())
         digest.update(repr((parameters.joints, parameters.command_interface)).encode())
         parts = digest.digest()[: 2 * _KEY_BYTES]

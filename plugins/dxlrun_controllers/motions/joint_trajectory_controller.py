@@ -12,17 +12,17 @@ from pydantic import Field, model_validator
 
 from dxlrun import (
     LIVE,
-    Angle,
     AngularAcceleration,
     CommandModel,
     Context,
     Controller,
     Duration,
-    Floats,
     Goal,
+    GoalTolerances,
     Interfaces,
     Outcome,
     ParametersModel,
+    Tolerance,
 )
 from dxlrun_controllers.joints import (
     CLOSING_SPEED,
@@ -43,6 +43,7 @@ from dxlrun_controllers.motions.trajectory_command import (
     SPLICED,
     ChunkCommand,
     ChunkHead,
+    GoalLimits,
     TrajectoryCommand,
     flat_chunk,
     flat_trajectory,
@@ -58,17 +59,17 @@ _STILL: Final = 1e-3
 
 
 class Tolerances(ParametersModel):
-    """How far a joint may be off, each one angle for all joints or a mapping by joint.
+    """How far a joint may be off, each one distance for all joints or a mapping by joint.
 
-    A tolerance that is left out is not checked.
+    A goal may have its own in place of these.
     """
 
-    path: PerJoint[Angle] | None = None
-    """On the way: beyond it the goal is aborted, and the joints come to rest."""
-    goal: PerJoint[Angle] | None = None
-    """At the end: the goal counts as reached when every joint is nearer than this."""
-    goal_time: Duration = 0
-    """How long after the end the goal may still be reached."""
+    path: PerJoint[Tolerance] | None = None
+    """On the way: beyond it the goal is aborted, and the joints come to rest; left out: not checked."""
+    goal: PerJoint[Tolerance] | None = None
+    """At the end: the goal is reached when every joint is nearer than this; left out: the joint's own."""
+    goal_time: Duration | None = None
+    """How long after the end the goal may still be reached; left out: the joints' own."""
 
 
 class TrajectoryParameters(JointsParameters):
@@ -103,8 +104,6 @@ class TrajectoryParameters(JointsParameters):
 class _Phase(Enum):
     RESTING = auto()
     MOVING = auto()
-    SETTLING = auto()
-    """The trajectory has ended, the goal not yet."""
     STOPPING = auto()
 
 
@@ -159,15 +158,22 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._moves = self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
-        self._start_ns = self._base_ns = self._stop_ns = self._end_ns = self._feedback_ns = self._now_ns = 0
+        self._start_ns = self._base_ns = self._stop_ns = self._feedback_ns = self._now_ns = 0
         self._timeout_ns = np.inf
         self._base_s = self._splice_s = 0.0
         self._speed = self._rate = parameters.speed
         self._slope = 0.0
         """The speed that is wanted; that of now, and how fast it changes, 1/s."""
-        self._path_tolerance = row_of(parameters.tolerances.path, joints)
-        self._goal_tolerance = row_of(parameters.tolerances.goal, joints)
-        self._checks_path = parameters.tolerances.path is not None
+        tolerances = parameters.tolerances
+        self._own = GoalLimits(
+            path=row_of(tolerances.path, joints),
+            path_velocity=np.full(count, np.inf),
+            position=row_of(tolerances.goal, joints, np.nan),
+            velocity=np.full(count, np.nan),
+            settle_s=np.nan if tolerances.goal_time is None else tolerances.goal_time * 1e-9,
+        )
+        self._within = self._own
+        """Tolerances of the goal that is pursued."""
         self._lower, self._upper = limits.lower, limits.upper
         own = row_of(parameters.deceleration, joints, np.nan)
         deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
@@ -230,9 +236,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     ) -> None:
         """Let the joints of a trajectory follow it, which begins `clock_s` after the one before did."""
         since_s, more = self._warped(time_ns) - clock_s, data[flat_size(data) :]
-        track, moved = self._tracks.free(), more[1 : 1 + len(self._moved)] != 0
+        count = len(self._moved)
+        track, moved = self._tracks.free(), more[-count:] != 0
         track.trajectory.load(data, self._path_of(moved), waited_s)
         self._timeout_ns = float(more[0]) * 1e9
+        self._within = self._own.replaced_by(more[1:], count)
         self._take(track, moved)
         if self._refused_for_haste():
             self._brake(time_ns)
@@ -337,9 +345,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._measure(silent=0.0)
             row = int(self._error.argmax())
         after = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s{', ' * bool(text)}{text}"
+        goal.end(outcome, after, self.context.joints[row], float(self._error[row]), self._moved_joints())
+
+    def _moved_joints(self) -> list[str]:
         joints = self.context.joints
-        moved = [joints[each] for each in np.flatnonzero(self._moved).tolist()]
-        goal.end(outcome, after, joints[row], float(self._error[row]), moved)
+        return [joints[each] for each in np.flatnonzero(self._moved).tolist()]
 
     # In a cycle
 
@@ -353,8 +363,6 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._move(time_ns, elapsed)
         elif self._phase is _Phase.STOPPING:
             self._come_to_rest(time_ns)
-        elif self._phase is _Phase.SETTLING:
-            self._settle(time_ns)
         elif self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
         self._command(period_ns)
@@ -368,11 +376,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def _move(self, time_ns: int, elapsed: float) -> None:
         if self._spliced is None and elapsed >= self._trajectory.duration_s:
-            self._phase, self._end_ns = _Phase.SETTLING, time_ns
-            self._settle(time_ns)
+            self._phase = _Phase.RESTING
+            self._hand_over(time_ns)
         elif self._goal is None:
             return
-        elif self._checks_path and (row := self._worst(self._path_tolerance, silent=0.0)) >= 0:
+        elif self._within.checks_path and (row := self._find_off_path()) >= 0:
             self._end(Outcome.ABORTED, time_ns, f"{self._off(row)}, stopping", row)
             self._stop_from(time_ns)
         elif time_ns - self._start_ns > self._timeout_ns:
@@ -409,19 +417,19 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._base_ns, self._rate = time_ns, reached
         return self._base_s
 
-    def _settle(self, time_ns: int) -> None:
-        """End the goal when it is reached, or too late."""
-        tolerances = self.parameters.tolerances
-        row = self._worst(self._goal_tolerance, silent=np.inf)
-        if row < 0:
-            self._phase = _Phase.RESTING
-            self._end(Outcome.REACHED, time_ns)
-        elif time_ns - self._end_ns >= tolerances.goal_time:
-            self._phase = _Phase.RESTING
-            self._end(Outcome.MISSED, time_ns, f"{self._off(row)}, holding", row)
-        elif time_ns - self._start_ns > self._timeout_ns:
-            self._phase = _Phase.RESTING
-            self._time_out(time_ns)
+    def _hand_over(self, time_ns: int) -> None:
+        """Let the goal be judged by its last point, as it was asked."""
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        left_ns = self._timeout_ns - (time_ns - self._start_ns)
+        tolerances = GoalTolerances(
+            self._within.position,
+            self._within.velocity,
+            None if math.isnan(self._within.settle_s) else round(self._within.settle_s * 1e9),
+            round(left_ns) if math.isfinite(left_ns) else None,
+        )
+        goal.judge(self._trajectory.end, joints=self._moved_joints(), tolerances=tolerances)
 
     def _time_out(self, time_ns: int) -> None:
         self._measure(silent=np.inf)
@@ -470,10 +478,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._error = np.where(states.valid, np.abs(states.position - self._desired.position), silent)
         np.copyto(self._error, 0.0, where=self._unmoved)
 
-    def _worst(self, tolerance: Floats, silent: float) -> int:
-        """Return the row of the joint that is farthest off of those beyond their tolerance; -1: none is."""
-        self._measure(silent)
-        beyond = self._error > tolerance
+    def _find_off_path(self) -> int:
+        """Return the row of the joint that is farthest off its path, beyond a tolerance; -1: none is."""
+        self._measure(silent=0.0)
+        states, within = self.context.states, self._within
+        slip = np.abs(states.velocity - self._desired.velocity)
+        beyond = self._error > within.path
+        beyond |= (slip > within.path_velocity) & states.valid & self._moved
         return int(np.where(beyond, self._error, -1.0).argmax()) if beyond.any() else -1
 
     def _off(self, row: int) -> str:

@@ -24,9 +24,11 @@ from dxlrun import (
     Controller,
     Duration,
     Goal,
+    GoalTolerances,
     Interfaces,
     Outcome,
     ParametersModel,
+    Tolerance,
 )
 from dxlrun_controllers.joints import (
     CLOSING_SPEED,
@@ -90,10 +92,10 @@ class KeyframeParameters(ParametersModel):
     """`posvel` commands the speed beside the position; where a step names torques, efforts are too."""
     approach: Annotated[AngularVelocity, Field(gt=0)] = 1.0
     """rad/s; on the way to the first pose of a goal no joint is faster, the way takes longer instead"""
-    tolerance: Annotated[Angle, Field(gt=0)] | None = None
-    """How far a joint may be off at the end; left out: a goal is reached when its time is over."""
-    settle: Duration = 500_000_000
-    """ns after the end in which the tolerance may still be reached"""
+    tolerance: Tolerance | None = None
+    """How far a joint may be off at the end; left out: its own tolerance."""
+    settle: Duration | None = None
+    """ns after the end in which the tolerance may still be reached; left out: the joints' own"""
     speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
     """What all motions are sped up by."""
     partial: bool = False
@@ -219,6 +221,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Joints without torque now; none unless `partial`."""
         self._out = np.zeros(count, dtype=np.bool_)
         """Joints that are left out until the next step: they stay where they had no torque last."""
+        self._asked = np.full(count, np.nan)
+        """rad, the newest pose of each joint as it was asked, before its limits; NaN: none."""
         self._missed = np.zeros(count, dtype=np.bool_)
         """Joints that were left out of the goal for a while."""
         self._stand = np.zeros(count)
@@ -231,7 +235,6 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._now.rest_at(self.context.commands.position)
         self._goal: Goal | None = None
         self._playing = self._stopping = False
-        self._settle_ns = -1
         self._unknown = True
         self._starting = self.parameters.start is not None
 
@@ -251,7 +254,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def _begin(self, motion: str, speed: float, repeat: int) -> None:
         """Begin a motion where the joints are sent, with their speed."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
-        self._playing, self._stopping, self._starting, self._settle_ns = True, False, False, -1
+        self._playing, self._stopping, self._starting = True, False, False
+        self._asked.fill(np.nan)
         parameters = self.parameters
         self._name, self._goal_speed = motion, speed
         self._steps = parameters.steps(motion, repeat)
@@ -267,8 +271,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Bring each joint to rest by its deceleration."""
         if self._stopping:
             return
-        if not self._playing:  # at the end, waiting for its servos
-            self._finish(Outcome.CANCELLED, "stopped at the end")
+        if not self._playing:  # at the end, where its goal is judged
             return
         self._now.velocity *= self._rate
         self._rate = 1.0
@@ -283,11 +286,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if self._starting:
             self._start()
         if self._playing:
-            self._play(dt, time_ns)
+            self._play(dt)
         elif self._stopping:
             self._decelerate(dt)
-        elif self._settle_ns >= 0:
-            self._settle(time_ns)
         elif self._unknown:
             self._hold_where_heard()
 
@@ -328,7 +329,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def _wanted_rate(self) -> float:
         return min(self._goal_speed * self._motion.speed * self.parameters.speed, HIGHEST_RATE)
 
-    def _play(self, dt: float, time_ns: int) -> None:
+    def _play(self, dt: float) -> None:
         self._rate = self._wanted_rate()
         self._time_s += dt * self._rate
         self._done_s += dt * self._rate / self._motion.speed
@@ -338,8 +339,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             if not self._next_step():
                 self._playing = False
                 self._command()
-                self._settle_ns = time_ns
-                self._settle(time_ns)
+                self._hand_over()
                 return
         if self._time_s < self._step_s:
             evaluate(self._piece[: self._order], self._time_s, self._now)
@@ -371,7 +371,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.copyto(start[0], self._now.position)
         np.copyto(start[1], self._now.velocity)
         np.copyto(end[0], start[0])
-        np.copyto(end[0], pose, where=np.isfinite(pose) & ~self._out)
+        posed = np.isfinite(pose) & ~self._out
+        np.copyto(self._asked, pose, where=posed)
+        np.copyto(end[0], pose, where=posed)
         np.clip(end[0], self._lower, self._upper, out=end[0])
         self._step_s, self._pause_s = step.time * 1e-9, step.pause * 1e-9
         if softly:
@@ -406,13 +408,19 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     # The end
 
-    def _settle(self, time_ns: int) -> None:
-        """End the goal when every joint is near enough, or has had its time."""
-        parameters, (worst, joint) = self.parameters, self._worst()
-        if parameters.tolerance is None or worst <= parameters.tolerance:
-            self._finish(Outcome.REACHED, f"played {self._name}")
-        elif time_ns - self._settle_ns >= parameters.settle:
-            self._finish(Outcome.MISSED, f"{joint} is off at its end")
+    def _hand_over(self) -> None:
+        """Let the goal be judged by the last pose of each joint, as it was asked."""
+        moved, text = self._moved_joints(f"played {self._name}")
+        if not moved:
+            self._finish(Outcome.ABORTED, f"played {self._name}")
+            return
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        parameters, count = self.parameters, len(self._asked)
+        near = np.nan if parameters.tolerance is None else float(parameters.tolerance)
+        tolerances = GoalTolerances(np.full(count, near), np.full(count, np.nan), parameters.settle)
+        goal.judge(self._asked.copy(), joints=moved, tolerances=tolerances, text=text)
 
     def _worst(self) -> tuple[float, str]:
         """Return the largest distance from what is commanded, rad, and of which joint; infinite where a servo
@@ -423,15 +431,16 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         return float(error[row]), self.context.joints[row]
 
     def _finish(self, outcome: Outcome, text: str) -> None:
-        self._settle_ns = -1
+        """End the goal without a judgement."""
         goal, self._goal = self._goal, None
         if goal is not None:
-            (worst, joint), joints = self._worst(), self.context.joints
-            named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
-            moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]
-            missed = [each for each, was in zip(joints, self._missed, strict=True) if each in named and was]
-            if missed:
-                text += f", without {', '.join(missed)} for want of torque"
-            if missed and not moved and outcome is not Outcome.CANCELLED:
-                outcome = Outcome.ABORTED
-            goal.end(outcome, text, joint, worst, moved)
+            (worst, joint), (_, text) = self._worst(), self._moved_joints(text)
+            goal.end(outcome, text, joint, worst)
+
+    def _moved_joints(self, text: str) -> tuple[list[str], str]:
+        """Return the joints that the goal moves now, and a text with those that were left out of it."""
+        joints = self.context.joints
+        named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
+        moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]
+        missed = [each for each, was in zip(joints, self._missed, strict=True) if each in named and was]
+        return moved, f"{text}, without {', '.join(missed)} for want of torque" if missed else text

@@ -20,6 +20,7 @@ from dxlrun import (
     Duration,
     Floats,
     Goal,
+    GoalTolerances,
     Interfaces,
     Outcome,
     ParametersModel,
@@ -34,7 +35,10 @@ from dxlrun_controllers.joints import (
     row_of,
 )
 from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
+from dxlrun_controllers.motions.trajectory_command import Near
 
+_HEAD: Final = 3
+"""Numbers in front of the rows of a goal."""
 MOST_PIECES: Final = 256
 """Of one table: the `rows` commands before its goal, and the goal's own rows."""
 
@@ -92,7 +96,10 @@ class SamplesCommand(CommandModel):
     rows: Rows
     """As of `rows`; they follow those."""
     settle: Annotated[float, Field(ge=0, le=3600)] = 0.0
-    """s for which the last row is commanded still, after its period, before the goal is reached"""
+    """s for which the last row is commanded still, after its period, before the goal is judged"""
+    tolerance: Near | None = None
+    """rad or m, how near the joints must be to the last row's positions; left out: that of each joint; `inf`:
+    the goal is reached when its time is over and its joints have torque"""
 
 
 @unique
@@ -121,7 +128,7 @@ class SamplePlayer(Controller[SampleParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: SampleParameters) -> NDArray[np.float64]:
-        """Return the rows one after the other; of `samples` with period and settling time, s, in front.
+        """Return the rows one after the other; of `samples` behind period, settling time and tolerance.
 
         Raises ValueError for a row of another size, or beyond the range of its joint.
         """
@@ -130,7 +137,8 @@ class SamplePlayer(Controller[SampleParameters]):
         rows = _checked(command.rows, parameters).ravel()
         if isinstance(command, RowsCommand):
             return rows
-        return np.concatenate([[command.period, command.settle], rows])
+        tolerance = np.nan if command.tolerance is None else command.tolerance
+        return np.concatenate([[command.period, command.settle, tolerance], rows])
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -188,7 +196,7 @@ class SamplePlayer(Controller[SampleParameters]):
         """Play the rows that were kept, and those of the goal."""
         if self._phase is _Phase.PLAYING:  # that one has ended as preempted, its rows with it
             self._pieces = []
-        self._keep(data[2:])
+        self._keep(data[_HEAD:])
         if len(self._pieces) > MOST_PIECES:
             self._pieces = []
             goal.end(Outcome.ABORTED, f"its table came in more than {MOST_PIECES} pieces")
@@ -198,6 +206,7 @@ class SamplePlayer(Controller[SampleParameters]):
         self._piece = self._first = 0
         self._goal, self._phase = goal, _Phase.PLAYING
         self._start_ns, self._period_ns = time_ns, float(data[0]) * 1e9
+        self._tolerance = float(data[2])
         self._settled_ns = time_ns + round(self._total * self._period_ns + float(data[1]) * 1e9)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
@@ -229,7 +238,7 @@ class SamplePlayer(Controller[SampleParameters]):
         # wake-ups scatter around their deadlines: a row is due half a cycle before its time, at most
         early_ns = min(self._period_ns, period_ns) / 2
         if time_ns + early_ns >= self._settled_ns:
-            self._end(Outcome.REACHED)
+            self._hand_over()
             self._begin_stop(time_ns, over=True)
             return
         index = min(int((elapsed_ns + early_ns) / self._period_ns), self._total - 1)
@@ -284,6 +293,22 @@ class SamplePlayer(Controller[SampleParameters]):
             return
         joint = self.context.joints[row] if row >= 0 else ""
         goal.end(outcome, f"joint {joint} {text}" if joint else text, joint)
+
+    def _hand_over(self) -> None:
+        """Let the goal be judged by its last row; efforts and PWM lead to no position and no rest."""
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        count, positions = len(self._primary), None
+        if np.isfinite(self._tolerance) or np.isnan(self._tolerance):
+            if self._by_position:
+                positions = self._pieces[-1][-self._width :][:count]
+            elif self._interface == "velocity":
+                positions = np.full(count, np.nan)
+        goal.judge(
+            positions,
+            tolerances=GoalTolerances(np.full(count, self._tolerance), np.full(count, np.nan)),
+        )
 
     def _begin_stop(self, time_ns: int, *, over: bool = False) -> None:
         """Let the joints come to rest; `over`: those commanded by position are sent to rest already."""

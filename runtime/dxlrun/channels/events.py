@@ -124,6 +124,10 @@ class Granted(msgspec.Struct, frozen=True):
     granted: bool
 
 
+RUN_ENDED = "the run ended"
+"""Text of a goal that ran when its run ended in order."""
+
+
 class GoalReport(msgspec.Struct, frozen=True):
     """Data of GOAL_ACCEPTED and GOAL_ENDED."""
 
@@ -143,6 +147,17 @@ class GoalReport(msgspec.Struct, frozen=True):
     error: float | None = None
     """How far that joint was from the goal, SI units; None: not known."""
 
+    @property
+    def failed(self) -> bool:
+        """True for a goal that was missed or aborted, but not because the run ended."""
+        return self.status in ("missed", "aborted") and self.text != RUN_ENDED
+
+    @property
+    def sentence(self) -> str:
+        """How a failed goal ended: `arm missed the goal of its trajectory: after 2 s, joint elbow is ...`."""
+        verb = "missed" if self.status == "missed" else "aborted"
+        return f"{self.controller} {verb} the goal of its {self.kind}: {self.text}"
+
 
 class EventSink(Protocol):
     """Takes events; never blocks, never raises."""
@@ -160,7 +175,7 @@ LONGEST_DATA = 4096
 LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 """Bytes of an event's record."""
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
-_MOST_MISSED = 100
+_MOST_FAILED = 100
 _USUAL_EVENT = 192
 
 
@@ -235,8 +250,8 @@ class EventTotals(msgspec.Struct, frozen=True):
     """And takeovers that controllers requested."""
     goals: dict[str, int] = {}
     """How many goals were accepted, and ended in each way."""
-    missed: tuple[str, ...] = ()
-    """Where goals came from that were missed, the first hundred."""
+    failed: tuple[GoalReport, ...] = ()
+    """Goals that were missed or aborted, the first hundred."""
     started_ns: int = 0
     """When the loop started; ns of the run's clock."""
 
@@ -244,20 +259,20 @@ class EventTotals(msgspec.Struct, frozen=True):
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
-    __slots__ = ("_clock", "_errors", "_goals", "_missed", "_started_ns", "_writer")
+    __slots__ = ("_clock", "_errors", "_failed", "_goals", "_started_ns", "_writer")
 
     def __init__(self, writer: Appender, clock: Clock) -> None:
         self._writer = writer
         self._clock = clock
         self._errors = EventCounts()
         self._goals: Counter[str] = Counter()
-        self._missed: list[str] = []
+        self._failed: list[GoalReport] = []
         self._started_ns = 0
 
     @property
     def totals(self) -> EventTotals:
         """What was emitted until now."""
-        return EventTotals(self._errors.groups, dict(self._goals), tuple(self._missed), self._started_ns)
+        return EventTotals(self._errors.groups, dict(self._goals), tuple(self._failed), self._started_ns)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
@@ -267,8 +282,8 @@ class EventRing:
         if code in _GOALS and data:
             report = msgspec.json.decode(data, type=GoalReport)
             self._goals[report.status] += 1
-            if report.status == "missed" and len(self._missed) < _MOST_MISSED:
-                self._missed.append(report.origin)
+            if report.failed and len(self._failed) < _MOST_FAILED:
+                self._failed.append(report)
         elif code == EventCode.LOOP_STARTED:
             self._started_ns = t_ns
         event = Event(

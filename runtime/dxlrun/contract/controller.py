@@ -121,8 +121,9 @@ class Outcome(StrEnum):
     """How a goal ended."""
 
     REACHED = "reached"
+    """Every joint answered, had torque, was within tolerance of its goal and at rest."""
     MISSED = "missed"
-    """Not reached within its tolerance or time."""
+    """A joint was off, or moved still, after the settling time."""
     ABORTED = "aborted"
     """The controller gave it up, was deactivated, or broke its contract."""
     CANCELLED = "cancelled"
@@ -130,8 +131,24 @@ class Outcome(StrEnum):
     """Another goal took its place."""
 
 
+class GoalTolerances(msgspec.Struct, frozen=True):
+    """How near the joints of a goal must come, shape (joints,) in the order of the controller's joints.
+
+    NaN: the tolerance of the joint, by the robot file or its default; infinite: not checked.
+    """
+
+    position: Floats
+    """Distance from the goal, rad or m."""
+    velocity: Floats
+    """Speed below which a joint is at rest, rad/s or m/s."""
+    settle_ns: int | None = None
+    """How long after the end of the motion the goal may still be reached, ns; None: the joints' own."""
+    left_ns: int | None = None
+    """How long the goal may take from now on in any case, ns; None: it has no time-out."""
+
+
 class Goal(Protocol):
-    """A goal that a controller works on, one at a time, until it calls `end`."""
+    """A goal that a controller works on, one at a time, until it calls `judge` or `end`."""
 
     @property
     def number(self) -> int:
@@ -144,6 +161,29 @@ class Goal(Protocol):
     def feedback(self, progress: float, error: float = float("nan")) -> None:
         """Report progress, 0..1, and the largest distance from the desired state; the runtime thins it."""
 
+    def judge(
+        self,
+        positions: Floats | None = None,
+        *,
+        joints: Sequence[str] | None = None,
+        tolerances: GoalTolerances | None = None,
+        text: str = "",
+    ) -> None:
+        """Hand the goal over to the runtime: its motion has ended, and the runtime decides how the goal did.
+
+        The goal is reached when each of its joints has answered, has torque, is within tolerance of its
+        position and is at rest. It is aborted when a joint is lost or has no torque, and missed when a joint
+        is still off after its settling time. Until then the goal runs, and the controller holds its joints.
+
+        Args:
+            positions: Goal of each joint of the controller as it was asked, before any limit, rad or m; NaN:
+                the joint has only to be at rest. None: the goal has no positions, such as one of efforts; its
+                joints have only to answer and to have torque.
+            joints: Joints that the goal moves; None: all joints of the controller.
+            tolerances: Tolerances of this goal; None: those of the joints.
+            text: What the report of the result adds; empty: the time that the goal took.
+        """
+
     def end(
         self,
         outcome: Outcome,
@@ -154,9 +194,9 @@ class Goal(Protocol):
     ) -> None:
         """Report the result, once; `joint` is the worst one, `error` its distance from the goal, SI units.
 
-        `joints` are those that the goal moves, None: all that the controller commands. The goal is aborted
-        instead of reached or missed when one of them is lost or has no torque. While one of them missed a
-        reply or its torque is in doubt, `reached` waits.
+        `joints` are those that the goal moves, None: all that the controller commands. Reached is judged as
+        by `judge`, with the positions that the controller commands now. A goal is aborted instead of missed
+        when one of its joints is lost or has no torque.
         """
 
 

@@ -150,6 +150,30 @@ class Either(Quantity):
         )
 
 
+class Unlimited(Either):
+    """A quantity above 0 of one of several kinds, or `inf`."""
+
+    def __call__(self, text: object) -> Measure:
+        """Return the value in SI, with its unit; an infinite one has none."""
+        if text == "inf" or (isinstance(text, float) and math.isinf(text) and text > 0):
+            return text if isinstance(text, Measure) else Measure(math.inf, "")
+        found = super().__call__(text)
+        if not found > 0:
+            raise refuse(f"{text!r} is not above 0", f"write one such as {self.examples}, or inf")
+        return found
+
+    def text(self, value: float) -> str:
+        """Return the text that is read to a value."""
+        return "inf" if math.isinf(value) else super().text(value)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return the schema of a file in which it is written."""
+        text = super().__get_pydantic_json_schema__(schema, handler)
+        return {"anyOf": [text, {"type": "string", "const": "inf"}]}
+
+
 def _per(units: Mapping[str, float], divisor: str) -> dict[str, float]:
     return {f"{unit}/{divisor}": size for unit, size in units.items()}
 
@@ -288,6 +312,10 @@ speed = Either("a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 5
 acceleration = Either(
     "an acceleration", (angular_acceleration, linear_acceleration), "10 rad/s^2, or 1 m/s^2 of a linear joint"
 )
+tolerance = Unlimited("a tolerance", (angle, length), "5 deg, or 5 mm of a linear joint")
+rest_speed = Unlimited(
+    "a speed at rest", (angular_velocity, linear_velocity), "5 deg/s, or 5 mm/s of a linear joint"
+)
 torque_or_force = Either("a torque or a force", (torque, force), "0.3 Nm, or 2 N of a linear joint")
 
 Angle = Annotated[float, angle]
@@ -315,6 +343,10 @@ Position = Annotated[Measure, position]
 Speed = Annotated[Measure, speed]
 Acceleration = Annotated[Measure, acceleration]
 TorqueOrForce = Annotated[Measure, torque_or_force]
+Tolerance = Annotated[float, Field(allow_inf_nan=True), tolerance]
+"""Distance, rad or m, above 0, or `inf`."""
+RestSpeed = Annotated[float, Field(allow_inf_nan=True), rest_speed]
+"""rad/s or m/s, above 0, or `inf`."""
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
 """Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""
 

@@ -26,6 +26,14 @@ ScheduleName = Literal["absolute", "sequential"]
 """When cycles are due, see `control/schedule.py`. `sequential` has no key in the robot file: it is the
 yardstick of `dxlrun experiment tracking`."""
 
+GOAL_TOLERANCE_RAD, GOAL_TOLERANCE_M = math.radians(5.0), 0.005
+"""Default distance from a goal within which a joint has reached it, rad and m; within the same distance a
+second it is at rest."""
+SETTLE_NS = 1_000_000_000
+"""Default time after the end of a motion in which its goal may still be reached."""
+UNLIMITED = 1e300
+"""Stands for an infinite tolerance: JSON has no infinity."""
+
 MOST_SHARE = 2
 """One part in so many of the period is the most that the clock is polled: the rest is left to others."""
 
@@ -73,6 +81,12 @@ class JointPlan(msgspec.Struct, frozen=True):
     """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
     coupled: tuple[str, ...] = ()
     """The joints that the same servos move, itself among them; empty: none but itself."""
+    tolerance: float | None = None
+    """Distance within which a goal is reached, rad or m, UNLIMITED: any; None: the default"""
+    rest_speed: float | None = None
+    """Speed below which the joint is at rest, rad/s or m/s, UNLIMITED: any; None: the default"""
+    settle_ns: int = SETTLE_NS
+    """How long after the end of a motion its goal may still be reached"""
 
     @property
     def label(self) -> str:
@@ -88,6 +102,18 @@ class JointPlan(msgspec.Struct, frozen=True):
     def highest_effort(self) -> float:
         """The lower one of the file's limit and the servo's highest goal, in the unit of `effort`."""
         return min(_or_inf(self.effort), _or_inf(self.top_effort))
+
+    @property
+    def goal_tolerance(self) -> float:
+        """Distance within which a goal of the joint is reached, rad or m."""
+        default = GOAL_TOLERANCE_M if self.linear else GOAL_TOLERANCE_RAD
+        return default if self.tolerance is None else self.tolerance
+
+    @property
+    def highest_rest_speed(self) -> float:
+        """Speed below which the joint counts as at rest, rad/s or m/s."""
+        default = GOAL_TOLERANCE_M if self.linear else GOAL_TOLERANCE_RAD  # per second
+        return default if self.rest_speed is None else self.rest_speed
 
     @property
     def slow_speed(self) -> float:

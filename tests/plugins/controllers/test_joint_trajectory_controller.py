@@ -152,16 +152,74 @@ def test_a_goal_may_be_reached_within_its_time():
 
 
 @pytest.mark.parametrize(
-    ("answers", "told", "error"),
-    [(True, "joint a is 1.0000 rad off", 1.0), (False, "joint a does not answer", np.inf)],
+    ("answers", "outcome", "told", "error"),
+    [
+        (True, Outcome.MISSED, "joint a is 57.30 deg off", 1.0),
+        (False, Outcome.ABORTED, "joint a has not answered", np.nan),
+    ],
 )
-def test_a_missed_goal_says_by_how_much(answers, told, error):
+def test_a_missed_goal_says_by_how_much(answers, outcome, told, error):
     robot = moving(GOAL)
     robot.states.valid[:] = answers
     path = seen(robot, (0.5, 1.0, 1.4, 1.6, 3.0), follow=False)
-    expected = (Outcome.MISSED, f"after 1.600 s, {told}, holding", "a", pytest.approx(error))
+    expected = (outcome, f"after 1.600 s, {told}", "a", pytest.approx(error, nan_ok=True))
     assert robot.goal.ended == [expected]
     np.testing.assert_allclose(path[-1], 1.3)
+
+
+def test_without_tolerances_a_goal_is_judged_by_those_of_the_joint():
+    robot = moving()
+    robot.states.position[:] = 1.2
+    seen(robot, (0.5, 1.0, 1.5, 1.98), follow=False)
+    assert robot.goal.outcome is None
+    robot.update(2.0, follow=False)
+    told = "after 2.000 s, joint a is 5.73 deg off"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(0.1))]
+
+
+def test_a_goal_is_missed_while_its_joint_moves():
+    robot = moving()
+    robot.states.position[:], robot.states.velocity[:] = 1.3, 4.38
+    seen(robot, (1.0, 2.0), follow=False)
+    told = "after 2.000 s, joint a still moves at 250.96 deg/s"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(0.0))]
+
+
+@pytest.mark.parametrize(
+    ("given", "outcome"),
+    [
+        ({"goal_tolerance": {"a": 0.2}}, Outcome.REACHED),
+        ({"goal_tolerance": {"a": "12 deg"}}, Outcome.REACHED),
+        ({"goal_tolerance": {"a": {"position": "inf"}}}, Outcome.REACHED),
+        ({"goal_tolerance": {"a": 0.05}}, Outcome.MISSED),
+        ({"goal_tolerance": {"a": {"velocity": 1.0}}}, Outcome.MISSED),
+        ({"goal_tolerance": {"a": {"position": 0.2, "velocity": "1 deg/s"}}}, Outcome.MISSED),
+    ],
+)
+def test_a_goal_has_tolerances_of_its_own(given, outcome):
+    robot = started(ONE | {"tolerances": {"goal": "8 deg"}})
+    robot.send(0.0, "trajectory", points=one(1.3), goal_time_tolerance="200 ms", **given)
+    robot.states.position[:], robot.states.velocity[:] = 1.15, np.radians(2.0)
+    seen(robot, (1.0, 1.2), follow=False)
+    assert outcomes(robot) == [outcome]
+
+
+def test_a_goal_has_path_tolerances_of_its_own():
+    for most in (0.1, {"velocity": 0.9}):
+        robot = started()
+        robot.send(0.0, "trajectory", points=one(1.3), path_tolerance={"a": most})
+        robot.update(0.05, follow=False)
+        robot.update(0.15, follow=False)
+        assert outcomes(robot) == [Outcome.ABORTED]
+        robot.send(1.0, "trajectory", points=one(1.3))
+        robot.update(1.5, follow=False)
+        assert robot.goal.outcome is None, "they were those of one goal"
+
+
+def test_a_tolerance_of_a_joint_that_is_not_moved_is_refused():
+    for key in ("goal_tolerance", "path_tolerance"):
+        with pytest.raises(ValueError, match=f"{key} names b, which is not moved"):
+            started(TWO).prepare("trajectory", points=one(1.3), joints=["a"], **{key: {"b": 0.1}})
 
 
 FULL = {"positions": [0.1], "velocities": [0.2], "accelerations": [0.3]}
@@ -257,7 +315,7 @@ def test_joints_that_a_goal_does_not_name_hold():
     robot.send(0.0, "trajectory", joints=["b"], points=one(0.8))
     for time in (0.25, 0.5, 1.0, 2.0):
         np.testing.assert_allclose(robot.update(time), [0.3, -0.2 + min(time, 1.0)])
-    assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.5))]  # of before
+    assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.0))]
 
 
 def test_joints_that_a_goal_does_not_name_go_on_with_theirs_until_a_cancel_stops_all():
@@ -265,7 +323,7 @@ def test_joints_that_a_goal_does_not_name_go_on_with_theirs_until_a_cancel_stops
     robot.update(0.4)
     robot.send(0.5, "trajectory", joints=["b"], points=one(0.3, time=0.2))
     np.testing.assert_allclose(robot.update(0.7), [1.0, 0.3])
-    assert robot.goal.ended == [(Outcome.REACHED, "after 0.200 s", "b", pytest.approx(0.1))]
+    assert robot.goal.ended == [(Outcome.REACHED, "after 0.200 s", "b", pytest.approx(0.0))]
     np.testing.assert_allclose(robot.commands.velocity, [1.0, CLOSING_SPEED])
     robot.send(0.8, "trajectory", joints=["b"], points=one(-0.7))
     np.testing.assert_allclose(robot.update(0.9)[0], 1.2)
@@ -453,12 +511,12 @@ def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named():
     robot.states.position[:] = 0.3, -0.15
     robot.update(0.9, follow=False)
     assert robot.goal.outcome is None
-    robot.update(1.0, follow=False)
-    told = "after 1.000 s, joint a is 1.0000 rad off, holding"
+    seen(robot, (1.0, 2.0), follow=False)
+    told = "after 2.000 s, joint a is 57.30 deg off"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
     robot.states.position[1] = -0.31
-    robot.send(2.0, "trajectory", points=one(1.3, -0.2))
-    robot.update(2.1, follow=False)
+    robot.send(3.0, "trajectory", points=one(1.3, -0.2))
+    robot.update(3.1, follow=False)
     assert robot.goal.ended[0][2:] == ("b", pytest.approx(0.11))
 
 
@@ -468,7 +526,7 @@ def test_feedback_comes_ten_times_a_second_with_progress_and_distance():
         robot.states.position[:] = 0.3 + step * 0.01 - 0.05
         robot.update(step * 0.01, follow=False)
     expected = [(progress, 0.05) for progress in np.arange(0.1, 0.95, 0.1)]
-    np.testing.assert_allclose(robot.goal.progress, expected)
+    np.testing.assert_allclose(robot.goal.progresses, expected)
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0])
@@ -486,7 +544,7 @@ def test_the_time_out_ends_a_goal_that_is_waited_for_too():
     robot = started(ONE | {"tolerances": {"goal": "2 deg", "goal_time": "5 s"}})
     robot.send(0.0, "trajectory", timeout=2, points=one(1.3))
     seen(robot, (1.0, 1.9, 2.1, 9.0), follow=False)
-    told = "after 2.100 s, its time-out: joint a is 1.0000 rad off"
+    told = "after 2.100 s, joint a is 57.30 deg off"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
 
 

@@ -33,7 +33,7 @@ def test_rows_are_played_by_time_whatever_the_joints_answer(player: Any) -> None
     assert seen == [*ROWS, ROWS[-1], ROWS[-1]]
     assert not stage.goal.ended
     stage.update(1.12)
-    assert stage.goal.ended == [(Outcome.REACHED, "", "", pytest.approx(np.nan, nan_ok=True))]
+    assert stage.goal.ended == [(Outcome.REACHED, "after 0.120 s", "a", 0.0)]
     assert stage.update(1.2).tolist() == ROWS[-1]
 
 
@@ -216,3 +216,29 @@ def test_rows_that_come_while_a_table_is_played_end_it(player: Any) -> None:
     stage.send(0.04, "samples", period=0.02, rows=ROWS[3:])
     assert stage.update(0.04).tolist() == ROWS[0]
     assert stage.update(0.06).tolist() == ROWS[3]
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "outcome"),
+    [({}, Outcome.MISSED), ({"tolerance": 0.5}, Outcome.REACHED), ({"tolerance": "inf"}, Outcome.REACHED)],
+)
+def test_a_table_is_judged_by_its_last_row_unless_its_tolerance_is_infinite(
+    player: Any, tolerance: Any, outcome: Outcome
+) -> None:
+    stage = player()
+    stage.send(0.0, "samples", period=0.02, rows=ROWS, **tolerance)
+    stage.states.position[:] = np.array(ROWS[-1]) + 0.2
+    for at in (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 1.2):
+        stage.update(at, follow=False)
+    assert [one[0] for one in stage.goal.ended] == [outcome]
+    assert stage.goal.number
+
+
+def test_velocities_are_reached_at_rest_and_efforts_without_any(player: Any) -> None:
+    for interface, outcome in (("velocity", Outcome.MISSED), ("effort", Outcome.REACHED)):
+        stage = player(interface)
+        stage.send(0.0, "samples", period=0.02, rows=ROWS)
+        stage.states.velocity[:] = 3.0
+        for at in (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 1.2):
+            stage.update(at, follow=False)
+        assert [one[0] for one in stage.goal.ended] == [outcome]

@@ -56,7 +56,7 @@ def test_a_goal_is_reached_with_its_width():
     assert robot.commands.position[0] == pytest.approx(-1.26 + 1.92 * (78 - 60) / 58)
     run(robot, 3.0)
     assert goal.outcome is Outcome.REACHED
-    assert goal.text.startswith("reached at -0.6")
+    assert goal.text.startswith("at -0.6")
     assert "60" in goal.text or "59" in goal.text
     assert goal.error <= 0.02
     assert goal.joint == "gripper"
@@ -236,10 +236,19 @@ def test_a_linear_gripper_reports_lengths():
     goal = robot.ask("grip", width="20 mm")
     assert robot.commands.position[0] == pytest.approx(0.02)
     run(robot, 3.0)
-    assert (goal.outcome, goal.text[:10]) == (Outcome.REACHED, "reached at")
+    assert (goal.outcome, goal.text[:3]) == (Outcome.REACHED, "at ")
     assert " m, " in goal.text
     goal = robot.ask("grip", position="31 mm")
     assert (goal.outcome, goal.text) == (Outcome.ABORTED, "0.031 m is outside its limits 0..0.03 m")
     goal = robot.ask("grip", position="30 mm")
     run(robot, 3.0, blocked_at=0.025)
     assert goal.text.startswith("stalled, holds something at 0.025 m, 10 mm")
+
+
+def test_a_gripper_that_passes_its_goal_has_not_reached_it():
+    robot, goal = gripping(PLAIN | {"timeout": "500 ms"})
+    robot.states.position[0], robot.states.velocity[0] = 0.59, 4.4
+    for _ in range(27):
+        robot.step()
+    assert (goal.outcome, goal.joint) == (Outcome.MISSED, "gripper")
+    assert goal.text.startswith("joint gripper still moves at 252.10 deg/s; at 0.59 rad")

@@ -251,7 +251,9 @@ def test_servos_that_stay_behind_miss():
     play(robot, 1.3, follow=False)
     assert robot.goal.outcome is None
     play(robot, 0.3, follow=False)
-    assert robot.goal.ended == [(Outcome.MISSED, "a is off at its end", "a", pytest.approx(0.5))]
+    assert robot.goal.ended == [
+        (Outcome.MISSED, "joint a is 28.65 deg off; played wave", "a", pytest.approx(0.5))
+    ]
     goal = robot.ask("play", motion="wave")
     play(robot, 1.3, follow=False)
     robot.states.position[:] = robot.commands.position + 0.04
@@ -305,7 +307,7 @@ def test_joints_without_torque_are_left_out_and_join_in_with_the_next_step():
     assert np.abs(np.diff(b)).max() == pytest.approx(0.072, abs=0.001), "a cubic, no jump"
     goal = robot.goal
     assert (goal.outcome, goal.text) == (Outcome.REACHED, "played wave, without b for want of torque")
-    assert goal.joints == ["a", "b"]
+    assert goal.judged == ["a", "b"]
 
 
 def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted():
@@ -313,7 +315,7 @@ def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted():
     robot.states.torque[1] = Torque.RELEASED
     goal = robot.ask("play", motion="wave")
     follow_with_a(robot, 80)
-    assert (goal.outcome, goal.joints) == (Outcome.REACHED, ["a"])
+    assert (goal.outcome, goal.judged) == (Outcome.REACHED, ["a"])
     goal = robot.ask("play", motion="alone")
     play(robot, 1.0, follow=False)
     assert (goal.outcome, goal.text) == (Outcome.ABORTED, "played alone, without b for want of torque")
@@ -326,3 +328,19 @@ def test_a_joint_that_gets_torque_at_rest_stays_where_it_was_led():
     robot.states.torque[1], robot.states.position[1] = Torque.ON, 0.65
     play(robot, 0.1, follow=False)
     assert robot.commands.position.tolist() == [0.0, 0.7]
+
+
+def test_a_pose_beyond_a_limit_is_missed_as_it_was_asked():
+    """The player clamps the pose; the goal is judged by the pose of the robot file."""
+    robot = playing(limits={"lower": -0.3})
+    play(robot, 3.0)
+    told = "joint a is 11.46 deg off; played wave"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(0.2))]
+
+
+def test_without_a_tolerance_a_motion_is_judged_by_those_of_the_joints():
+    robot = playing()
+    play(robot, 2.1, follow=False)
+    assert robot.goal.outcome is None
+    play(robot, 0.2, follow=False)
+    assert robot.goal.outcome is Outcome.MISSED

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, Refusal
-from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord
+from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
-from dxlrun.contract.controller import Outcome
+from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.messages import Header
+from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
 
 FEEDBACK_NS = 100_000_000
 """Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""
@@ -27,7 +28,6 @@ GOALS_TOPIC = "/goals"
 KEPT = 256
 """Of so many goals that ended it is known how."""
 _LONGEST_TEXT = 500
-_JUDGED = (Outcome.REACHED, Outcome.MISSED)
 _WARNED = (Outcome.MISSED, Outcome.ABORTED)
 CERTAIN_NS = 500_000_000
 """How long `reached` waits for replies and torque that are in doubt; at least LOST_CYCLES periods. [i]"""
@@ -63,6 +63,9 @@ class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many numbers each command has."""
     end_ns: int = 0
     """When the part is over."""
+    positions: tuple[float | None, ...] = ()
+    """Goal of each joint of the controller at the end, rad or m, None: it has none; empty: the part has no
+    positions."""
 
 
 class PlayedMotion(msgspec.Struct):
@@ -83,23 +86,41 @@ class PlayedMotion(msgspec.Struct):
         return None
 
     def report(self, time_ns: int) -> None:
-        """Report its progress, and its end."""
+        """Report its progress; at its end hand the goal over to be judged."""
         passed_ns, end_ns = time_ns - self.begun_ns, self.part.end_ns
+        if self.goal.is_judged:
+            return
         if self.next == len(self.commands) and passed_ns >= end_ns:
-            self.goal.end(Outcome.REACHED, "all commands were given")
+            given = self.part.positions
+            positions = np.array([np.nan if one is None else one for one in given]) if given else None
+            self.goal.judge(positions, text="all commands were given")
         else:
             self.goal.feedback(min(1.0, passed_ns / end_ns) if end_ns > 0 else 0.0)
 
 
-class Result(NamedTuple):
-    """What `Goal.end` was given, and until when `reached` may become certain."""
+class _Target(NamedTuple):
+    """Where one joint of a goal was asked to be, and how near is near enough."""
 
-    text: str
     joint: str
-    error: float
-    joints: Sequence[str] | None
-    """By which the goal is judged; None: those that its controller commands."""
-    certain_by_ns: int = 0
+    row: int
+    position: float
+    """As it was asked, before any limit, rad or m; NaN: no position."""
+    tolerance: float
+    """rad or m"""
+    rest_speed: float
+    """Speed below which the joint is at rest, rad/s or m/s."""
+    linear: bool
+
+
+class _Judgement(NamedTuple):
+    """A goal whose motion has ended: what it is judged by, and until when it may be reached."""
+
+    targets: tuple[_Target, ...]
+    text: str
+    settled_ns: int
+    """Last time at which a joint may still come within its tolerance; ns of the run's clock."""
+    certain_ns: int
+    """Last time at which a missing reply, or a torque in doubt, may become certain."""
 
 
 class RunningGoal:
@@ -116,20 +137,39 @@ class RunningGoal:
         """None while it runs."""
         self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""
         """As reported last."""
-        self.result: Result | None = None
-        """Of a goal that counts as reached when its joints are certain."""
+        self.judgement: _Judgement | None = None
+        """None until the motion has ended."""
+        self.accepted_ns = goals.now_ns
+        """ns of the run's clock."""
         self._goals = goals
         self._reported_ns = -FEEDBACK_NS
 
+    @property
+    def is_judged(self) -> bool:
+        """True from the end of the motion on: the runtime decides how the goal ends."""
+        return self.judgement is not None
+
     def feedback(self, progress: float, error: float = math.nan) -> None:
         """Report progress, 0..1, and the largest distance from the desired state, SI units."""
-        if self.outcome is not None or self.result is not None:
+        if self.outcome is not None or self.is_judged:
             return
         self.progress, self.error = float(progress), float(error)
         now_ns = self._goals.now_ns
         if now_ns - self._reported_ns >= FEEDBACK_NS:
             self._reported_ns = now_ns
             self._goals.publish(self, "running")
+
+    def judge(
+        self,
+        positions: Floats | None = None,
+        *,
+        joints: Sequence[str] | None = None,
+        tolerances: GoalTolerances | None = None,
+        text: str = "",
+    ) -> None:
+        """Let the joints' states decide how the goal ends, see `controller.Goal.judge`."""
+        if self.outcome is None and not self.is_judged:
+            self._goals.begin_judging(self, positions, joints, tolerances, text)
 
     def end(
         self,
@@ -143,8 +183,13 @@ class RunningGoal:
 
         Reached and missed are judged by the joints' states, see `controller.Goal.end`.
         """
-        if self.outcome is None:
-            self._goals.judge(self, Outcome(outcome), Result(text, joint, float(error), joints))
+        if self.outcome is not None:
+            return
+        outcome = Outcome(outcome)
+        if outcome is Outcome.REACHED:
+            self.judge(self._goals.commanded_positions(self.controller), joints=joints, text=text)
+        else:
+            self._goals.end(self, outcome, text=text, joint=joint, error=float(error), joints=joints)
 
 
 class Goals:
@@ -154,11 +199,12 @@ class Goals:
         self,
         record: CycleRecord,
         events: EventSink,
-        joints: Sequence[str] = (),
-        commanded: Callable[[str], Sequence[str]] = lambda controller: (),
+        joints: Sequence[JointPlan] = (),
+        commanded: Callable[[str], tuple[Sequence[str], Floats | None]] = lambda controller: ((), None),
     ) -> None:
-        """`joints` are the robot's, `commanded` returns those of a controller by its name."""
-        self._rows = {joint: row for row, joint in enumerate(joints)}
+        """`joints` are the robot's. `commanded` returns by a controller's name the joints that it commands,
+        and the positions that it commands now; None: it commands none."""
+        self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
         """Number of the newest one."""
@@ -200,32 +246,120 @@ class Goals:
             return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
         return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
 
-    def judge(self, goal: RunningGoal, outcome: Outcome, result: Result) -> None:
-        """End a goal, but let `reached` wait until its joints are certain.
+    def commanded_positions(self, controller: str) -> Floats | None:
+        """Return a copy of the positions that a controller commands now; None: it commands none."""
+        positions = self._commanded(controller)[1]
+        return None if positions is None else positions.copy()
 
-        One that is reached or missed is aborted instead when a joint goes nowhere, and that joint named.
+    def begin_judging(
+        self,
+        goal: RunningGoal,
+        positions: Floats | None,
+        joints: Sequence[str] | None,
+        tolerances: GoalTolerances | None,
+        text: str,
+    ) -> None:
+        """Judge a goal whose motion has ended, from this cycle on; see `controller.Goal.judge`."""
+        names, now_ns = self._commanded(goal.controller)[0], self.now_ns
+        settle_ns = None if tolerances is None else tolerances.settle_ns
+        targets, longest_ns = [], 0
+        for index, name in enumerate(names):
+            if joints is not None and name not in joints:
+                continue
+            row, plan = self._joints[name]
+            longest_ns = max(longest_ns, plan.settle_ns)
+            position, near, slow = math.nan, math.nan, math.nan
+            if positions is not None:
+                position = float(positions[index])
+            if tolerances is not None:
+                near, slow = float(tolerances.position[index]), float(tolerances.velocity[index])
+            near = plan.goal_tolerance if math.isnan(near) else near
+            slow = plan.highest_rest_speed if math.isnan(slow) else slow
+            if positions is None:
+                slow = UNLIMITED
+            targets.append(_Target(name, row, position, near, slow, plan.linear))
+        settle_ns = longest_ns if settle_ns is None else settle_ns
+        if tolerances is not None and tolerances.left_ns is not None:
+            settle_ns = min(settle_ns, tolerances.left_ns)
+        settled_ns = now_ns + settle_ns
+        certain_ns = now_ns + max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
+        goal.judgement = _Judgement(tuple(targets), text, settled_ns, max(settled_ns, certain_ns))
+        self._judge(goal, goal.judgement)
+
+    def _judge(self, goal: RunningGoal, judgement: _Judgement, *, last: bool = False) -> None:
+        """End a goal as its joints' states decide; one that may still be reached goes on, unless this is the
+        `last` cycle."""
+        states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.now_ns
+        rows = [target.row for target in targets]
+        unable = states.unable(rows)
+        doubtful = None if unable is not None else states.doubtful(rows)
+        if doubtful is not None and now_ns < judgement.certain_ns and not last:
+            return
+        found = unable or doubtful
+        outcome, joint, error = Outcome.REACHED, "", math.nan
+        if found is not None:
+            joint = targets[rows.index(found[0])].joint
+            outcome, reason = Outcome.ABORTED, f"joint {joint} {found[1]}"
+        else:
+            joint, error, reason = self._find_worst(targets)
+            if reason and now_ns < judgement.settled_ns and not last:
+                return
+            outcome = Outcome.MISSED if reason else Outcome.REACHED
+        if text:
+            text = f"{reason}; {text}" if reason else text
+        else:
+            text = f"after {(now_ns - goal.accepted_ns) * 1e-9:.3f} s{', ' * bool(reason)}{reason}"
+        self._close(goal, outcome, text, joint, error)
+
+    def _find_worst(self, targets: Sequence[_Target]) -> tuple[str, float, str]:
+        """Return the joint that is farthest off, its distance, and why the goal is not reached; empty: it is.
+
+        A joint that is beyond its tolerance comes before one that moves, that before one that is near enough.
         """
-        text, joint, error, joints, _ = result
-        names = self._commanded(goal.controller) if joints is None else joints
-        if outcome in _JUDGED and names:
-            states, rows = self._record.states, [self._rows[name] for name in names]
-            found = states.unable(rows)
-            if found is None and outcome is Outcome.REACHED and (found := states.doubtful(rows)):
-                now_ns = self.now_ns
-                if goal.result is None:
-                    wait_ns = max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
-                    goal.result = Result(text, joint, error, tuple(names), now_ns + wait_ns)
-                if now_ns < goal.result.certain_by_ns:
-                    return
-            if found is not None:
-                at, why = found
-                error = error if names[rows.index(at)] == joint else math.nan
-                outcome, joint = Outcome.ABORTED, names[rows.index(at)]
+        states = self._record.states
+        worst: tuple[int, float, str, float, str] = (0, -1.0, "", math.nan, "")
+        for target in targets:
+            error = abs(states.position.item(target.row) - target.position)
+            speed = abs(states.velocity.item(target.row))
+            rank, off, reason = 0, 0.0 if math.isnan(error) else error, ""
+            if error > target.tolerance:
+                rank, reason = 2, f"joint {target.joint} is {_amount(error, target.linear)} off"
+            elif speed > target.rest_speed:
+                rank, off = 1, speed
+                reason = f"joint {target.joint} still moves at {_amount(speed, target.linear)}/s"
+            if (rank, off) > worst[:2]:
+                name = "" if math.isnan(error) and not reason else target.joint
+                worst = rank, off, name, error, reason
+        return worst[2:]
+
+    def end(
+        self,
+        goal: RunningGoal,
+        outcome: Outcome,
+        *,
+        text: str,
+        joint: str,
+        error: float,
+        joints: Sequence[str] | None,
+    ) -> None:
+        """End a goal for its controller; one that is missed is aborted where one of its joints goes nowhere,
+        and that joint is named."""
+        names = self._commanded(goal.controller)[0] if joints is None else joints
+        if outcome is Outcome.MISSED and names:
+            rows = [self._joints[name][0] for name in names]
+            if (found := self._record.states.unable(rows)) is not None:
+                unable, why = names[rows.index(found[0])], found[1]
+                error = error if unable == joint else math.nan
+                outcome, joint = Outcome.ABORTED, unable
                 text = f"joint {joint} {why}{'; ' * bool(text)}{text}"
-        goal.outcome, goal.result = outcome, None
+        self._close(goal, outcome, text, joint, error)
+
+    def _close(self, goal: RunningGoal, outcome: Outcome, text: str, joint: str, error: float) -> None:
+        goal.outcome, goal.judgement = outcome, None
         goal.error, goal.joint, goal.text = error, _writable(joint), _writable(text)
         if not goal.text and goal.joint and math.isfinite(error):
-            goal.text = f"{goal.joint} is {error:.4g} off"
+            linear = goal.joint in self._joints and self._joints[goal.joint][1].linear
+            goal.text = f"joint {goal.joint} is {_amount(error, linear)} off"
         if outcome is Outcome.REACHED:
             goal.progress = 1.0
         del self.running[goal.number]
@@ -234,11 +368,11 @@ class Goals:
         severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
         self._report(goal, EventCode.GOAL_ENDED, severity, outcome.value, sentence)
 
-    def settle(self) -> None:
-        """Judge again the goals whose results wait for their joints' replies and torque."""
+    def judge_running(self, *, last: bool = False) -> None:
+        """Judge the goals whose motions have ended; in the `last` cycle of a run none may wait any longer."""
         for goal in tuple(self.running.values()):
-            if goal.result is not None:
-                self.judge(goal, Outcome.REACHED, goal.result)
+            if goal.judgement is not None:
+                self._judge(goal, goal.judgement, last=last)
 
     def _report(
         self, goal: RunningGoal, code: EventCode, severity: Severity, status: str, sentence: str
@@ -258,6 +392,11 @@ class Goals:
         message.origin, message.status, message.progress = goal.origin, status, goal.progress
         message.error, message.joint, message.text = goal.error, goal.joint, goal.text
         self._publisher.publish(message)
+
+
+def _amount(value: float, linear: bool) -> str:
+    """Return a distance, rad or m, in the unit in which users write it."""
+    return f"{value * 1e3:.2f} mm" if linear else f"{math.degrees(value):.2f} deg"
 
 
 def _writable(text: object) -> str:

@@ -291,6 +291,11 @@ class Managed:
             self._goal = None
         return self._goal
 
+    @property
+    def commanded_positions(self) -> Floats | None:
+        """Positions that it commands now, rad or m, before any limit; None: it commands none."""
+        return self._outputs.commands.position if "position" in self.plan.command else None
+
     def adopt(self, goal: RunningGoal) -> None:
         """Have a goal that the runtime leads for it, by plain commands."""
         self._goal = goal
@@ -311,9 +316,11 @@ class Managed:
         if goal.kind not in self.controller.Goals:
             goal.end(Outcome.CANCELLED)
             return
-        goal.cancelling = True
+        goal.cancelling, judged = True, goal.is_judged
         self._inputs.gather()
         self._call(ControllerMethod.ON_CANCEL, "", self.controller.on_cancel, goal, time_ns)
+        if judged:  # its controller has handed it over, and does not end it
+            goal.end(Outcome.CANCELLED, "stopped at its end")
 
     def change_parameters(self, values: LiveValues, time_ns: int) -> None:
         """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name

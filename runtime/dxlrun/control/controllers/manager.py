@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
 from dxlrun.channels.commands import Command, CommandSink, NoCommands, TakenCommand
-from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord
+from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.kept import KeptStates
 from dxlrun.clock import Clock
@@ -80,7 +80,7 @@ class Manager:
         """What controllers request of the run in this cycle."""
         self._next = 0  # of the plan's commands
         self._lost: Collection[int] = ()
-        self._goals = Goals(record, events, [joint.name for joint in plan.joints], self._commanded)
+        self._goals = Goals(record, events, plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """What is played by commands, by controller."""
 
@@ -113,7 +113,7 @@ class Manager:
         if self._next < len(self._plan.commands):
             self._hand_over(time_ns)
         if self._goals.running:
-            self._goals.settle()
+            self._goals.judge_running()
         if self._motions:
             self._play_on(time_ns)
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
@@ -143,7 +143,11 @@ class Manager:
                 self.switching.execute(request, time_ns)
 
     def deactivate(self, time_ns: int) -> None:
-        """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`."""
+        """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`.
+
+        Goals whose motions have ended are judged now: their settling time is cut by the end of the run.
+        """
+        self._goals.judge_running(last=True)
         self.switching.deactivate_all(time_ns)
         self._keeping.finish()
 
@@ -166,8 +170,9 @@ class Manager:
             if command.lease_ns:
                 return Refusal(Code.GOAL_STREAMED, {"controller": managed.plan.name, "kind": kind})
             return self._begin_goal(managed, kind, data, command.origin, time_ns)
-        if (motion := self._motions.get(managed.plan.name)) is not None:
-            motion.goal.end(Outcome.PREEMPTED, "another command took its place")
+        goal = managed.goal
+        if goal is not None and (goal.is_judged or managed.plan.name in self._motions):
+            goal.end(Outcome.PREEMPTED, "another command took its place")
         streaming = command.lease_ns and managed.until_ns
         try:
             managed.command(kind, data, time_ns)
@@ -367,10 +372,12 @@ class Manager:
             if motion.goal.outcome is not None:
                 del self._motions[name]
 
-    def _commanded(self, controller: str) -> tuple[str, ...]:
-        """Return the joints that a controller commands, directly or through others."""
-        plan = self._named[controller].plan
-        return plan.joints if plan.command else ()
+    def _commanded(self, controller: str) -> tuple[tuple[str, ...], Floats | None]:
+        """Return the joints that a controller commands, directly or through others, and the positions that it
+        commands now; None: it commands none."""
+        managed = self._named[controller]
+        plan = managed.plan
+        return plan.joints if plan.command else (), managed.commanded_positions
 
     # Loading
 

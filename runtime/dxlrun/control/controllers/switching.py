@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, CycleRecord
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import RUN_ENDED, EventCode, EventSink, Severity
 from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Event, Managed, Request, State
@@ -149,7 +149,7 @@ class Switching:
         """Deactivate all controllers, those above first, else the last one first; raises nothing."""
         standing = self.standing
         for name in uppers_first(tuple(standing.active)[::-1], standing.known):
-            self._deactivate(self.named[name], time_ns, "the run ended")
+            self._deactivate(self.named[name], time_ns, RUN_ENDED)
         for group in self.groups:
             self._end_switch(group.number, Refusal(Code.RUN_ENDING))
         self.groups = []

@@ -1,0 +1,161 @@
+"""Goals of whole robots on virtual time: reached, missed and aborted, compared with the simulated shafts."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.kit.clients import Ask, steered
+from tests.kit.commands import Dxlrun
+
+from dxlrun.channels.events import EventCode
+from dxlrun.run.virtual_run import VirtualRobot
+
+BUSES = """
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}, return_delay_time: 0 us}
+"""
+FAR_GOAL = f"""
+name: far_goal{BUSES}
+loop: {{rate: 50}}
+joints:
+  reel:
+    {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true,
+     limits: {{velocity: 2 rad/s}}}}
+  elbow:
+    {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1,
+     limits: {{position: [-90 deg, 90 deg], velocity: 1 rad/s}}}}
+controllers:
+  reel: {{type: joint_trajectory_controller, joints: [reel]}}
+  elbow: {{type: joint_trajectory_controller, joints: [elbow]}}
+"""
+FAR = """
+name: far
+motions:
+  - controller: reel
+    points:
+      - {time: 1 s, joints: {reel: {position: 0 rad}}}
+      - {time: 3 s, joints: {reel: {position: 8 rad}}}
+"""
+PEAK = """
+name: peak
+motions:
+  - controller: elbow
+    points:
+      - {time: 1 s, joints: {elbow: {position: -80 deg, velocity: 0 deg/s}}}
+      - {time: 4 s, joints: {elbow: {position: 80 deg, velocity: 0 deg/s}}}
+"""
+SOFT_GRIP = f"""
+name: omx{BUSES}
+loop: {{rate: 100}}
+joints:
+  j1:
+    {{bus: main, id: 1, model: XL330-M288, reference: 180 deg, direction: 1,
+     limits: {{position: [-90 deg, 90 deg], velocity: 2 rad/s}}}}
+  grip:
+    {{bus: main, id: 2, model: XL330-M288, reference: 180 deg, direction: 1,
+     limits: {{position: [-90 deg, 90 deg], velocity: 2 rad/s}}}}
+controllers:
+  arm: {{type: joint_trajectory_controller, joints: [j1, grip], into: [soft]}}
+  soft: {{type: thermal_governor, joints: [j1, grip], command_interface: poseffort, limit: 60}}
+"""
+CANCEL_LIMIT = f"""
+name: cancel_limit{BUSES}
+loop: {{rate: 100}}
+joints:
+  elbow:
+    {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
+     limits: {{position: [-90 deg, 60 deg], velocity: 4 rad/s, acceleration: 10 rad/s^2}}}}
+controllers:
+  arm: {{type: joint_trajectory_controller, joints: [elbow]}}
+"""
+
+
+def written(directory: Path, text: str, name: str = "robot.yaml") -> Path:
+    path = directory / name
+    path.write_text(text)
+    return path
+
+
+def shaft(robot: VirtualRobot, number: int) -> float:
+    """Return where the shaft of a servo stands, rad from the middle of its turn."""
+    return robot.buses[0].servo(number).position - math.pi
+
+
+def ended(run: Any) -> list[dict[str, Any]]:
+    """Return how the goals ended, in order."""
+    return [json.loads(event.data) for event in run.log.events if event.code == EventCode.GOAL_ENDED]
+
+
+@pytest.fixture
+def play(tmp_path: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run a robot with a motion from the command line; return what the run and `analyze` said."""
+
+    def played(robot: str, motion: str) -> tuple[Any, Any]:
+        monkeypatch.chdir(tmp_path)
+        ran = dxlrun(
+            written(tmp_path, robot), "--virtual", "--play", written(tmp_path, motion, "motion.yaml")
+        )
+        (log,) = [line.split()[1] for line in ran.out.splitlines() if line.startswith("log: ")]
+        return ran, dxlrun("analyze", log)
+
+    return played
+
+
+def test_a_played_goal_that_the_velocity_limit_holds_back_is_missed(play):
+    ran, analyzed = play(FAR_GOAL, FAR)
+    assert ran.code == 1
+    assert "failed: " in ran.out
+    assert "reel missed the goal of its trajectory: after 3.980 s, joint reel is " in ran.out
+    for said in (ran.out, analyzed.out):
+        assert "joint reel is 12" in said, "it is 4.15 rad off at the end, and has one second more"
+    assert analyzed.code == 1
+    assert analyzed.out.splitlines()[0].startswith("Not good: ")
+    assert "(reel 12" in analyzed.out
+    assert "0 of 1 goal reached" in analyzed.out
+
+
+def test_a_played_goal_that_is_aborted_at_once_fails_the_run(play):
+    ran, analyzed = play(FAR_GOAL, PEAK)
+    assert (ran.code, analyzed.code) == (1, 1)
+    assert "failed: " in ran.out
+    assert "elbow aborted the goal of its trajectory" in ran.out
+    assert analyzed.out.splitlines()[0].startswith("Not good: ")
+
+
+def test_a_jammed_gripper_under_a_trajectory_is_missed(tmp_path):
+    def jam(robot: VirtualRobot) -> None:
+        bus = robot.buses[0]
+        bus.at(500_000_000, lambda: bus.servo(2).jam(True))
+
+    to = {"points": [{"time": 1.0, "positions": [math.radians(40)] * 2}]}
+    run = steered(
+        tmp_path, written(tmp_path, SOFT_GRIP), 3.0, [Ask(0.45, "arm", "trajectory", to)], before=jam
+    )
+    (goal,) = ended(run)
+    off = math.radians(40) - shaft(run.robot, 2)
+    assert off > math.radians(30)
+    assert (goal["status"], goal["joint"]) == ("missed", "grip")
+    assert goal["error"] == pytest.approx(off, abs=0.01)
+    assert shaft(run.robot, 1) == pytest.approx(math.radians(40), abs=0.05)
+
+
+def test_a_cancel_near_a_limit_stops_inside_it(tmp_path):
+    asks = [
+        Ask(0.2, "arm", "trajectory", {"points": [{"time": 0.65, "positions": [math.radians(-88)]}]}),
+        Ask(2.5, "arm", "trajectory", {"points": [{"time": 0.66, "positions": [math.radians(59)]}]}),
+        Ask(3.1, "", "cancel", {"controller": "arm"}),
+    ]
+    farthest = [0.0]
+
+    def watch(robot: VirtualRobot) -> None:
+        bus = robot.buses[0]
+        for at_ms in range(2500, 5000, 5):
+            bus.at(at_ms * 1_000_000, lambda: farthest.append(shaft(robot, 1)))
+
+    run = steered(tmp_path, written(tmp_path, CANCEL_LIMIT), 5.0, asks, before=watch)
+    assert [goal["status"] for goal in ended(run)] == ["reached", "cancelled"]
+    assert math.radians(30) < max(farthest) < math.radians(60.5)
