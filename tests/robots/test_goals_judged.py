@@ -159,3 +159,31 @@ def test_a_cancel_near_a_limit_stops_inside_it(tmp_path):
     run = steered(tmp_path, written(tmp_path, CANCEL_LIMIT), 5.0, asks, before=watch)
     assert [goal["status"] for goal in ended(run)] == ["reached", "cancelled"]
     assert math.radians(30) < max(farthest) < math.radians(60.5)
+
+
+HELD_OFF = """
+name: held_off
+motions:
+  - controller: reel
+    points:
+      - {time: 1 s, joints: {reel: {position: 0 rad}}}
+      - {time: 3 s, joints: {reel: {position: 4.2 rad}}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "status"),
+    [
+        ("", "reached"),
+        ("tolerance: {time: 0 s}, ", "missed"),
+        ("tolerance: {position: inf, velocity: inf, time: 0 s}, ", "reached"),
+        ("tolerance: {position: 30 deg, velocity: inf, time: 0 s}, ", "reached"),
+        ("tolerance: 0.01 deg, ", "missed"),
+    ],
+)
+def test_the_tolerance_of_a_joint_decides(tmp_path, tolerance, status):
+    """At the end of its motion the joint is 0.2 rad behind, and 0.1 s later at its goal."""
+    robot = FAR_GOAL.replace("id: 1, ", f"id: 1, {tolerance}")
+    run = steered(tmp_path, written(tmp_path, robot), 5.0, play=[written(tmp_path, HELD_OFF, "motion.yaml")])
+    (goal,) = ended(run)
+    assert goal["status"] == status, goal

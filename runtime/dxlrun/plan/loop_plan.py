@@ -87,6 +87,7 @@ class JointPlan(msgspec.Struct, frozen=True):
     """Speed below which the joint is at rest, rad/s or m/s, UNLIMITED: any; None: the default"""
     settle_ns: int = SETTLE_NS
     """How long after the end of a motion its goal may still be reached"""
+    wrap: bool = False  # A continuous joint to which a turn more is the same place
 
     @property
     def label(self) -> str:

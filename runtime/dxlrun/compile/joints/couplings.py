@@ -70,7 +70,9 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
                     known,
                     matrix=((1.0 / count,) * count,),
                     inverse=((1.0,),) * count,
-                    tolerance=float(joint.tolerance or (TOLERANCE_M if joint.linear else TOLERANCE_RAD)),
+                    tolerance=float(
+                        joint.tolerance.servos or (TOLERANCE_M if joint.linear else TOLERANCE_RAD)
+                    ),
                     transmission=False,
                 )
                 if _agree(file, coupling):

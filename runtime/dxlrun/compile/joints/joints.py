@@ -28,7 +28,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.description.units import plain
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.mode_plan import model_modes
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
 _UNITS: Mapping[str, str] = {
@@ -185,7 +185,16 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         servo_model=first.servo_model if coupling is None else None,
         linear=first.described.linear,
         coupled=() if coupling is None or len(coupling.joints) < 2 else coupling.joints,
+        tolerance=_limited(joint.tolerance.position),
+        rest_speed=_limited(joint.tolerance.velocity),
+        settle_ns=SETTLE_NS if joint.tolerance.time is None else joint.tolerance.time,
+        wrap=joint.wrap,
     )
+
+
+def _limited(tolerance: float | None) -> float | None:
+    """Return a tolerance as plans have it: JSON has no infinity."""
+    return None if tolerance is None else min(float(tolerance), UNLIMITED)
 
 
 def _servo_label(servos: Sequence[CompiledServo]) -> str:

@@ -7,21 +7,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema
+from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from dxlrun.description.document import KeyPath
 from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
+    GoalTolerance,
     Limits,
     MotorFile,
     OneOfServos,
     Register,
     ServoId,
-    Tolerance,
+    SharedTolerance,
     TravelPerTurn,
 )
 from dxlrun.description.units import (
@@ -95,6 +96,24 @@ class BareJoint(Form):
     continuous: bool = key("A wheel, or a joint of many turns; it needs no position limits.", "true", False)
     torque: OnOff = key("off: it is limp from the start, until `dxlrun torque on`.", "off", True)
     limits: Limits = key("Where it may go, and how fast.", "{position: [-90 deg, 90 deg]}", Limits())
+    tolerance: GoalTolerance = key(
+        "How near its goal it must come to have reached it.",
+        "{position: 2 deg, velocity: 2 deg/s, time: 2 s}",
+        GoalTolerance(),
+    )
+    wrap: bool = key(
+        "A continuous joint that goes the shorter way: a turn more is the same place.", "true", False
+    )
+
+    @model_validator(mode="after")
+    def _wraps_where_continuous(self) -> Self:
+        if self.wrap and not self.continuous:
+            raise refuse(
+                "wrap is for continuous joints: another joint has one way alone",
+                "write continuous: true, or take wrap out",
+            )
+        return self
+
     simulation: JointSimulation = key(
         "What its servos move when they are simulated.", "{inertia: 0.01 kg m^2}", JointSimulation()
     )
@@ -148,10 +167,10 @@ class SharedJoint(ServoJoint):
     servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = key(
         "Its servos; what one does not have is the joint's.", "[{id: 1}, {id: 2, direction: -1}]"
     )
-    tolerance: Tolerance | None = key(
-        "By how much its servos may disagree, as a position of the joint; 3 deg or 1 mm when absent.",
-        "3 deg",
-        None,
+    tolerance: SharedTolerance = key(
+        "How near its goal it must come to have reached it, and by how much its servos may disagree.",
+        "{servos: 3 deg, position: 2 deg}",
+        SharedTolerance(),
     )
 
 
@@ -193,6 +212,9 @@ _MEASURES: Mapping[KeyPath, tuple[Either, tuple[str, str]]] = {
     ("simulation", "friction"): (torque_or_force, ("0.05 Nm", "2 N")),
     ("simulation", "gravity"): (torque_or_force, ("0.3 Nm", "1.5 N")),
     ("tolerance",): (position, ("3 deg", "1 mm")),
+    ("tolerance", "servos"): (position, ("3 deg", "1 mm")),
+    ("tolerance", "position"): (position, ("2 deg", "2 mm")),
+    ("tolerance", "velocity"): (speed, ("2 deg/s", "2 mm/s")),
 }
 """Keys whose unit goes with the joint: how they are written where it turns, and where it is linear."""
 _TURNING: Mapping[KeyPath, str] = {

@@ -7,12 +7,31 @@ joint of one servo is q = s, of several servos the mean of theirs, and a transmi
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import CoreSchema
 
+from dxlrun.description import units
 from dxlrun.description.form import Form, Name, key, refuse
-from dxlrun.description.units import Acceleration, Angle, Effort, Length, Measure, Position, Speed
+from dxlrun.description.units import (
+    Acceleration,
+    Angle,
+    Duration,
+    Effort,
+    Length,
+    Measure,
+    Position,
+    RestSpeed,
+    Speed,
+)
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
 """Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
@@ -37,6 +56,47 @@ def _useful(value: Measure) -> Measure:
 
 Tolerance = Annotated[Position, Field(gt=0), AfterValidator(_useful)]
 """By how much servos of one joint may disagree, rad or m."""
+
+
+class GoalTolerance(Form):
+    """How near its goal a joint must come, and how slow, to have reached it."""
+
+    alone: ClassVar[str] = "position"
+    """What a tolerance without keys is."""
+    position: units.Tolerance | None = key(
+        "Distance from its goal; 5 deg or 5 mm when absent, inf: any.", "2 deg", None
+    )
+    velocity: RestSpeed | None = key(
+        "Speed below which it is at rest; 5 deg/s or 5 mm/s when absent, inf: any.", "2 deg/s", None
+    )
+    time: Duration | None = key(
+        "How long after the end of a motion its goal may still be reached; 1 s when absent.", "2 s", None
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_one_value(cls, data: object) -> object:
+        """Accept one value alone."""
+        return {cls.alone: data} if isinstance(data, str | int | float) else data
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return the schema of a mapping, or of one value alone."""
+        mapping = handler.resolve_ref_schema(handler(core_schema))
+        return {"anyOf": [mapping["properties"][cls.alone]["anyOf"][0], dict(mapping)]}
+
+
+class SharedTolerance(GoalTolerance):
+    """Tolerances of a joint with several servos."""
+
+    alone: ClassVar[str] = "servos"
+    servos: Tolerance | None = key(
+        "By how much its servos may disagree, as a position of the joint; 3 deg or 1 mm when absent.",
+        "3 deg",
+        None,
+    )
 
 
 def _whole(value: object) -> object:
