@@ -110,7 +110,7 @@ class Joint:
         self.slow_ns = SLOW_START_NS if was and not self.limp else self.slow_ns
         if was or self.limp:
             self.stay()
-        speed = or_inf(self.plan.velocity)
+        speed = self.plan.step_speed
         self.speed = least(speed, self.plan.slow_speed) if self.slow_ns > 0 else speed
         self.slow_ns -= dt_ns if self.slow_ns > 0 else 0
         self.dt_ns, self.dt, self.clamped = dt_ns, max(dt_ns, 1) * 1e-9, 0
@@ -173,7 +173,7 @@ class Joint:
                 self.steer()
             if self.moves:
                 self.goals[:2] = self.inside, self.toward
-            ceiling = self.speed if self.speed < self.own else nan
+            ceiling = least(self.speed, self.plan.highest_speed) if self.speed < self.own else nan
             if self.goals[0] < self.plan.lower or self.goals[0] > self.plan.upper:
                 ceiling = fleast(ceiling, gate.BACK_SPEED * self.share)
             self.goals[1] = fleast(self.goals[1], ceiling)
@@ -182,7 +182,7 @@ class Joint:
         elif self.mode == Mode.EFFORT:
             self.goals[2] = self.brake(self.commands[2], self.effort, Clamp.EFFORT)
         elif self.mode == Mode.PWM:
-            self.goals[3] = self.brake(self.commands[3], 1.0, Clamp.PWM)
+            self.goals[3] = self.brake(self.commands[3], self.plan.highest_pwm, Clamp.PWM)
         if self.mode == Mode.EFFORT_POSITION:
             value = abs(self.commands[2])
             self.flag(value > self.effort, Clamp.NOT_FINITE if isinf(value) else Clamp.EFFORT)

@@ -27,9 +27,10 @@ joints:
 def check(simulated_line, tmp_path, capsys):
     """Run the command on two simulated servos; gives exit code, both outputs, and what the bus was sent."""
 
-    def check(registers, *words, ids=(1, 2), robot_text=ROBOT):
+    def check(registers, *words, ids=(1, 2), robot_text=ROBOT, before=()):
         servos = tuple(ServoConfig(servo_id, "XM430-W350", 3.0, 0) for servo_id in ids)
         path, finish = simulated_line(BusConfig("main", 1_000_000, servos, 2.0))
+        assert not before or main(["servo", path, *before, "--protocol", "2.0", "--baud", "1000000"]) == 0
         robot = tmp_path / "robot.yaml"
         robot.write_text(robot_text.replace("PORT", path).replace("REGISTERS", registers))
         code = main(["check", str(robot), "--online", *words])
@@ -59,6 +60,17 @@ def test_servos_that_are_as_declared_are_counted(check):
     code, out, err, _ = check("position_p_gain: 800", "wrist_led:=0")
     assert "2 servos compared with the file, no differences\n" in out
     assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize(("limit", "tighter"), [("4 A", True), ("0.9 A", False)])
+def test_a_register_that_is_tighter_than_the_file_is_reported(check, limit, tighter):
+    written = ROBOT.replace("registers: {REG", f"limits: {{effort: {limit}}}, registers: {{REG")
+    before = ("1", "set", "current_limit", "400", "--yes")
+    code, _, err, _ = check("position_p_gain: 800", "wrist_led:=0", robot_text=written, before=before)
+    sentence = (
+        "elbow: goals of effort are held to Current Limit (38) = 400, 1.08 A, tighter than `limits.effort`"
+    )
+    assert (code, sentence in " ".join(err.split())) == (0, tighter), err
 
 
 def test_a_servo_that_is_missing_is_not_counted(check):

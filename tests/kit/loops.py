@@ -21,7 +21,14 @@ from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.description.modes import Mode
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, ScheduledCommand, SchedulerPlan
+from dxlrun.plan.loop_plan import (
+    ControllerPlan,
+    JointPlan,
+    LoopPlan,
+    ScheduledCommand,
+    SchedulerPlan,
+    ServoLimit,
+)
 from dxlrun.plan.policy_plan import SLOW_START_NS
 
 PERIOD_NS = 20_000_000
@@ -133,6 +140,8 @@ class Hardware:
     """How many cycles a joint takes to come into another mode"""
     stubborn: tuple[int, ...] = ()
     """Rows of joints that go back to position mode"""
+    servo_limits: dict[int, tuple[ServoLimit, ...]] = field(default_factory=dict)
+    """Registers that limit the servos, by row of the joint"""
     _coming: dict[int, tuple[int, int]] = field(default_factory=dict)
     _reads: int = 0
 
@@ -438,6 +447,7 @@ class GateRig:
         dt_ns: int = PERIOD_NS,
         more: Sequence[JointPlan] = (),
         sources: Sequence[Any] = (),
+        accepts: Sequence[EventCode] = (EventCode.GATE,),
         **joint: Any,
     ) -> None:
         """`eased`: the slow second after the start is over; `joint`: keys of JointPlan."""
@@ -445,7 +455,7 @@ class GateRig:
         plans = [*(JointPlan(f"j{row}", **limits) for row in range(joints)), *more]
         names = tuple(one.name for one in plans)
         controllers = [plan_of(name, joints=names) for name in "ab"]
-        self.dt_ns = dt_ns
+        self.dt_ns, self._accepts = dt_ns, accepts
         self.texts: list[str] = []
         self.plan = loop_plan(plans, controllers, period_ns=dt_ns, sources=tuple(sources))
         self.record = CycleRecord(self.plan.layout)
@@ -461,7 +471,7 @@ class GateRig:
             self.apply(SLOW_START_NS)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        assert code == EventCode.GATE
+        assert code in self._accepts
         self.texts.append(text)
 
     def apply(self, dt_ns: int = 0, **commands: Any) -> Sent:

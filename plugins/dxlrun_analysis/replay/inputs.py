@@ -5,18 +5,23 @@ These are the seams of the loop: a replay changes nothing above them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer, Refusal
 from dxlrun.channels.commands import Command, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, States
+from dxlrun.channels.events import EventCode
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, PortError
+from dxlrun.log.reader import UNREADABLE
+from dxlrun.plan.loop_plan import ServoLimit
 from dxlrun_analysis.client_commands import ClientCommand
 from dxlrun_analysis.replay.recorded import RecordedInputs
 
@@ -87,6 +92,17 @@ class RecordedHardware:
         np.copyto(sources.values[:states], row["source_state"][:states])
         np.copyto(sources.valid[:count], row["source_valid"][:count])
         np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
+
+    @property
+    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers of the servos in the run, from the events of its start."""
+        rows = {joint.name: row for row, joint in enumerate(self._inputs.plan.loop.joints)}
+        found: dict[int, Sequence[ServoLimit]] = {}
+        for event in self._inputs.log.events:
+            if event.code == EventCode.SERVO_LIMITS and event.source in rows:
+                with suppress(*UNREADABLE):
+                    found[rows[event.source]] = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
+        return found
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""

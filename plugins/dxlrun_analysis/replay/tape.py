@@ -29,6 +29,7 @@ _SCALARS = (
 )
 _EVENTS = frozenset(
     (
+        EventCode.SERVO_LIMITS,
         EventCode.STEERED,
         EventCode.COMMAND_REFUSED,
         EventCode.POLICY,

@@ -39,6 +39,8 @@ class EventCode(IntEnum):
     REGISTER_DIFFERS = 14
     REGISTER_WRITTEN = 15
     """A register was written because the robot file declares it or a client wants it; read back, too."""
+    SERVO_LIMITS = 16
+    """Registers of a joint's servo limit its goals further than the manual; the data are ServoLimit."""
     READ_LOST = 20
     """The first of a row of missed replies of one servo."""
     READ_BACK = 21

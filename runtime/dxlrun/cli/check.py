@@ -126,7 +126,10 @@ def _look(result: Compiled, packets: BusesLog) -> Found:
             f"every bus of {result.plan.robot} is simulated, so there are no servos to read; "
             "give it a port, such as port:=/dev/ttyUSB0"
         )
-    return look(buses, packets.of(result.plan.buses))
+    mechanics, joints = result.plan.mechanics, result.plan.loop.joints
+    alone = mechanics.direct if mechanics.coupled else [(row, row) for row in range(len(joints))]
+    moved = {servo: joints[joint] for joint, servo in alone}
+    return look(buses, packets.of(result.plan.buses), moved)
 
 
 def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:

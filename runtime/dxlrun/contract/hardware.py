@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dxlrun.plan.loop_plan import ServoLimit
 
 
 class Hardware(Protocol):
@@ -18,6 +20,11 @@ class Hardware(Protocol):
         `engaging` is called before any servo gets torque. Raises StartUpError (a servo is not as planned; all
         found problems in one message, no torque left on) or PortError.
         """
+
+    @property
+    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers that limit the goals of each joint's servos, by row; known once it has started."""
+        ...
 
     def read(self) -> None:
         """Fill the state arrays; a lost packet makes its row invalid, it is never an exception."""

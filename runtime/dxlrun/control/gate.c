@@ -17,7 +17,6 @@ act until the next one; [i] several times what a servo takes to follow (XM430: s
 #define FADING_S 0.5    /* s; how long a measured change of velocity counts */
 #define LAG_S 0.15      /* s; how long a servo in velocity mode goes on as before, an XM430 with 0.06 kg m^2 by its
 integral gain [i] */
-#define FULL_PWM 1.0
 #define SEEN 1e-9       /* rad; a goal that is less behind its command was not held back: rounding of a sum of steps */
 #define SLOWEST 0.01    /* rad/s; a commanded speed toward a position counts as at least this, so that the goal
 arrives. The slowest speed of an AX-12 is 0.0116 rad/s, see protocol.md: it never stands still on its way either */
@@ -30,10 +29,10 @@ enum { LOWER = 1, UPPER = 2, STEP = 4, TOO_FAST = 8, NOT_FINITE = 16, TOO_STRONG
 enum { OFF = 3, RELEASED = 4 }; /* Torque and Clamp: cycle.py */
 
 typedef struct { /* limits of one joint, infinite where there is none, and what is known of its goal */
-    double lower, upper, speed, effort;
+    double lower, upper, speed, effort, pwm;
     double acceleration;
     double own_speed;         /* the servo's own: steps at it hold nothing back, so nothing is flagged */
-    double highest_speed;     /* the lower one of the two */
+    double highest_speed;     /* the lowest of the two and of what a register of the servo allows */
     double slow_speed;        /* in the first second */
     double back_speed;        /* a joint that went beyond a limit goes back to it no faster */
     double least_band;        /* a joint that is so much too fast is braked with all its effort, or more by `brake` */
@@ -217,7 +216,7 @@ static void set_position(const Gate *g, Joint *j, int32_t i)
         g->goals[0][i] = j->inside;
         g->goals[1][i] = j->toward;
     }
-    double ceiling = j->now_speed < j->own_speed ? j->now_speed : NAN; /* NaN: as fast as the servo can */
+    double ceiling = j->now_speed < j->own_speed ? least(j->now_speed, j->highest_speed) : NAN; /* NaN: no limit */
     if (g->goals[0][i] < j->lower || g->goals[0][i] > j->upper)
         ceiling = fleast(ceiling, j->back_speed); /* its servo is sent to the limit, which it coasted over */
     g->goals[1][i] = fleast(g->goals[1][i], ceiling);
@@ -340,7 +339,7 @@ int32_t gate_apply(Gate *g, int64_t dt_ns)
         else if (j->mode == EFFORT)
             g->goals[2][i] = brake(g, j, i, bounded(g, j, i, g->commands[2][i], effort, TOO_STRONG), effort, dt);
         else if (j->mode == PWM)
-            g->goals[3][i] = brake(g, j, i, bounded(g, j, i, g->commands[3][i], FULL_PWM, OVER), FULL_PWM, dt);
+            g->goals[3][i] = brake(g, j, i, bounded(g, j, i, g->commands[3][i], j->pwm, OVER), j->pwm, dt);
         if (j->mode == EFFORT_POSITION)
             limit_effort(g, j, i);
         if (j->limp) {

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from ctypes import c_int64, c_void_p
 from pathlib import Path
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.plan.loop_plan import JointPlan, LoopPlan
+from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 
 SOURCE = Path(__file__).with_name("gate.c")
@@ -36,6 +38,12 @@ _WHAT = {
     Clamp.PWM: "held to the full voltage",
     Clamp.OUTWARD: "led out of the position limits",
 }
+_LIMITED: Mapping[Clamp, LimitedInterface] = {
+    Clamp.VELOCITY: "velocity",
+    Clamp.EFFORT: "effort",
+    Clamp.PWM: "pwm",
+}
+"""Clamps by a limit that a register of the servo may be tighter than."""
 _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that is 0 where a joint in this mode shall not move by its own."""
 
@@ -65,7 +73,7 @@ class Gate:
     - NaN was not commanded, and infinity is flagged: the goal is 0 then. A joint without a position to hold
       goes nowhere by itself when it is not commanded any more.
     - Velocities are cut to the speed that positions have, efforts to `limits.effort`, PWM to full voltage;
-      all of them to what the servo has.
+      all of them to what the servo has, and to its own registers: see `take_servo_limits`.
     - With `limits.acceleration` a velocity changes by at most `acceleration * dt` a cycle, also when it is
       not commanded any more; faster only at a position limit, for a joint that did not follow its goals.
     - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there,
@@ -82,6 +90,8 @@ class Gate:
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         count = len(plan.joints)
         self._plan = plan
+        self._limited = plan.joints
+        """The joints with the registers that limit their servos."""
         self._record = record
         self._events = events
         self._devices = DeviceGate(plan, record, events)
@@ -108,6 +118,30 @@ class Gate:
         self.modes = b""
         """The joints' modes, as they were entered last."""
         self._take_modes()
+
+    def take_servo_limits(self, limits: Mapping[int, Sequence[ServoLimit]]) -> None:
+        """Hold goals to the registers of the servos, which were read at the start, too.
+
+        A servo refuses a goal beyond its register as a whole. One event a joint has its limits as data, for a
+        replay; it is a warning where a register is tighter than the file's limit.
+
+        Args:
+            limits: by row of the joint.
+        """
+        joints = list(self._plan.joints)
+        for row, found in sorted(limits.items()):
+            joint = joints[row] = replace(joints[row], servo_limits=tuple(found))
+            binding = [own for own in found if joint.find_servo_limit(own.interface)]
+            if not binding:
+                continue
+            warns = any(joint.exceeds_file_limit(own.interface) for own in binding)
+            severity = Severity.WARNING if warns else Severity.INFO
+            data = msgspec.json.encode(joint.servo_limits)
+            text = "; ".join(joint.describe_servo_limit(own) for own in binding)
+            self._events.emit(EventCode.SERVO_LIMITS, severity, joint.name, f"{joint.label}: {text}", data)
+        self._limited = tuple(joints)
+        for name, values in _speeds_and_efforts(joints).items():
+            self._joints[name] = values
 
     def begin(self) -> None:
         """Take the joints' modes and goals as they are: they belong together, and the goals are at rest."""
@@ -161,7 +195,8 @@ class Gate:
                 name = self._plan.joints[row].name
                 # what commands it now may stand in for the controller whose fault this is, which has an event
                 by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
-                text = f"{name}{by}: {what}"
+                own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
+                text = f"{name}{by}: {f'held to {own.text}, a register of its servo' if own else what}"
                 self._events.emit(EventCode.GATE, Severity.WARNING, name, text)
 
     def _owner(self, joint: str) -> str:
@@ -176,6 +211,16 @@ class Gate:
         return "no controller"
 
 
+def _speeds_and_efforts(joints: Sequence[JointPlan]) -> Mapping[str, Sequence[float]]:
+    """Return the fields of gate.c that registers of the servos may lower."""
+    return {
+        "speed": [joint.step_speed for joint in joints],
+        "highest_speed": [joint.highest_speed for joint in joints],
+        "effort": [joint.highest_effort for joint in joints],
+        "pwm": [joint.highest_pwm for joint in joints],
+    }
+
+
 def _laid_out(joints: Sequence[JointPlan]) -> NDArray[np.void]:
     """Return the structs of gate.c for the joints, which begin slowly."""
     laid: NDArray[np.void] = np.zeros(len(joints), dtype=np.dtype(STRUCTS["Joint"]))
@@ -186,11 +231,9 @@ def _laid_out(joints: Sequence[JointPlan]) -> NDArray[np.void]:
         "lower": [joint.lower for joint in joints],
         "upper": [joint.upper for joint in joints],
         "bounded": [joint.bounded for joint in joints],
-        "speed": _limits([joint.velocity for joint in joints]),
+        **_speeds_and_efforts(joints),
         "own_speed": _limits([joint.top_speed for joint in joints]),
-        "highest_speed": [joint.highest_speed for joint in joints],
         "slow_speed": [joint.slow_speed for joint in joints],
-        "effort": [joint.highest_effort for joint in joints],
         "acceleration": acceleration,
         "back_speed": BACK_SPEED * share,
         "least_band": LEAST_BAND * share,

@@ -193,6 +193,7 @@ class Loop:
         self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
         if self.sensors is not None:
             self.sensors.read()
+        self.gate.take_servo_limits(self.hardware.servo_limits)
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()

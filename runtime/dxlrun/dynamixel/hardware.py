@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 
 import numpy as np
@@ -31,6 +31,7 @@ from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits, restore_
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.loop_plan import ServoLimit
 
 STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
 LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then
@@ -141,6 +142,11 @@ class DynamixelHardware:
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
             raise
+
+    @property
+    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers that limit the goals of each joint's servo, by row; known once it has started."""
+        return self._start_up.servo_limits
 
     def read(self) -> None:
         """Read every servo once, on all lines at once; of a line that is lost every row is invalid.

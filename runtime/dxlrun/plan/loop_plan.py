@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
@@ -52,6 +52,18 @@ class SchedulerPlan(msgspec.Struct, frozen=True):
     idle_latency: bool = False  # Keep the cores from deep idle states
 
 
+LimitedInterface: TypeAlias = Literal["velocity", "effort", "pwm"]
+"""Command interfaces whose magnitude a register of a servo may limit."""
+
+
+class ServoLimit(msgspec.Struct, frozen=True):
+    """A register that limits the goals of a joint's servo, as read at the start."""
+
+    interface: LimitedInterface
+    value: float  # Highest goal without its sign: rad/s or m/s, the unit of the effort, share of the voltage
+    text: str  # The register and its value: `Current Limit (38) = 20, 0.0538 A`
+
+
 class JointPlan(msgspec.Struct, frozen=True):
     """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
 
@@ -88,6 +100,8 @@ class JointPlan(msgspec.Struct, frozen=True):
     settle_ns: int = SETTLE_NS
     """How long after the end of a motion its goal may still be reached"""
     wrap: bool = False  # A continuous joint to which a turn more is the same place
+    servo_limits: tuple[ServoLimit, ...] = ()
+    """Registers of its servos that limit goals; empty in the plan, as they are read at the start."""
 
     @property
     def label(self) -> str:
@@ -96,13 +110,56 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def highest_speed(self) -> float:
-        """The lower one of the file's limit and the servo's top speed, rad/s."""
-        return min(_or_inf(self.velocity), _or_inf(self.top_speed))
+        """The lowest of the file's limit, the servo's top speed and its registers, rad/s."""
+        return self._highest("velocity")
+
+    @property
+    def step_speed(self) -> float:
+        """The speed to which the steps between goals are held, rad/s.
+
+        Where the file limits the speed, it is sent with each goal, so a register of the servo binds the steps
+        too. Without a limit in the file a servo goes to a position as fast as it can.
+        """
+        speed = _or_inf(self.velocity)
+        return min(speed, self.highest_speed) if speed < _or_inf(self.top_speed) else speed
 
     @property
     def highest_effort(self) -> float:
-        """The lower one of the file's limit and the servo's highest goal, in the unit of `effort`."""
-        return min(_or_inf(self.effort), _or_inf(self.top_effort))
+        """The lowest of the file's limit, the servo's highest goal and its registers; unit as `effort`."""
+        return self._highest("effort")
+
+    @property
+    def highest_pwm(self) -> float:
+        """The full voltage, 1, or less where a register of the servo limits it."""
+        return self._highest("pwm")
+
+    def find_servo_limit(self, interface: LimitedInterface) -> ServoLimit | None:
+        """Return the register that is tighter than the file and the manual; None where none is."""
+        own = next((one for one in self.servo_limits if one.interface == interface), None)
+        return None if own is None or own.value >= self._planned_limit(interface) else own
+
+    def exceeds_file_limit(self, interface: LimitedInterface) -> bool:
+        """Check whether the file's limit allows more than a register of the servo."""
+        given = self.velocity != self.top_speed and not self.coupled if interface == "velocity" else True
+        limits = {"velocity": self.velocity, "effort": self.effort, "pwm": None}
+        return given and limits[interface] is not None and self.find_servo_limit(interface) is not None
+
+    def describe_servo_limit(self, own: ServoLimit) -> str:
+        """Return what a register of the servo does to goals, and a remedy where the file allows more."""
+        held = f"goals of {own.interface} are held to {own.text}"
+        if not self.exceeds_file_limit(own.interface):
+            return held
+        key = f"limits.{own.interface}"
+        return f"{held}, tighter than `{key}` in the robot file; lower `{key}`, or raise the register"
+
+    def _highest(self, interface: LimitedInterface) -> float:
+        own = self.find_servo_limit(interface)
+        return self._planned_limit(interface) if own is None else own.value
+
+    def _planned_limit(self, interface: LimitedInterface) -> float:
+        if interface == "velocity":
+            return min(_or_inf(self.velocity), _or_inf(self.top_speed))
+        return min(_or_inf(self.effort), _or_inf(self.top_effort)) if interface == "effort" else 1.0
 
     @property
     def goal_tolerance(self) -> float:

@@ -170,6 +170,7 @@ class GatewayApp:
     ) -> None:
         self._link = link
         self._preparation = preparation
+        link.take_servo_limits = preparation.take_servo_limits
         self._log = log
         self._allowances = {one.rate: Allowance(one.rate, now) for one in REQUESTS if one.rate}
         self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}

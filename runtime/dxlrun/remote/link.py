@@ -23,7 +23,7 @@ from dxlrun.channels.tagged import decode
 from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.messages.cdr import Codec
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
@@ -101,6 +101,8 @@ class Link:
         self._text = 0
         self._pending: dict[int, _Pending] = {}
         self._pending_bytes = 0
+        self.take_servo_limits: Callable[[str, tuple[ServoLimit, ...]], object] = lambda joint, limits: None
+        """Takes the registers that limit a joint's servo, which the loop reports at its start."""
 
     def let_begin(self) -> None:
         """Let controllers begin where the supervisor has paused the loop until a client can stop it."""
@@ -293,6 +295,9 @@ class Link:
             self._text -= len(self.events.popleft()[1].text)
         self.events.append((next(self._event_numbers), event))
         self.goals.take(event)
+        if event.code == EventCode.SERVO_LIMITS:
+            limits = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
+            self.take_servo_limits(event.source, limits)
         if event.code == EventCode.STALE_COMMAND and event.source == "loop":
             self.paused = False
         loaded = self.controllers.get(event.source)

@@ -43,7 +43,7 @@ from dxlrun.description.units import (
     linear_velocity,
 )
 from dxlrun.errors import suggestion
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""
@@ -162,7 +162,7 @@ class Known:
 class Preparation:
     """Prepares commands by the controllers' classes, outside of the loop's process."""
 
-    joints: Mapping[str, JointPlan]
+    joints: dict[str, JointPlan]
     """The robot's, by name, in its order."""
     plugins: PlugIns
     sources: tuple[SourcePlan, ...] = ()
@@ -175,6 +175,12 @@ class Preparation:
     """By the controller's name; one that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Controller type -> schema of each command."""
+
+    def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:
+        """Judge commands by the registers that limit a joint's servo, too."""
+        if joint in self.joints:
+            self.joints[joint] = replace(self.joints[joint], servo_limits=limits)
+            self._known.clear()
 
     def takes(self, plan: ControllerPlan) -> dict[str, object]:
         """Return the JSON Schema of each command that a controller takes; empty where it cannot be had."""

@@ -11,7 +11,7 @@ import msgspec
 from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import CommandModel
 from dxlrun.errors import Mark
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
 
 if TYPE_CHECKING:
     from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone
@@ -191,7 +191,13 @@ def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: st
         if abs(effort) > joint.highest_effort:
             most, own = joint.highest_effort, joint.highest_effort != joint.effort
             limit = "the highest goal of its servo" if own else "its effort limit"
+            limit = _register_limit(joint, "effort") or limit
             text = f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
+            yield BeyondLimit(joint.name, text)
+    for joint, pwm in zip(joints, _row(joints, values, "pwm"), strict=False):
+        if abs(pwm) > joint.highest_pwm:
+            most, limit = joint.highest_pwm, _register_limit(joint, "pwm") or "the full voltage"
+            text = f"{joint.name} is asked for {pwm:.6g}{where}, more than {most:.6g}, {limit}"
             yield BeyondLimit(joint.name, text)
 
 
@@ -216,12 +222,19 @@ def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[BeyondLimi
     if abs(speed) > joint.highest_speed * (1 + _ROUNDING):
         own = joint.highest_speed != joint.velocity
         limit = "the top speed of its servo" if own else "its velocity limit"
+        limit = _register_limit(joint, "velocity") or limit
         unit = speed_unit(joint.linear)
         yield BeyondLimit(
             joint.name,
             f"{joint.name} is asked for {speed:.6g} {unit}{where}, more than {joint.highest_speed:.6g} "
             f"{unit}, {limit}",
         )
+
+
+def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:
+    """Return the register of a joint's servo that is its limit, as sentences name it; empty: none is."""
+    own = joint.find_servo_limit(interface)
+    return "" if own is None else f"{own.text}, a register of its servo"
 
 
 def _row(joints: Sequence[JointPlan], values: Mapping[str, object], name: str) -> Sequence[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import msgspec
@@ -14,7 +14,7 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.contract.hardware import Hardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
 FADE_NS = 1_000_000_000
@@ -196,6 +196,37 @@ class JointHardware:
         self._hardware.start(engaging)
         self._arrays.begin()
         self._arrays.read()
+
+    @property
+    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers that limit the goals of each joint's servos, each of them while the others rest."""
+        own = self._hardware.servo_limits
+        found = {joint: tuple(own.get(servo, ())) for joint, servo in self._plan.direct}
+        for coupling in self._plan.couplings:
+            for column, joint in enumerate(coupling.joints):
+                found[joint] = self._limits_of(coupling, column, own)
+        return found
+
+    def _limits_of(
+        self, coupling: CouplingPlan, column: int, own: Mapping[int, Sequence[ServoLimit]]
+    ) -> tuple[ServoLimit, ...]:
+        """Return the tightest limit of each interface of one joint of a coupling."""
+        tightest: dict[LimitedInterface, ServoLimit] = {}
+        for place, servo in enumerate(coupling.servos):
+            factors = {
+                "velocity": abs(coupling.inverse[place][column]),
+                "effort": abs(coupling.matrix[column][place]),
+                "pwm": float(len(coupling.joints) == 1),
+            }
+            for limit in own.get(servo, ()):
+                factor = factors[limit.interface]
+                if not factor:
+                    continue
+                value = limit.value / factor
+                if limit.interface not in tightest or value < tightest[limit.interface].value:
+                    text = f"{limit.text} ({self._together.label(servo)})"
+                    tightest[limit.interface] = ServoLimit(limit.interface, value, text)
+        return tuple(tightest.values())
 
     def read(self) -> None:
         """Read the servos, fill the joints' states; a servo without torque takes it from its partners."""

@@ -21,6 +21,7 @@ from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.torque_limits import SILENT, limits_positions
 from dxlrun.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit
+from dxlrun.plan.loop_plan import LimitedInterface, ServoLimit
 from dxlrun.plan.transaction import Program
 
 ENGAGE_SPEED = 0.5
@@ -140,6 +141,28 @@ def read_limits(one: Access) -> Program[dict[OwnLimit, int]]:
         if reply.answered:
             found[limit] = reply.word(limit.size)
     return found
+
+
+def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimit, ...]:
+    """Return the registers that keep a servo's goals below the highest of its modes, as its joint counts."""
+    servo, table, found = one.servo, one.table, list[ServoLimit]()
+    for limit, raw in limits.items():
+        scales = [scale for mode in servo.modes if (scale := getattr(mode, limit.of)) is not None]
+        if not scales or all(raw >= scale.most for scale in scales):
+            continue
+        value = min(min(raw, scale.most) * scale.per_tick for scale in scales)
+        interface: LimitedInterface = "velocity" if limit.of == "speed" else limit.of
+        if interface == "velocity":
+            value *= servo.ratio
+            written = f"{servo.position_text(value)}/s"
+        elif interface == "pwm" or table.effort_unit == "1":
+            written = f"{value:.1%}".replace("%", " %")
+        else:
+            written = (
+                f"{value:.3g} {'N' if servo.linear and table.effort_unit == 'Nm' else table.effort_unit}"
+            )
+        found.append(ServoLimit(interface, value, f"{table.items[limit.name].title} = {raw}, {written}"))
+    return tuple(found)
 
 
 def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:

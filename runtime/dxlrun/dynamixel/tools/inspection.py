@@ -18,15 +18,18 @@ from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
-from dxlrun.dynamixel.servo.access import first_reach
+from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
+from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Result
 
 NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken
+NO_JOINTS: Mapping[int, JointPlan] = {}
 
 
 class Identity(msgspec.Struct, frozen=True):
@@ -80,13 +83,23 @@ def read_models(
     return {joint: one.model for joint, one in found.items()}
 
 
-def look(buses: Sequence[BusPlan], packets: Mapping[str, PacketSink] = NOWHERE) -> Found:
+def look(
+    buses: Sequence[BusPlan],
+    packets: Mapping[str, PacketSink] = NOWHERE,
+    joints: Mapping[int, JointPlan] = NO_JOINTS,
+) -> Found:
     """Check every servo as a start does, and every declared register; opens the ports, closes them.
 
-    `packets`: by bus, what takes its packets. Raises PortError when a port cannot be opened or is gone.
+    Args:
+        buses: the plans of the lines.
+        packets: by bus, what takes its packets.
+        joints: by row of a servo, the joint that it moves alone; registers are compared with its limits.
+
+    Raises:
+        PortError: a port cannot be opened or is gone.
     """
     with _lines(buses) as ports:
-        found = _run([_look(plan) for plan in buses], buses, ports, MonotonicClock(), packets)
+        found = _run([_look(plan, joints) for plan in buses], buses, ports, MonotonicClock(), packets)
     together = Found()
     for one in found:
         together.compared += one.compared
@@ -129,7 +142,7 @@ def _run(
     return [one for one in found if one is not None]
 
 
-def _look(plan: BusPlan) -> Program[Found]:
+def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
     surveyed = Findings()
     yield from survey(plan, False, surveyed)
     remarks = [f"{joint}: {text}" for joint, text in surveyed.texts(EventCode.REGISTER_DIFFERS)]
@@ -139,8 +152,19 @@ def _look(plan: BusPlan) -> Program[Found]:
         differences = [RegisterDifference(register, None) for register in servo.registers]
         if servo.joint in answered:
             differences = list((yield from compare(first_reach(plan, servo), servo.registers)))
+            found.remarks += yield from _tighter_limits(first_reach(plan, servo), joints.get(servo.row))
         found.registers += [_row(plan, servo, one) for one in differences]
     return found
+
+
+def _tighter_limits(one: Access, joint: JointPlan | None) -> Program[list[str]]:
+    """Return a sentence for each register of a servo that is tighter than the limits of its joint."""
+    if joint is None:
+        return []
+    limits = servo_limits(one, (yield from read_limits(one)))
+    joint = replace(joint, servo_limits=limits)
+    tighter = [own for own in limits if joint.exceeds_file_limit(own.interface)]
+    return [f"{joint.name}: {joint.describe_servo_limit(own)}" for own in tighter]
 
 
 def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:

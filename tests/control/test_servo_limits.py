@@ -1,0 +1,217 @@
+"""Registers of a servo that limit its goals: what they take off counts as a clamp, and is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import pytest
+from tests.kit.loops import GateRig
+from tests.kit.stories import replayed, send, tell
+from tests.kit.wire import all_writes
+
+from dxlrun.channels.cycle import Clamp
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.description.modes import Mode
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.plan.loop_plan import JointPlan, ServoLimit
+from dxlrun.testing import VirtualRobot
+
+ROBOT = """\
+name: limited
+buses: {{main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{kind: direct}}}}}}
+loop: {{rate: 100}}
+joints:
+  a: {{bus: main, id: 1, model: {model}, reference: {reference} deg, direction: -1, {limits}}}
+controllers:
+  c: {{type: joint_group_{kind}_controller, joints: [a]}}
+"""
+
+
+class Case(NamedTuple):
+    model: str
+    register: str
+    kind: str  # Of the controller and its command
+    goal: str  # The item that the register limits
+    clamp: Clamp
+
+    @property
+    def protocol(self) -> float:
+        return 1.0 if self.model == "AX-12A" else 2.0
+
+    @property
+    def title(self) -> str:
+        return TITLES[self.model, self.register]
+
+    @property
+    def raw(self) -> int:
+        """Value of the register"""
+        return int(self.title.partition(" = ")[2].partition(",")[0])
+
+
+TITLES = {
+    ("XM430-W350", "current_limit"): "Current Limit (38) = 20, 0.0538 A",
+    ("XM430-W350", "velocity_limit"): "Velocity Limit (44) = 50, 68.7 deg/s",
+    ("XM430-W350", "pwm_limit"): "PWM Limit (36) = 200, 22.6 %",
+    ("XL430-W250", "velocity_limit"): "Velocity Limit (44) = 50, 68.7 deg/s",
+    ("PH42-020-S300", "current_limit"): "Current Limit (38) = 100, 0.1 A",
+    ("PH42-020-S300", "velocity_limit"): "Velocity Limit (44) = 600, 36.0 deg/s",
+    ("H42-20-S300-R", "torque_limit"): "Torque Limit (30) = 40, 0.161 A",
+    ("YM070-210-R051", "current_limit"): "Current Limit (66) = 30, 0.3 A",
+    ("AX-12A", "max_torque"): "Max Torque (14) = 300, 29.3 %",
+}
+"""Model and register -> the register with its value, as events name it"""
+CASES = (
+    Case("XM430-W350", "current_limit", "effort", "goal_current", Clamp.EFFORT),
+    Case("XM430-W350", "current_limit", "poseffort", "goal_current", Clamp.EFFORT),
+    Case("XM430-W350", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY),
+    Case("XM430-W350", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY),
+    Case("XM430-W350", "pwm_limit", "pwm", "goal_pwm", Clamp.PWM),
+    Case("XL430-W250", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY),
+    Case("PH42-020-S300", "current_limit", "effort", "goal_current", Clamp.EFFORT),
+    Case("PH42-020-S300", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY),
+    Case("H42-20-S300-R", "torque_limit", "effort", "goal_torque", Clamp.EFFORT),
+    Case("YM070-210-R051", "current_limit", "effort", "goal_current", Clamp.EFFORT),
+    Case("AX-12A", "max_torque", "poseffort", "torque_limit", Clamp.EFFORT),
+)
+COMMANDS = {
+    "effort": ("efforts", lambda value: (value,)),
+    "velocity": ("velocities", lambda value: (value,)),
+    "pwm": ("pwm", lambda value: (value,)),
+    "posvel": ("posvel", lambda value: (0.01, value)),
+    "poseffort": ("poseffort", lambda value: (0.01, value)),
+}
+"""Name of the command, and its values for a limited one"""
+every_case = pytest.mark.parametrize(
+    "case", CASES, ids=lambda case: f"{case.model} {case.register} {case.kind}"
+)
+
+
+def run(case: Case, tmp_path: Path, share: float, limits: str = "limits: {position: [-10 deg, 10 deg]}"):
+    """Command a share of the register's limit for some cycles; return the log, and the goals on the wire."""
+    table = control_table(case.model, case.protocol)
+    file, robots = tmp_path / "robot.yaml", []
+    reference = 180 if table.min_tick == 0 and table.max_tick > 1023 else 150 if table.min_tick == 0 else 0
+    file.write_text(
+        ROBOT.format(
+            model=case.model, protocol=case.protocol, kind=case.kind, reference=reference, limits=limits
+        )
+    )
+
+    def set_register(robot: VirtualRobot) -> None:
+        registers = robot.buses[0].servo(1).registers
+        registers[case.register] = case.raw
+        if case.model.startswith("Y"):  # shipped with limits of a few degrees
+            registers["min_position_limit"], registers["max_position_limit"] = -1_000_000, 1_000_000
+        robots.append(robot)
+
+    name, values = COMMANDS[case.kind]
+    value = limit_of(case, file) * share
+    story = {number: [send("c", name, *values(value))] for number in range(30, 34)}
+    log = tell(file, story, tmp_path / "run.mcap", seconds=0.8, before=set_register)
+    (robot,) = robots
+    item = table.items[case.goal]
+    sent = [
+        int.from_bytes(data[item.address - begin :][: item.size], "little", signed=item.signed)
+        for _, _, begin, data in all_writes(tuple(robot.ledger.entries), robot.plan.buses[0])
+        if begin <= item.address and item.address + item.size <= begin + len(data)
+    ]
+    return replayed(log), sent
+
+
+def limit_of(case: Case, file: Path) -> float:
+    """Return the limit in the unit of the command, as the servo's table has it."""
+    table = control_table(case.model, case.protocol)
+    if case.kind in {"velocity", "posvel"}:
+        return case.raw * table.rad_s_per_tick
+    if case.kind == "pwm":
+        return case.raw * table.items["goal_pwm"].scale
+    return case.raw * (table.effort_per_tick if case.protocol == 2.0 else 1 / 1023)
+
+
+@every_case
+def test_a_goal_beyond_a_register_is_held_to_it_counted_and_named(case, tmp_path):
+    log, sent = run(case, tmp_path, 1.5)
+    assert max(map(abs, sent)) == case.raw
+    clamped = log.cycles["clamped"][:, 0]
+    assert (clamped & case.clamp).any()
+    texts = [event.text for event in log.events if event.code == EventCode.GATE]
+    held = [text for text in texts if "a register of its servo" in text]
+    assert [text.lower() for text in held] == [
+        f"a, controller c: held to {case.title}, a register of its servo".lower()
+    ]
+
+
+@every_case
+def test_a_goal_within_a_register_is_not_reported(case, tmp_path):
+    log, sent = run(case, tmp_path, 0.9)
+    assert sent
+    assert max(map(abs, sent)) <= case.raw
+    assert not (log.cycles["clamped"][:, 0] & case.clamp).any()
+    assert [
+        event.text for event in log.events if event.code == EventCode.GATE and "register" in event.text
+    ] == []
+
+
+@pytest.mark.parametrize(
+    ("limits", "severity"),
+    [("limits: {effort: 0.5 A}", Severity.WARNING), ("limits: {effort: 0.04 A}", None), ("", Severity.INFO)],
+)
+def test_the_start_reports_a_register_that_is_tighter_than_the_file(limits, severity, tmp_path):
+    log, _ = run(CASES[0], tmp_path, 0.5, limits or "limits: {position: [-10 deg, 10 deg]}")
+    told = [event for event in log.events if event.code == EventCode.SERVO_LIMITS and "effort" in event.text]
+    assert [event.severity for event in told] == ([severity] if severity else [])
+    for event in told:
+        held = "goals of effort are held to Current Limit (38) = 20, 0.0538 A"
+        remedy = (
+            ", tighter than `limits.effort` in the robot file; lower `limits.effort`, or raise the register"
+        )
+        assert held + (remedy if severity is Severity.WARNING else "") in event.text
+        assert event.text.startswith("a (ID 1 on bus main): ")
+        limits_found = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
+        assert limits_found[-1].interface in {"effort", "velocity"}
+
+
+def test_a_register_binds_the_steps_only_where_the_file_limits_the_speed():
+    slow = ServoLimit("velocity", 2.0, "Velocity Limit (44) = 83, 114 deg/s")
+    for velocity, step in ((None, None), (4.0, 2.0), (1.0, 1.0)):
+        joint = JointPlan("j0", -1, 1, velocity, top_speed=8.0, servo_limits=(slow,))
+        assert joint.step_speed == (step or float("inf"))
+        assert joint.highest_speed == min(2.0, velocity or 2.0)
+
+
+def test_goals_without_a_speed_get_the_one_that_the_servo_will_take():
+    rig = GateRig(velocity=4.0, top_speed=8.0, accepts=(EventCode.GATE, EventCode.SERVO_LIMITS))
+    rig.gate.take_servo_limits({0: (ServoLimit("velocity", 2.0, "Velocity Limit (44) = 83, 114 deg/s"),)})
+    assert rig.apply(position=0.02).velocity == 2.0
+    assert rig.apply(position=0.02, velocity=3.0).clamped == Clamp.VELOCITY
+    assert rig.texts[0].startswith(
+        "j0: goals of velocity are held to Velocity Limit (44) = 83, 114 deg/s, tighter"
+    )
+    assert rig.texts[-1].endswith("held to Velocity Limit (44) = 83, 114 deg/s, a register of its servo")
+
+
+@pytest.mark.parametrize(
+    ("mode", "interface"), [(Mode.EFFORT, "effort"), (Mode.PWM, "pwm"), (Mode.VELOCITY, "velocity")]
+)
+def test_the_files_limit_is_named_where_it_is_the_tighter_one(mode, interface):
+    rig = GateRig(
+        mode=mode, effort=0.1, velocity=0.1, top_speed=8.0, accepts=(EventCode.GATE, EventCode.SERVO_LIMITS)
+    )
+    rig.gate.take_servo_limits({0: (ServoLimit(interface, 1.0, "a register"),)})
+    assert rig.texts == []
+    rig.apply(**{interface: 5.0})
+    assert "a register" not in rig.texts[-1]
+
+
+def test_a_limit_of_the_manual_is_not_described_as_one_of_the_register():
+    joint = JointPlan("j", -1, 1, None, top_effort=3.0, servo_limits=(ServoLimit("effort", 3.0, "x"),))
+    assert joint.find_servo_limit("effort") is None
+    assert joint.highest_effort == 3.0
+    tight = JointPlan(
+        "j", -1, 1, None, effort=2.0, top_effort=3.0, servo_limits=(ServoLimit("effort", 1.0, "x"),)
+    )
+    assert tight.describe_servo_limit(tight.servo_limits[0]).startswith(
+        "goals of effort are held to x, tighter"
+    )
