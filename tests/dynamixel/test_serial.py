@@ -13,14 +13,16 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.process import memory_file
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial
+from dxlrun.dynamixel.port.serial_open import let_go, open_serial
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlrun.process_table import robot_of
 
 
 @pytest.fixture
@@ -160,12 +162,11 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     )
 
 
-def test_a_plan_begins_with_the_name_of_its_robot():
-    """By that a run is known from outside."""
+def test_a_process_that_has_a_plan_open_is_known_by_its_robot():
     torso = Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml"
-    match = _ROBOT.match(to_json(compile_files(torso, {}, []).plan))
-    assert match is not None
-    assert match[1] == b"bioloid_torso"
+    descriptor = memory_file("dxlrun-plan", to_json(compile_files(torso, {}, []).plan))
+    assert robot_of(Path("/proc/self")) == "bioloid_torso"
+    os.close(descriptor)
 
 
 def test_the_line_is_locked_against_every_program(opened):

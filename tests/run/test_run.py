@@ -165,7 +165,7 @@ def test_a_loop_that_was_stopped_accuses_no_servo(start, tmp_path):
     loop = run.child("dxlrun.run.loop_process")
     for _ in range(2):
         os.kill(loop, signal.SIGSTOP)
-        time.sleep(0.15)  # the guardian waits for 0.5 s
+        time.sleep(0.1)  # the guardian waits for 0.25 s
         os.kill(loop, signal.SIGCONT)
         time.sleep(0.1)
     run.finish()

@@ -27,17 +27,20 @@ from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
-from dxlrun.run import guardian
-from dxlrun.run.guardian import (
-    LEAST_TIMEOUT_NS,
-    LONGEST_LOOK_NS,
-    Ended,
-    Guardian,
-    GuardianMessage,
-    standstill_timeout_ns,
-)
+from dxlrun.run import watch
+from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
 from dxlrun.run.loop_process import AskedToStop, Pulse
 from dxlrun.run.run_processes import create_memory, guardian_job
+from dxlrun.run.watch import (
+    HALTED_NS,
+    LEAST_TIMEOUT_NS,
+    Duty,
+    LoopWatch,
+    SignsOfLife,
+    Watched,
+    duty_of,
+    standstill_timeout_ns,
+)
 from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -89,6 +92,11 @@ def test_what_makes_the_timeout_shorter_is_seen_behind_the_beat_before_it(page, 
 # Why it stood still
 
 
+def stat_line(state: str, start_ticks: int = 5) -> str:
+    """Return the line of a process in /proc/PID/stat; parentheses and spaces may be in its name."""
+    return f"7 (a) S name) {state} 1 {'0 ' * 17}{start_ticks} 0 0\n"
+
+
 @pytest.fixture
 def processor(tmp_path):
     """Return what makes a process' entry in /proc say so: its processor time, ms, and its state."""
@@ -96,7 +104,7 @@ def processor(tmp_path):
 
     def shown(run_ms, state):
         (tmp_path / "schedstat").write_text(f"{run_ms * MS} 5 9\n")
-        (tmp_path / "stat").write_text(f"7 (a) S name) {state} 1 7 7 0\n")
+        (tmp_path / "stat").write_text(stat_line(state))
         return made
 
     return shown
@@ -137,8 +145,7 @@ def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(watche
     found = []
     for at in range(0, 130 * MS, 10 * MS):
         made._clock = VirtualClock(at)  # type: ignore[assignment]  # as in the fixture
-        found.append(made._timed_out(processor(50, "R")))
-        made._killed = found[-1]  # type: ignore[assignment]  # never late here
+        found.append(reason_to_kill(made, processor(50, "R")))
     assert set(found) == {None, "hung"}
     how = made._how("hung", None)  # type: ignore[arg-type]  # asked of one that ended by itself
     said = " and was killed; it was ready to run, but got a processor for only 0.0 ms of that"
@@ -166,9 +173,10 @@ def test_standstill_timeout(phase, rate, patience):
 def test_the_first_cycle_may_take_longer_never_less(watcher, period_ms, first, later):
     made, _, page = watcher
     page.may_take(period_ms * MS)
-    assert made._timeout_ns(Phase.RUNNING) == first * MS
+    page.enter(Phase.RUNNING)
+    assert made._timeout_ns() == first * MS
     page.cycle(1, 0)
-    assert made._timeout_ns(Phase.RUNNING) == later * MS
+    assert made._timeout_ns() == later * MS
 
 
 @pytest.mark.parametrize(
@@ -196,7 +204,7 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     how: str,
 ) -> None:
     """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
-    monkeypatch.setattr(guardian, patience, 100 * MS)
+    monkeypatch.setattr(watch, patience, 100 * MS)
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     page = Heartbeat(memory.heartbeat)
@@ -215,9 +223,23 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     assert watcher._how(ended, loop) == f"the loop stood still for more than 100 ms{how} and was killed"
 
 
+class Unwatched(LoopWatch):
+    """Supervisor and guardian of a test: they respond."""
+
+    def __init__(self) -> None:
+        pass
+
+    def duty(self, now_ns: int) -> Duty:
+        return Duty.NONE
+
+
+def no_events() -> EventRing:
+    return EventRing(Handover(lambda kind, payload: None), VirtualClock())
+
+
 def test_only_a_set_up_is_given_up_and_only_once(page):
     stop = StopFlag(requested=True)
-    beat = Pulse(page, stop)
+    beat = Pulse(page, stop, Unwatched(), no_events(), lambda: 0)
     for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
         page.enter(phase)
         beat()
@@ -247,7 +269,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     os.close(descriptor)
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     stop = StopFlag()
-    pulse = Pulse(page, stop)
+    pulse = Pulse(page, stop, Unwatched(), no_events(), lambda: 0)
     count = 0
 
     def beat() -> None:
@@ -293,6 +315,17 @@ def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
 # The guardian's judgement, without its processes
 
 
+def reason_to_kill(made: Guardian, processor: ProcessorTime | None = None) -> str | None:
+    """Let a guardian look once, as its loop does."""
+    processor = processor or ProcessorTime(Path("none"))
+    reason = made._reason_to_kill(duty_of(Watched.GUARDIAN, made._silent()))
+    processor.look(made._loop_signs.still_ns)
+    if reason and not made._killed:
+        made._note_standstill(reason, processor)
+        made._killed = reason
+    return reason
+
+
 @pytest.fixture
 def watcher(start, tmp_path):
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
@@ -301,7 +334,7 @@ def watcher(start, tmp_path):
     control, terminal = process.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes
-    made._still = Standstill(LONGEST_LOOK_NS, 0)
+    made._loop_signs = SignsOfLife(os.getpid(), LONGEST_LOOK_NS, 0)
     with terminal:
         yield made, terminal, Heartbeat(memory.heartbeat)
     control.close()
@@ -348,7 +381,7 @@ def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(watcher):
         (b'{"type": "Stop"}\n', "stop"),
         (b'{"type": "Cut"}\n', "cut"),
         (b'{"type": "Stop"}\n{"type": "Cut"}\n', "cut"),  # two interrupts that arrive together
-        (None, "stop"),  # the terminal is gone
+        (None, None),  # the terminal is gone: it is silent from now on
     ],
 )
 def test_what_the_terminal_asks_for(watcher, said, wish):
@@ -358,6 +391,7 @@ def test_what_the_terminal_asks_for(watcher, said, wish):
     else:
         terminal.sendall(said)
     assert made._request() == wish
+    assert made._silent() == ({Watched.SUPERVISOR} if said is None else set())
 
 
 def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watcher):
@@ -367,11 +401,157 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watch
     told = []
     for at_ms in range(0, 130, 10):
         made._clock.wait_until(at_ms * MS)
-        told.append(made._timed_out(ProcessorTime(Path("none"))))
+        told.append(reason_to_kill(made))
     assert told == [None] * 11 + ["hung"] * 2  # five periods of 20 ms
+    made._killed = None
     page.beat()
-    assert made._timed_out(ProcessorTime(Path("none"))) is None
+    assert reason_to_kill(made) is None
     made._stop_by_ns = 125 * MS
     page.beat()
     made._clock.wait_until(126 * MS)
-    assert made._timed_out(ProcessorTime(Path("none"))) == "late"
+    assert reason_to_kill(made) == "late"
+
+
+# Who acts when others are silent
+
+
+OTHERS = {
+    which: tuple(
+        frozenset(
+            other for at, other in enumerate(one for one in Watched if one is not which) if bits >> at & 1
+        )
+        for bits in range(4)
+    )
+    for which in Watched
+}
+
+
+def test_exactly_one_process_acts_whichever_are_silent():
+    for silent in {silent for sets in OTHERS.values() for silent in sets}:
+        acting = [one for one in Watched if one not in silent and duty_of(one, silent) is not Duty.NONE]
+        assert len(acting) == bool(silent), silent
+
+
+@pytest.mark.parametrize(
+    ("watcher", "silent", "duty"),
+    [
+        ("guardian", {"supervisor"}, Duty.STOP_LOOP),
+        ("supervisor", {"guardian"}, Duty.KILL_GUARDIAN),
+        ("loop", {"guardian"}, Duty.NONE),
+        ("guardian", {"loop"}, Duty.KILL_LOOP),
+        ("loop", {"supervisor", "guardian"}, Duty.END),
+        ("guardian", {"supervisor", "loop"}, Duty.KILL_LOOP),
+        ("supervisor", {"guardian", "loop"}, Duty.KILL_BOTH),
+    ],
+)
+def test_duty_of_each_survivor(watcher, silent, duty):
+    assert duty_of(Watched(watcher), {Watched(one) for one in silent}) is duty
+
+
+@pytest.fixture
+def watched(tmp_path):
+    """Return what sets the state of process 7 in a table of processes, and the table's folder."""
+    (tmp_path / "7").mkdir()
+
+    def shown(state, start_ticks=5):
+        (tmp_path / "7/stat").write_text(stat_line(state, start_ticks))
+        return tmp_path
+
+    return shown
+
+
+@pytest.mark.parametrize("state", ["T", "t", "Z", "X"])
+def test_a_process_that_is_stopped_or_dead_is_silent_soon(watched, state):
+    signs = SignsOfLife(7, 100 * MS, 0, watched("S"))
+    watched(state)
+    silent = []
+    for at_ms in range(0, 400, 50):
+        signs.look("same", at_ms * MS)
+        silent.append(signs.is_silent(5000 * MS))
+    assert silent == [at_ms * MS > HALTED_NS for at_ms in range(0, 400, 50)]
+    signs.look("beat", 400 * MS)
+    assert not signs.is_silent(5000 * MS)
+
+
+@pytest.mark.parametrize("state", ["R", "S", "D"])
+def test_a_starved_process_is_not_silent_before_its_timeout(watched, state):
+    signs = SignsOfLife(7, 100 * MS, 0, watched(state))
+    silent = []
+    for at_ms in range(0, 5200, 100):
+        signs.look("same", at_ms * MS)
+        silent.append(signs.is_silent(5000 * MS))
+    assert silent == [False] * 51 + [True]
+
+
+def test_a_process_id_of_another_process_is_of_a_dead_one(watched):
+    signs = SignsOfLife(7, 1000 * MS, 0, watched("S", start_ticks=5))
+    watched("S", start_ticks=6)
+    for at_ms in (0, 300):
+        signs.look("same", at_ms * MS)
+    assert signs.is_silent(5000 * MS)
+
+
+class Stopped:
+    """A child that a signal has stopped, and that is killed in the end."""
+
+    def __enter__(self) -> int:
+        self._child = subprocess.Popen(["/bin/sleep", "60"])
+        self._child.send_signal(signal.SIGSTOP)
+        os.waitpid(self._child.pid, os.WUNTRACED)
+        return self._child.pid
+
+    def __exit__(self, *_: object) -> None:
+        self._child.kill()
+        self._child.wait()
+
+
+@pytest.mark.parametrize("beating", ["supervisor", "guardian", "neither"])
+def test_a_loop_ends_by_itself_only_when_neither_of_the_others_responds(page, beating):
+    with Stopped() as supervisor, Stopped() as guardian:
+        loop_watch = LoopWatch(page, supervisor, guardian, 20 * MS, 0)
+        duties = []
+        for at_ms in range(0, 500, 20):
+            if beating == "supervisor":
+                page.supervisor_look()
+            elif beating == "guardian":
+                page.look()
+            duties.append(loop_watch.duty(at_ms * MS))
+    ended = [duty is Duty.END for duty in duties]
+    assert ended == [beating == "neither" and at_ms * MS > HALTED_NS for at_ms in range(0, 500, 20)]
+
+
+def test_a_loop_on_a_starved_machine_goes_on(page):
+    """Both others only wait for a processor: this process stands for them."""
+    loop_watch = LoopWatch(page, os.getpid(), os.getpid(), 20 * MS, 0)
+    assert {loop_watch.duty(at_ms * MS) for at_ms in range(0, 4000, 20)} == {Duty.NONE}
+
+
+def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):
+    stop, reported = StopFlag(), []
+    events = EventRing(Handover(lambda kind, payload: reported.append(bytes(payload))), VirtualClock())
+    with Stopped() as supervisor, Stopped() as guardian:
+        loop_watch = LoopWatch(page, supervisor, guardian, 20 * MS, 0)
+        clock = VirtualClock(0)
+        beat = Pulse(page, stop, loop_watch, events, clock.now_ns)
+        page.enter(Phase.RUNNING)
+        while not stop.requested:
+            clock.wait_until(clock.now_ns() + 20 * MS)
+            beat()
+            assert clock.now_ns() < 1000 * MS
+        beat()
+    assert len(reported) == 1
+    assert b"neither the supervisor nor the guardian responds" in reported[0]
+
+
+def test_a_guardian_stops_the_loop_in_order_when_its_supervisor_was_stopped(watcher):
+    made, _, page = watcher
+    page.enter(Phase.RUNNING)
+    page.cycle(1, 0)
+    with Stopped() as supervisor:
+        made._supervisor_signs = SignsOfLife(supervisor, LONGEST_LOOK_NS, 0)
+        found = []
+        for at_ms in range(0, 300, 10):
+            made._clock.wait_until(at_ms * MS)
+            page.beat()
+            found.append(duty_of(Watched.GUARDIAN, made._silent()) is Duty.STOP_LOOP)
+    assert found == [at_ms * MS > HALTED_NS for at_ms in range(0, 300, 10)]

@@ -1,6 +1,7 @@
-"""Heartbeat: shared memory by which the guardian and the terminal see that the loop lives.
+"""Heartbeats: shared memory by which loop, guardian and supervisor see that the others respond.
 
-A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
+A single writer a field: the loop's process, for `looks` the guardian, and for `supervisor_looks` the
+supervisor. Each field is one aligned 64-bit
 store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
 clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
 visible behind what was shown before it, and what makes the guardian's timeout shorter behind the beat before
@@ -15,8 +16,9 @@ from pathlib import Path
 
 from dxlrun.channels import shared_memory
 from dxlrun.channels.shared_memory import load, store
+from dxlrun.process_table import read_stat
 
-_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL, _SUPERVISOR_LOOKS = range(8)
 _NAMES = 4096
 _NAME_BYTES = 128
 _MOST_NAMES = 64
@@ -66,7 +68,7 @@ def create() -> int:
 
 
 class Heartbeat:
-    """The page, mapped; the loop writes, other processes only read."""
+    """The page, mapped; each process writes its own fields."""
 
     __slots__ = ("_beats", "_memory", "_words")
 
@@ -110,6 +112,10 @@ class Heartbeat:
         """Show that the guardian watches; called by the guardian alone."""
         self._words[_LOOKS] += 1
 
+    def supervisor_look(self) -> None:
+        """Show that the supervisor watches; called by the supervisor alone."""
+        self._words[_SUPERVISOR_LOOKS] += 1
+
     @property
     def activity(self) -> str:
         """What of which controller was called and has not returned, as words; empty where there is none."""
@@ -123,6 +129,11 @@ class Heartbeat:
     def looks(self) -> int:
         """Number of times that the guardian has looked at the loop."""
         return self._words[_LOOKS]
+
+    @property
+    def supervisor_looks(self) -> int:
+        """Number of times that the supervisor has looked at guardian and loop."""
+        return self._words[_SUPERVISOR_LOOKS]
 
     @property
     def phase(self) -> Phase:
@@ -212,6 +223,5 @@ class ProcessorTime:
         return None
 
     def _may_run(self) -> bool:
-        with suppress(OSError, IndexError):
-            return (self._folder / "stat").read_text().rpartition(")")[2].split()[0] == "R"
-        return False
+        stat = read_stat(self._folder)
+        return stat is not None and stat.state == "R"

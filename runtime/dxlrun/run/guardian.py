@@ -3,8 +3,9 @@
 A small process, one priority above the loop. It opens, locks and keeps the ports' descriptors, executes the
 loop's process on them as its child, and watches that child: by its pidfd, which shows at once that it ended,
 and by its heartbeat, which shows that it hangs. A loop that is gone before it reported DONE, or that stands
-still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. A line
-that the loop has lost is opened again and handed over.
+still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. When
+the supervisor is dead or stopped, the loop is asked to stop (`watch.py`). A line that the loop has lost is
+opened again and handed over.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, Standstill
+from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime
 from dxlrun.channels.packets import PacketBatch, salvage
 from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.channels.ring import RingReader, RingWriter
@@ -39,21 +40,9 @@ from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
 
 _NEVER = 1 << 62
-SILENT_PERIODS = 5
-"""A running loop whose counter stands still this long hangs."""
-LEAST_TIMEOUT_NS = 80_000_000
-"""At high rates a few periods are less than a stock Linux's worst wake-up (thesis: 17 ms), and than a host
-of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
-TORQUE_TIMEOUT_NS = 1_000_000_000
-"""Start and shutdown beat while they await replies; each wait ends within milliseconds."""
-SETUP_TIMEOUT_NS = 30_000_000_000
-"""The same without torque: nothing is lost by waiting for a machine that other programs keep busy."""
-LOADING_TIMEOUT_NS = 60_000_000_000
-"""For each plug-in's import and each on_configure: a neural network on a slow card takes half of it [i]."""
-ENDING_TIMEOUT_NS = 5_000_000_000
-"""For what plug-ins left to be done when the process of a loop that is done ends."""
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
 """It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""
@@ -82,6 +71,8 @@ class GuardianJob:
     take_over: bool
     """The loop accepts servos that are already torqued."""
     memory: RunMemory
+    supervisor: int
+    """Process ID."""
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this."""
 
@@ -96,6 +87,8 @@ class LoopJob:
     """Descriptors, in the order of the plan's buses."""
     channel: int
     """To the guardian, which opens lines that are gone again."""
+    supervisor: int
+    """Process ID."""
     guardian: int
     """Process ID."""
     epoch_offset_ns: int = 0
@@ -115,7 +108,7 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
 
     ending: Ending
     outcome: tuple[str, ...] = ()
-    """What the guardian did instead of the loop, one sentence each."""
+    """What the guardian did in place of supervisor or loop, one sentence each."""
 
 
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
@@ -194,12 +187,17 @@ class Guardian:
         self._clock = MonotonicClock()
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._safe_stop = SafeStop(job)
-        self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
+        self._loop_signs = SignsOfLife(os.getpid(), LONGEST_LOOK_NS, self._clock.now_ns())
+        self._supervisor_signs = SignsOfLife(job.supervisor, LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
+        self._unsupervised = ""
+        """Why the loop was asked to stop although nobody requested that."""
         self._killed: Literal["hung", "late", "cut"] | None = None
         """Why the loop was killed."""
         self._starved_ns: int | None = None
         """The processor time that it got while it stood still, where it wanted more."""
+        self._halted = False
+        """The loop was killed because a signal had stopped it."""
 
     def run(self) -> None:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
@@ -220,24 +218,30 @@ class Guardian:
         # the terminal gets the ports too: should this process die, they are still held, and still open
         self._control.send(Started(loop.pid, grants), lines.descriptors)
         ending = self._watch(loop, lines, loop_channel)
-        outcome: list[str] = []
+        outcome = [self._unsupervised] if self._unsupervised else []
         how = self._how(ending, loop)
         if ending == "unused":
-            outcome = [f"{how}; nothing had been sent to the robot"]
-            self._safe_stop.report(outcome[0], Severity.ERROR)
+            outcome.append(f"{how}; nothing had been sent to the robot")
+            self._safe_stop.report(outcome[-1], Severity.ERROR)
         elif ending != "done":
             lines.returned()  # one that came back in this moment is to hear it, too
             if ending == "cut":
-                outcome = self._safe_stop.limp(lines.descriptors, how, Severity.WARNING)
+                outcome += self._safe_stop.limp(lines.descriptors, how, Severity.WARNING)
             else:
-                outcome = self._safe_stop.end(lines.descriptors, how, Severity.ERROR)
+                outcome += self._safe_stop.end(lines.descriptors, how, Severity.ERROR)
         lines.close()
         self._control.send(Ended(ending, tuple(outcome)))
 
     def _execute(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
         given = self._job
         job = LoopJob(
-            given.memory, given.take_over, tuple(descriptors), channel, os.getpid(), given.epoch_offset_ns
+            given.memory,
+            given.take_over,
+            tuple(descriptors),
+            channel,
+            given.supervisor,
+            os.getpid(),
+            given.epoch_offset_ns,
         )
         return process.start(
             "dxlrun.run.loop_process",
@@ -252,6 +256,7 @@ class Guardian:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
+        self._loop_signs = SignsOfLife(loop.pid, LONGEST_LOOK_NS, self._clock.now_ns())
         nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
             # a terminal that is gone would wake it for ever, a loop that is gone asks for nothing
@@ -265,13 +270,16 @@ class Guardian:
             if lines in ready:
                 self._hand_over(lines, channel)
             request = self._request() if self._control in ready else None
-            if request == "stop":
+            duty = duty_of(Watched.GUARDIAN, self._silent())
+            processor.look(self._loop_signs.still_ns)
+            if duty is Duty.STOP_LOOP and not self._unsupervised:
+                self._report_unsupervised()
+            if request == "stop" or (duty is Duty.STOP_LOOP and self._stop_by_ns == _NEVER):
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
                 loop.send_signal(signal.SIGTERM)
-            reason: Literal["hung", "late", "cut"] | None = (
-                "cut" if request == "cut" else self._timed_out(processor)
-            )
+            reason = "cut" if request == "cut" else self._reason_to_kill(duty)
             if reason and not self._killed:
+                self._note_standstill(reason, processor)
                 self._killed = reason
                 loop.kill()
 
@@ -305,30 +313,51 @@ class Guardian:
             for each in (channel, self._control):
                 each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
-    def _timed_out(self, processor: ProcessorTime) -> Literal["hung", "late"] | None:
-        """Return why the loop is not waited for any longer, if it is not."""
+    def _silent(self) -> frozenset[Watched]:
+        """Return which of the others do not respond; a supervisor that has ended closed its channel."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
-        timeout_ns = self._timeout_ns(phase)  # first: the loop beats before it asks for less of it
-        still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
-        processor.look(still_ns)
-        if still_ns > timeout_ns:
-            if not self._killed:
-                self._starved_ns = processor.starved_ns(still_ns)
-            return "hung"
-        return "late" if now_ns > self._stop_by_ns else None
+        timeout_ns = self._timeout_ns()  # first: the loop beats before it asks for less of it
+        self._loop_signs.look((phase, self._heartbeat.beats), now_ns)
+        self._supervisor_signs.look(self._heartbeat.supervisor_looks, now_ns)
+        silent = {
+            Watched.LOOP: self._loop_signs.is_silent(timeout_ns),
+            Watched.SUPERVISOR: self._control.closed or self._supervisor_signs.is_halted(),
+        }
+        return frozenset(which for which, is_silent in silent.items() if is_silent)
 
-    def _timeout_ns(self, phase: Phase) -> float:
-        timeout_ns = standstill_timeout_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
-        if phase is Phase.RUNNING and not self._heartbeat.cycles:
-            return max(timeout_ns, TORQUE_TIMEOUT_NS)  # controllers are activated; no goal was commanded yet
-        return timeout_ns
+    def _reason_to_kill(self, duty: Duty) -> Literal["hung", "late"] | None:
+        """Return why the loop is not waited for any longer, if it is not."""
+        if duty is Duty.KILL_LOOP:
+            return "hung"
+        return "late" if self._clock.now_ns() > self._stop_by_ns else None
+
+    def _timeout_ns(self) -> float:
+        return loop_timeout_ns(self._heartbeat, self._job.period_ns)
+
+    def _note_standstill(self, reason: str, processor: ProcessorTime) -> None:
+        """Note why a loop stands still, before it is killed for that."""
+        if reason == "hung":
+            self._halted = self._loop_signs.still_ns <= self._timeout_ns()
+            self._starved_ns = processor.starved_ns(self._loop_signs.still_ns)
+
+    def _report_unsupervised(self) -> None:
+        """Report that the supervisor is dead or stopped, so that nobody else could end the run."""
+        what = (
+            "left the run"
+            if self._control.closed
+            else "was stopped, as by Ctrl-Z, and could not end the run any more"
+        )
+        self._unsupervised = (
+            f"the supervisor (process {self._job.supervisor}) {what}; the loop was asked to stop"
+        )
+        self._safe_stop.report(self._unsupervised, Severity.WARNING)
 
     def _request(self) -> Literal["stop", "cut"] | None:
-        """Return what the terminal asks for; one that is gone cannot ask any more: stop in order."""
+        """Return what the terminal requests."""
         messages = self._control.receive()
         if any(isinstance(message, Cut) for message in messages):
             return "cut"
-        return "stop" if messages or self._control.closed else None
+        return "stop" if messages else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
         """Return how the loop came to its end, and in which controller's code."""
@@ -337,7 +366,9 @@ class Guardian:
         called = self._heartbeat.activity
         where = f" in {called}" if called else ""
         if self._killed == "hung":
-            still = _duration(self._timeout_ns(self._heartbeat.phase))
+            if self._halted:
+                return f"the loop was stopped by a signal{where} and was killed"
+            still = _duration(self._timeout_ns())
             return f"the loop stood still for more than {still}{where} and was killed{self._starved()}"
         if self._killed == "late":
             limit = _duration(self._job.exit_timeout_ns)
@@ -351,17 +382,6 @@ class Guardian:
         got = f"; it was ready to run, but got a processor for only {self._starved_ns / 1e6:.1f} ms of that"
         fix = "; loop.scheduler.policy round_robin lets it run before other programs"
         return got if self._job.priority else got + fix
-
-
-def standstill_timeout_ns(phase: Phase, period_ns: int) -> float:
-    """Return how long the loop's counter may stand still, ns."""
-    timeouts_ns = {
-        Phase.LOADING: LOADING_TIMEOUT_NS,
-        Phase.SETUP: SETUP_TIMEOUT_NS,
-        Phase.RUNNING: max(SILENT_PERIODS * period_ns, LEAST_TIMEOUT_NS),
-        Phase.DONE: ENDING_TIMEOUT_NS,
-    }
-    return timeouts_ns.get(phase, TORQUE_TIMEOUT_NS)
 
 
 def _duration(time_ns: float) -> str:

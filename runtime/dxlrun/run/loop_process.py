@@ -1,7 +1,8 @@
 """The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
 
 One thread, executed afresh (no fork), on descriptors that the guardian opened. It is asked to stop
-by SIGTERM, which the guardian sends, or the Linux kernel when the guardian is gone.
+by SIGTERM, which the guardian sends, or the Linux kernel when the guardian is gone. When neither supervisor
+nor guardian responds, it ends of its own accord (`watch.py`).
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.guardian import LoopJob
+from dxlrun.run.watch import Duty, LoopWatch
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):
@@ -104,20 +106,30 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     return check
 
 
+UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit"
+
+
 class AskedToStop(Exception):
     """A stop was requested before the robot ran: no torque may be switched on any more."""
 
 
 @dataclass(slots=True)
 class Pulse:
-    """Called while replies are awaited, and once a cycle: beats, and gives a set-up up that is to stop."""
+    """Called while replies are awaited, and once a cycle: beats, looks at supervisor and guardian, and gives
+    a set-up up that is to stop."""
 
     heartbeat: Heartbeat
     stop: StopFlag
+    watch: LoopWatch
+    events: EventSink
+    now_ns: Callable[[], int]
 
     def __call__(self) -> None:
         """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
         self.heartbeat.beat()
+        if not self.stop.requested and self.watch.duty(self.now_ns()) is Duty.END:
+            self.stop.request()
+            self.events.emit(EventCode.GUARDIAN, Severity.ERROR, "loop", UNWATCHED)
         if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             self.heartbeat.enter(Phase.STOPPING)
             raise AskedToStop
@@ -150,6 +162,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     )
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
+    watch = LoopWatch(heartbeat, job.supervisor, job.guardian, plan.loop.period_ns, clock.now_ns())
     plugins = load_plugins(_looked_at(heartbeat), plan.included)
     plugins.import_all()
     robot = assemble(
@@ -158,7 +171,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         ports=ports,
         clock=clock,
         sinks=sinks,
-        beat=Pulse(heartbeat, stop),
+        beat=Pulse(heartbeat, stop, watch, sinks.events, clock.now_ns),
         stop=stop,
         take_over=job.take_over,
         inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),

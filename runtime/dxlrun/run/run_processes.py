@@ -193,6 +193,7 @@ def guardian_job(
         last=plan.loop.policies.on_fault.last,
         take_over=take_over,
         memory=memory,
+        supervisor=os.getpid(),
         epoch_offset_ns=epoch_offset_ns,
     )
 
@@ -229,6 +230,8 @@ def _executed(
     descriptor = process.memory_file(f"dxlrun-{name}", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
     try:
-        return Child(name, module, arguments, [descriptor, *inherited], memory.stderr, messages)
+        # each has the plan's memory: by that a process is known to belong to the run
+        shared = {descriptor, memory.plan, *inherited}
+        return Child(name, module, arguments, sorted(shared), memory.stderr, messages)
     finally:
         os.close(descriptor)

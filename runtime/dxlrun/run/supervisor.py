@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from dxlrun.channels import process
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.events import Severity
-from dxlrun.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import MailboxWriter
 from dxlrun.channels.process import (
@@ -71,6 +71,15 @@ from dxlrun.run.run_summary import (
     refusals,
     show_grants,
 )
+from dxlrun.run.watch import (
+    GUARDIAN_TIMEOUT_NS,
+    URGENT_TIMEOUT_NS,
+    Duty,
+    SignsOfLife,
+    Watched,
+    duty_of,
+    loop_timeout_ns,
+)
 from dxlrun.simulation.messages import SimulationMessage
 
 if TYPE_CHECKING:
@@ -80,11 +89,7 @@ _POLL_S = 0.1
 _RESTART_S = 2.0
 """Between the end of a sensor's process and the start of another one."""
 _LOOK_NS = 100_000_000
-"""A look at the guardian counts for at most this: when this process did not run, it may not have either."""
-_GUARDIAN_TIMEOUT_NS = 5_000_000_000
-"""The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
-_TORQUE_TIMEOUT_NS = 100_000_000
-"""The same for one that is to cut torque: its loop is gone, or that was requested."""
+"""A look at another process counts for at most this: when this one did not run, that may not have either."""
 _GONE_POLL_S = 0.02
 """Between two looks at the guardian when the loop is gone."""
 
@@ -151,6 +156,8 @@ class _Run:
     job: GuardianJob | None = None
     loop: int | None = None
     """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
+    loop_signs: SignsOfLife | None = None
+    """None as long as there is no loop."""
     log: Path | None = None
     sentences: list[str] = field(default_factory=list)
     ended: Ended | None = None
@@ -207,6 +214,7 @@ class _Run:
                 self.recorder.channel.send(LoopRuns(started.loop))
             with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
                 self.loop = os.pidfd_open(started.loop)
+                self.loop_signs = SignsOfLife(started.loop, _LOOK_NS, time.monotonic_ns())
         return self.guardian
 
     def hold(self) -> None:
@@ -221,11 +229,15 @@ class _Run:
             self.log = None
 
     def watch(self, guardian: Child[GuardianMessage], show: Callable[[Heartbeat], None]) -> None:
-        """Wait for the guardian's last message; pass on what the signals ask for."""
+        """Wait for the guardian's last message; pass on what the signals request.
+
+        Return too when the guardian is gone, or was killed because it did not respond.
+        """
         heartbeat = Heartbeat(self.memory.heartbeat)
-        still = Standstill(_LOOK_NS, time.monotonic_ns())
+        signs = SignsOfLife(guardian.process.pid, _LOOK_NS, time.monotonic_ns())
         asked, gone = 0, False
         while self.ended is None and not guardian.channel.closed:
+            heartbeat.supervisor_look()
             if self.signals > asked:
                 asked = self.signals
                 guardian.channel.send(Stop() if asked == 1 else Cut())
@@ -238,15 +250,28 @@ class _Run:
             loop = () if gone or self.loop is None else (self.loop,)
             message = guardian.poll(_GONE_POLL_S if gone else _POLL_S, *loop)
             gone = gone or bool(select.select(loop, [], [], 0)[0])
+            signs.look(heartbeat.looks, time.monotonic_ns())
             torque = heartbeat.phase not in (Phase.LOADING, Phase.DONE)
             urgent = torque and (gone or asked > 1)
-            timeout_ns = _TORQUE_TIMEOUT_NS if urgent else _GUARDIAN_TIMEOUT_NS
+            guardian_silent = signs.is_silent(URGENT_TIMEOUT_NS if urgent else GUARDIAN_TIMEOUT_NS)
+            duty = self._duty(heartbeat, guardian_silent=guardian_silent, loop_gone=gone)
             if message:
                 self._take(message, guardian.channel.descriptors)
-            elif still.ns(heartbeat.looks, time.monotonic_ns()) > timeout_ns:
+            elif duty is not Duty.NONE and not guardian.channel.closed:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
+
+    def _duty(self, heartbeat: Heartbeat, *, guardian_silent: bool, loop_gone: bool = False) -> Duty:
+        """Look at the loop; return what this process has to do. One that is done is not silent."""
+        silent = {Watched.GUARDIAN} if guardian_silent else set()
+        phase, signs = heartbeat.phase, self.loop_signs
+        if signs is not None and phase is not Phase.DONE:
+            timeout_ns = loop_timeout_ns(heartbeat, self.plan.loop.period_ns)  # first: as in the guardian
+            signs.look((phase, heartbeat.beats), time.monotonic_ns())
+            if loop_gone or signs.is_silent(timeout_ns):
+                silent.add(Watched.LOOP)
+        return duty_of(Watched.SUPERVISOR, silent)
 
     def _look_after_simulation(self, guardian: Child[GuardianMessage]) -> None:
         """End the run when the simulated servos are gone: unlike an adapter they do not come back."""
@@ -322,9 +347,11 @@ class _Run:
     def _without_guardian(self, loop: int, guardian: Child[GuardianMessage], job: GuardianJob) -> None:
         """The guardian is gone, and Linux has signalled the loop: see that it stops, or cut torque."""
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
-        while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
+        heartbeat = Heartbeat(self.memory.heartbeat)
+        while not (gone := bool(select.select([loop], [], [], _GONE_POLL_S)[0])):
+            silent = self._duty(heartbeat, guardian_silent=True) is Duty.KILL_BOTH
             # the second request may have gone to a guardian that did not read it any more
-            if time.monotonic() > give_up or self.signals > 1:
+            if silent or time.monotonic() > give_up or self.signals > 1:
                 signal.pidfd_send_signal(loop, signal.SIGKILL)
                 select.select([loop], [], [])
                 break
@@ -436,7 +463,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     elif outcome is None:
         outcome = LoopOutcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
-    if run.ended is not None and run.ended.ending != "done":
+    if run.ended is not None:
         sentences += run.ended.outcome
     sentences += run.sentences
     interrupted = run.signals > 0

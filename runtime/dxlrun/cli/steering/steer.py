@@ -20,6 +20,7 @@ from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
+    from dxlrun.process_table import FoundRun
     from dxlrun.remote.client import Executed, RemoteRobot
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
@@ -64,12 +65,18 @@ def list_robots(
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
     from dxlrun.remote.sockets import running
+    from dxlrun.run.unsteered import describe, unsteered_runs
 
     here = running()
-    names = dict.fromkeys((*here, *known_robots()))
+    unsteered = {run.robot: run for run in unsteered_runs()}
+    names = dict.fromkeys((*here, *known_robots(), *unsteered))
     _require_known(robot, names)
     found, code = [], 0
     for name in names if robot is None else (robot,):
+        if name in unsteered:
+            print_error(f"dxlrun: {describe(unsteered[name])}")
+            code |= robot is not None
+            continue
         try:
             with connect(name, "dxlrun list") as one:
                 found.append({**one.info(), "name": name})
@@ -83,7 +90,7 @@ def list_robots(
         show(
             headline(info), *([drawing(info)] if graph else [controllers(info), sources(info), groups(info)])
         )
-    if not found and not code:
+    if not found and not code and not unsteered:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
 
@@ -202,9 +209,31 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     no_wait
         Return as soon as the loop has accepted it.
     """
+    from dxlrun.run.unsteered import end_run
+
+    if (run := unsteered_of(chosen)) is not None:
+        sentence = end_run(run, wait=not no_wait)
+        if chosen.as_json:
+            show_json({"robot": run.robot, "ended": sentence})
+        else:
+            show(sentence)
+        return 0
     with robot_of(chosen, "stop") as robot:
         robot.stop(wait=not no_wait)
         return report_done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
+
+
+def unsteered_of(chosen: Chosen) -> FoundRun | None:
+    """Return the chosen run if it cannot be steered, else None; raises InputError when the choice is open."""
+    from dxlrun.remote.sockets import running
+    from dxlrun.run.unsteered import unsteered_run, unsteered_runs
+
+    if chosen.robot is not None:
+        return unsteered_run(chosen.robot)
+    unsteered = unsteered_runs()
+    names = sorted({*running(), *(run.robot for run in unsteered)})
+    _require_one(names)
+    return unsteered[0] if unsteered else None
 
 
 def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
@@ -212,15 +241,25 @@ def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
     from dxlrun.remote.sockets import running
+    from dxlrun.run.unsteered import describe
 
     names = running()
+    known = names if chosen.robot is None else (*names, *known_robots())
+    missing = chosen.robot not in known if chosen.robot else not names
+    if missing and (run := unsteered_of(chosen)) is not None:
+        raise DxlrunError(describe(run))
     if chosen.robot is not None:
-        _require_known(chosen.robot, (*names, *known_robots()))
+        _require_known(chosen.robot, known)
     elif not names:
         raise DxlrunError("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
-    elif len(names) > 1:
-        raise InputError(f"several robots run; choose one: --robot {', --robot '.join(names)}")
+    else:
+        _require_one(names)
     return connect(chosen.robot or names[0], f"dxlrun {verb}")
+
+
+def _require_one(names: Sequence[str]) -> None:
+    if len(names) > 1:
+        raise InputError(f"several robots run; choose one: --robot {', --robot '.join(names)}")
 
 
 def _require_known(robot: str | None, names: Collection[str]) -> None:

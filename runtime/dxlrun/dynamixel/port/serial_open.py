@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import re
 import termios
 from collections.abc import Iterable
 from contextlib import suppress
@@ -14,9 +13,7 @@ from pathlib import Path
 import serial
 
 from dxlrun.errors import PortError
-
-_PLAN_MEMORY = "/memfd:dxlrun-plan "
-_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # How a plan begins as JSON
+from dxlrun.process_table import robot_of
 
 
 class ExclusiveSerial(serial.Serial):
@@ -129,23 +126,11 @@ def _holder(path: str) -> str:
     found = [
         process for process in _processes() if process.name != str(os.getpid()) and _has_open(process, device)
     ]
-    robot = next((name for name in map(_robot, found) if name), None)
+    robot = next((name for name in map(robot_of, found) if name), None)
     if robot is not None:
         return f"a run of {robot}; `dxlrun stop --robot {robot}` ends it, or Ctrl-C in its terminal"
     named = [f"{_command(process)} (process {process.name})" for process in found]
     return f"{' and '.join(named) or 'another process, which this user may not see'}; stop that first"
-
-
-def _robot(process: Path) -> str | None:
-    """Return the name of the robot that a process runs: guardian and loop share the plan's memory."""
-    try:
-        for descriptor in (process / "fd").iterdir():
-            if os.readlink(descriptor).startswith(_PLAN_MEMORY):
-                match = _ROBOT.match(descriptor.read_bytes())
-                return match[1].decode() if match else None
-    except (OSError, UnicodeDecodeError):
-        pass  # it has ended meanwhile, or is not ours
-    return None
 
 
 def _processes() -> Iterable[Path]:

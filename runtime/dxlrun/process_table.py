@@ -1,0 +1,158 @@
+"""Linux' table of processes: the state of one, and the runs on this computer with their processes."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+PROC = Path("/proc")
+_PLAN_MEMORY = "/memfd:dxlrun-plan "
+_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # the beginning of a plan as JSON
+_DEAD = "ZXx"
+_STOPPED = "Tt"
+SUPERVISOR = "supervisor"
+_ROLES = {
+    b"dxlrun.run.guardian": "guardian",
+    b"dxlrun.run.loop_process": "loop",
+    b"dxlrun.log.recorder": "recorder",
+    b"dxlrun.remote": "gateway",
+    b"dxlrun.run.sensor_process": "sensor",
+}
+
+
+class ProcessStat(NamedTuple):
+    """An entry of the process table (proc_pid_stat(5))."""
+
+    state: str
+    """A letter: R running, S and D waiting, T stopped by a signal, t by a debugger, Z and X dead."""
+    parent: int
+    start_ticks: int
+    """Time of its start: a process ID is used again, with another time."""
+
+    @property
+    def is_dead(self) -> bool:
+        """True when it has ended, whether its parent has noticed or not."""
+        return self.state in _DEAD
+
+    @property
+    def is_stopped(self) -> bool:
+        """True when a signal or a debugger has stopped it: it does nothing until it is continued."""
+        return self.state in _STOPPED
+
+
+def read_stat(folder: Path) -> ProcessStat | None:
+    """Return the entry of a process by its folder in /proc; None when there is none."""
+    with suppress(OSError, ValueError, IndexError):
+        words = (folder / "stat").read_text(errors="replace").rpartition(")")[2].split()
+        return ProcessStat(words[0], int(words[1]), int(words[19]))
+    return None
+
+
+class RunProcess(NamedTuple):
+    """A process of a run."""
+
+    pid: int
+    role: str
+    stat: ProcessStat
+
+    def __str__(self) -> str:
+        return f"{self.role} (process {self.pid})"
+
+
+class FoundRun(NamedTuple):
+    """A run on this computer, with the processes that are alive; they share the memory of its plan."""
+
+    robot: str
+    processes: tuple[RunProcess, ...]
+    runtime_directory: str
+    """XDG_RUNTIME_DIR in its environment, where its gateway listens; empty without one."""
+
+    def process(self, role: str) -> RunProcess | None:
+        """Return its process of this role; None when it is gone."""
+        return next((one for one in self.processes if one.role == role), None)
+
+    @property
+    def problem(self) -> str:
+        """Why the run cannot be steered, as a clause; empty when it can."""
+        steering = (SUPERVISOR, "guardian", "loop", "gateway")
+        gone = [role for role in steering if self.process(role) is None]
+        stopped = [str(one) for one in self.processes if one.stat.is_stopped and one.role in steering]
+        parts = [f"it has no {' and no '.join(gone)}"] if gone else []
+        parts += (
+            [f"its {' and '.join(stopped)} {'is' if len(stopped) == 1 else 'are'} stopped"] if stopped else []
+        )
+        return " and ".join(parts)
+
+
+def is_alive(process: RunProcess) -> bool:
+    """Return whether a process of a run has not ended; its ID may belong to another one by now."""
+    stat = read_stat(PROC / str(process.pid))
+    return stat is not None and not stat.is_dead and stat.start_ticks == process.stat.start_ticks
+
+
+def robot_of(process: Path) -> str | None:
+    """Return the name of the robot that a process runs, by its folder in /proc; None when it runs none."""
+    found = _plan_memory(process)
+    return found[1] if found else None
+
+
+def found_runs() -> list[FoundRun]:
+    """Return the runs of this user (root: of all) on this computer, whatever state their processes are in."""
+    runs: dict[tuple[int, int], tuple[str, list[RunProcess]]] = {}
+    for folder in PROC.iterdir():
+        if not folder.name.isdigit():
+            continue
+        memory, stat = _plan_memory(folder), read_stat(folder)
+        if memory is not None and stat is not None and not stat.is_dead:
+            key, robot = memory
+            process = RunProcess(int(folder.name), _role(folder), stat)
+            runs.setdefault(key, (robot, []))[1].append(process)
+    found = ((robot, tuple(_members(processes))) for robot, processes in runs.values())
+    return sorted(FoundRun(robot, members, _directory(members[0].pid)) for robot, members in found if members)
+
+
+def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
+    """Return those that belong to the run: a supervisor has children of it, or executes dxlrun."""
+    parents = {one.stat.parent for one in processes}
+    for one in sorted(processes):
+        if one.role:
+            yield one
+        elif one.pid in parents or _executes_dxlrun(PROC / str(one.pid)):
+            yield one._replace(role=SUPERVISOR)
+
+
+def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
+    """Return what identifies the plan's memory that a process has open, and the robot of the plan."""
+    with suppress(OSError, UnicodeDecodeError):  # it has just ended, or belongs to another user
+        for descriptor in (process / "fd").iterdir():
+            if os.readlink(descriptor).startswith(_PLAN_MEMORY):
+                match = _ROBOT.match(descriptor.read_bytes())
+                inode = descriptor.stat()
+                return ((inode.st_dev, inode.st_ino), match[1].decode()) if match else None
+    return None
+
+
+def _directory(pid: int) -> str:
+    with suppress(OSError):
+        for variable in (PROC / str(pid) / "environ").read_bytes().split(b"\0"):
+            if variable.startswith(b"XDG_RUNTIME_DIR="):
+                return os.fsdecode(variable.partition(b"=")[2])
+    return ""
+
+
+def _words(process: Path) -> list[bytes]:
+    with suppress(OSError):
+        return (process / "cmdline").read_bytes().split(b"\0")
+    return []
+
+
+def _role(process: Path) -> str:
+    return next((_ROLES[word] for word in _words(process) if word in _ROLES), "")
+
+
+def _executes_dxlrun(process: Path) -> bool:
+    return any(os.path.basename(word) == b"dxlrun" for word in _words(process)[:3])

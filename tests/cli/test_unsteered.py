@@ -1,0 +1,98 @@
+"""Runs that cannot be steered: `dxlrun list` names them, `dxlrun stop` ends them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+Begin = Callable[..., subprocess.Popen[str]]
+LOOP = """\
+import os, signal, sys
+signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+plan = os.memfd_create("dxlrun-plan")
+os.pwrite(plan, b'{"robot":"%s","loop":{}}', 0)
+print("ready", flush=True)
+while True:
+    signal.pause()
+"""
+
+
+@pytest.fixture
+def orphan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
+    """Start what stands for the loop of a run that has lost all its other processes."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+    def begin(robot: str, source: str = LOOP) -> subprocess.Popen[str]:
+        # the last word is by what a loop's process is known
+        command = [sys.executable, "-c", source.replace("%s", robot), "dxlrun.run.loop_process"]
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        stack.enter_context(child)
+        stack.callback(child.kill)
+        assert child.stdout
+        assert child.stdout.readline() == "ready\n"
+        return child
+
+    with ExitStack() as stack:
+        yield begin
+
+
+def test_a_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun, orphan: Begin) -> None:
+    loop = orphan("lonely_arm")
+    problem = "it has no supervisor and no guardian and no gateway"
+    fix = "`dxlrun stop --robot lonely_arm` ends it"
+    named = f"dxlrun: lonely_arm runs but cannot be steered: {problem}; {fix}\n"
+    assert dxlrun("list") == (0, "", named)
+    assert dxlrun("list", "--robot", "lonely_arm") == (1, "", named)
+    assert dxlrun("halt") == (1, "", named)
+    assert dxlrun("halt", "--robot", "lonely_arm") == (1, "", named)
+    ended = f"lonely_arm has ended; it could not be steered: {problem}\n"
+    assert dxlrun("stop") == (0, ended, "")
+    assert loop.wait(60) == 0
+    assert "no robot runs" in dxlrun("list").out
+
+
+def test_a_stopped_loop_is_continued_to_its_end(dxlrun, orphan: Begin) -> None:
+    loop = orphan("held_arm")
+    loop.send_signal(signal.SIGSTOP)
+    os.waitpid(loop.pid, os.WUNTRACED)
+    said = dxlrun("stop", "--robot", "held_arm")
+    assert said.code == 0, said.err
+    assert f"its loop (process {loop.pid}) is stopped" in said.out
+    assert loop.wait(60) == 0
+
+
+def test_a_run_of_another_runtime_directory_is_ended_by_name_only(
+    dxlrun, orphan: Begin, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    loop = orphan("far_arm")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "other"))
+    assert "no robot runs that can be steered" in dxlrun("stop").err
+    assert "far_arm" not in dxlrun("list").err
+    assert dxlrun("stop", "--robot", "far_arm").code == 0
+    assert loop.wait(60) == 0
+
+
+def test_several_runs_are_not_ended_without_a_name(dxlrun, orphan: Begin) -> None:
+    loops = orphan("left_arm"), orphan("right_arm")
+    said = dxlrun("stop")
+    assert said.code == 2
+    assert "--robot left_arm, --robot right_arm" in said.err
+    assert [loop.poll() for loop in loops] == [None, None]
+
+
+def test_a_process_that_does_not_end_is_named_with_what_to_do(
+    dxlrun, orphan: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dxlrun.run.unsteered._END_S", 0.1)
+    loop = orphan("deaf_arm", LOOP.replace("lambda *_: sys.exit()", "signal.SIG_IGN"))
+    said = dxlrun("stop")
+    assert said.code == 1
+    assert f"deaf_arm: loop (process {loop.pid}) did not end within 0.1 s" in said.err
+    assert "switch the servos' power off" in said.err

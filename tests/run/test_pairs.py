@@ -1,0 +1,194 @@
+"""Campaign: two hits, KILL or STOP, on two processes of a run; servos emulated by `tests/kit/emulator.py`.
+
+One survivor of main process, guardian and loop takes torque off. Recorder and gateway do not end control.
+Afterwards nothing of the run is left but processes that are stopped, or that wait for one that is, and
+`dxlrun stop` ends these. No time decides: each test prints how long torque stayed on after the hit.
+
+CI runs `TELLING`, the first ten pairs. All ordered pairs, before a release:
+
+    DXLRUN_KILL_PAIRS=90 python -m pytest tests/run/test_pairs.py -q -rP
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from dxlrun.remote.sockets import sockets
+
+EMULATOR = Path(__file__).parents[1] / "kit/emulator.py"
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+IDS = ("3", "7")
+MODULES = {
+    "main": "dxlrun",
+    "guardian": "run.guardian",
+    "loop": "run.loop_process",
+    "recorder": "log.recorder",
+    "gateway": "remote",
+}
+IN_CONTROL = ("main", "guardian", "loop")
+SETTLED_S = 3.0
+"""After it `dxlrun stop` is to end what is left, whether it would have ended by itself or not."""
+PAUSES_S = (0.0, 0.02, 0.1, 0.3)
+"""Between the hits, in turn: before, while and after the first one is noticed."""
+
+
+class Hit(NamedTuple):
+    """A signal to one of the processes."""
+
+    process: str
+    signal: str
+
+    def __str__(self) -> str:
+        return f"{self.process}_{self.signal}"
+
+
+HITS = tuple(Hit(process, number) for process in MODULES for number in ("KILL", "STOP"))
+TELLING = (
+    (Hit("guardian", "STOP"), Hit("main", "KILL")),
+    (Hit("main", "KILL"), Hit("guardian", "STOP")),
+    (Hit("guardian", "STOP"), Hit("loop", "STOP")),
+    (Hit("guardian", "KILL"), Hit("loop", "STOP")),
+    (Hit("main", "STOP"), Hit("guardian", "STOP")),
+    (Hit("main", "STOP"), Hit("gateway", "STOP")),
+    (Hit("main", "KILL"), Hit("loop", "STOP")),
+    (Hit("loop", "KILL"), Hit("guardian", "STOP")),
+    (Hit("guardian", "STOP"), Hit("recorder", "KILL")),
+    (Hit("gateway", "STOP"), Hit("recorder", "KILL")),
+)
+
+
+def pairs() -> list[Any]:
+    """Return the pairs to try, the telling ones first, with the pause between their hits."""
+    count = int(os.environ.get("DXLRUN_KILL_PAIRS", "10"))
+    ordered = ((first, second) for first in HITS for second in HITS if first != second)
+    chosen = list(dict.fromkeys((*TELLING, *ordered)))[:count]
+    return [
+        pytest.param(first, second, PAUSES_S[index % len(PAUSES_S)], id=f"{first}-{second}")
+        for index, (first, second) in enumerate(chosen)
+    ]
+
+
+class Servos(NamedTuple):
+    """The emulated servos: their terminal, and their journal."""
+
+    port: str
+    journal: Path
+
+    def entries(self, what: str) -> list[dict[str, Any]]:
+        """Return the journal's lines of a kind, the oldest first."""
+        lines = self.journal.read_bytes().splitlines()
+        return [entry for entry in map(json.loads, lines) if entry["what"] == what]
+
+    def torque(self) -> dict[int, int]:
+        """Return Torque Enable of each servo that had it written."""
+        return {entry["servo"]: entry["value"] for entry in self.entries("torque")}
+
+    def limp_since_ns(self) -> int:
+        """Return when the last servo lost torque."""
+        torque: dict[int, int] = {}
+        since_ns = 0
+        for entry in self.entries("torque"):
+            if torque.get(entry["servo"]) == 1 and not entry["value"]:
+                since_ns = entry["t_ns"]
+            torque[entry["servo"]] = entry["value"]
+        return since_ns
+
+
+@pytest.fixture
+def servos(tmp_path: Path) -> Iterator[Servos]:
+    journal = tmp_path / "journal.jsonl"
+    command = [sys.executable, str(EMULATOR), str(journal), *IDS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        yield Servos(process.stdout.readline().strip(), journal)
+        process.kill()
+
+
+@pytest.fixture
+def run(
+    request: pytest.FixtureRequest,
+    start: Callable[..., Any],
+    servos: Servos,
+    tmp_path: Path,
+    wait_for: Callable[..., Any],
+) -> Any:
+    """A run of `pair` under a name of its own, once it controls the servos; a gateway only to be hit."""
+    gateway = "gateway" in request.node.callspec.id
+    robot = tmp_path / "pairs.yaml"
+    text = (tmp_path / "pair.yaml").read_text().replace("latency: 1 ms", "latency: 4 ms")
+    name = f"pair_{os.getpid()}"
+    robot.write_text(text.replace("name: pair", f"name: {name}", 1))
+    running = start(f"port:={servos.port}", robot=robot, gateway=gateway)
+
+    def complete() -> bool:
+        assert running.process.poll() is None, running.finish()
+        wanted = {module for name, module in MODULES.items() if gateway or name != "gateway"}
+        return wanted <= set(running.processes())
+
+    wait_for(complete, "all processes")
+    if gateway:  # before it listens, its end ends a run on a real port: the robot was held for it
+        wait_for(lambda: name in sockets(), "the socket")
+    wait_for(lambda: sum(servos.torque().values()) == len(IDS), "torque")
+    in_control(servos, wait_for)
+    return running
+
+
+def in_control(servos: Servos, wait_for: Callable[..., Any]) -> None:
+    """Wait for twenty more exchanges, torque on."""
+    before = len(servos.entries("instruction"))
+    wait_for(lambda: len(servos.entries("instruction")) > before + 20, "more exchanges")
+    assert set(servos.torque().values()) == {1}
+
+
+def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> None:
+    """Wait until the processes are gone, or end them by `dxlrun stop`; judge that it finds them."""
+    with suppress(subprocess.TimeoutExpired):
+        run.process.wait(SETTLED_S)  # reaped: a dead child of this process is none that is left
+    until = time.monotonic() + SETTLED_S
+    while not run.gone() and time.monotonic() < until:
+        time.sleep(0.05)
+    if left := run.processes():
+        name = f"pair_{os.getpid()}"
+        done = subprocess.run(
+            [DXLRUN, "stop", "--robot", name], capture_output=True, text=True, timeout=60, check=False
+        )
+        print(f"left: {', '.join(sorted(left))}; dxlrun stop: {done.stdout.strip()} {done.stderr.strip()}")
+        assert done.returncode == 0, done.stderr
+        assert name in done.stdout
+    run.finish()
+    wait_for(run.gone, "the end of every process")
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("first", "second", "pause_s"), pairs())
+def test_one_survivor_takes_torque_off(  # noqa: PLR0917  fixtures
+    run: Any, servos: Servos, wait_for: Callable[..., Any], first: Hit, second: Hit, pause_s: float
+) -> None:
+    pids = run.processes()
+    hit_ns = 0
+    for hit in (first, second):
+        if hit.process in IN_CONTROL:
+            hit_ns = hit_ns or time.monotonic_ns()
+        with suppress(ProcessLookupError):  # it ended because of the first
+            os.kill(pids[MODULES[hit.process]], signal.Signals[f"SIG{hit.signal}"])
+        time.sleep(pause_s)
+    if not hit_ns:
+        in_control(servos, wait_for)
+        run.signal(signal.SIGINT)
+    wait_for(lambda: not any(servos.torque().values()), "torque off")
+    if hit_ns:
+        after_ms = (servos.limp_since_ns() - hit_ns) / 1e6
+        print(f"TORQUE OFF after {after_ms:.0f} ms: {first}, {second} {pause_s * 1e3:.0f} ms later")
+    end_what_is_left(run, wait_for)
+    assert not any(servos.torque().values())
