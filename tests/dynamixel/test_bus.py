@@ -139,10 +139,11 @@ def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled():
     assert kinds(sink) == [(PacketKind.LATE, 7, stale), (PacketKind.STATUS, 7, GOOD)]
 
 
-def test_replies_are_owed_in_bounded_memory():
-    line = ScriptedLine()
-    talk(line, *[QUESTION] * 50)
-    assert line.bus._owed == {7: [1] * 8}
+def test_late_replies_to_a_repeated_request_are_recognized_up_to_a_bound():
+    late = [(300_000 + number * 100_000, ANSWER) for number in range(10)]
+    line = ScriptedLine(*[()] * 50, late)
+    _, sink, _ = talk(line, *[QUESTION] * 50, LINE.unanswered(b"\xff\xff\xfe\x02\x05\xfa"), listen(2_000_000))
+    assert [kind for kind, *_ in kinds(sink)] == [PacketKind.LATE] * 8 + [PacketKind.STATUS] * 2
 
 
 OTHERS = {

@@ -207,16 +207,6 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
     assert rig.torque() == [False, True]
 
 
-@pytest.mark.parametrize(
-    ("model", "protocol"),
-    [("XM430-W350", 2.0), ("XL-320", 2.0), ("PH54-200-S500", 2.0), ("MX-64", 1.0), ("AX-12A", 1.0)],
-)
-def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(model, protocol):
-    plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
-    one = reach(plan, plan.servos[0])
-    assert next(modes.mode_now(one)).awaited[0].length != next(one.read_torque()).awaited[0].length
-
-
 def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
     ends = {"lower": -math.inf, "upper": math.inf}
     rig = start_rig(make_plan((1, 2, 3, 4), model="AX-12A", continuous=True, **ends))

@@ -106,7 +106,7 @@ def test_lies_raise_nothing_and_modes_and_torque_are_known_as_they_are_soon_afte
         act(rig, chance, name)
         cycle(rig)
     liars.end()
-    for _ in range(110):  # a lost servo is asked once a second
+    for _ in range(200):  # a lost servo is probed once a second, and waits for the replies that it owes
         cycle(rig)
     torqued = rig.hardware._servos[0].life.torqued
     for servo in rig.plans[0].servos:

@@ -112,7 +112,7 @@ def test_a_timer_of_16_ms_is_named_before_any_servo_has_torque(tmp_path):
         robot.run()
     (sentence,) = refusal.value.sentences
     assert sentence.startswith(
-        "every servo answers too late: replies on bus main come 15.3 ms later than the wire"
+        "every servo answers too late: replies on bus main come 15.1 ms later than the wire"
     )
     assert "1 ms were planned for the adapter: that is a latency timer of 16 ms" in sentence
     assert "`echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer` shortens it" in sentence

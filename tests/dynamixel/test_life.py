@@ -13,6 +13,7 @@ from tests.kit.rigs import goals_in, make_plan, make_rig
 from dxlrun.channels.cycle import States
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
+from dxlrun.dynamixel.exchange.owed import OwedReplies
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.servo import life
 from dxlrun.dynamixel.servo.life import (
@@ -33,7 +34,9 @@ def one():
     """The life of one servo, apart from any line."""
     plan = make_plan((1,))
     rig = make_rig(plan)
-    reads = CyclicReads(plan, Samples([plan], States.empty(1), rig.events).buses[0])
+    reads = CyclicReads(
+        plan, Samples([plan], States.empty(1), rig.events).buses[0], OwedReplies(rig.clock.now_ns)
+    )
     return Life(rig.hardware._idle[0], reads)
 
 

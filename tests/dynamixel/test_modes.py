@@ -241,7 +241,7 @@ def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone(
     lose = partial(rig.buses[0].alter_next_instruction, "lost", lambda _: b"")
     rig.when(lambda data: data[2] == 1 and data[4:7] == b"\x03\x18\x00", lose)
     rig.set_modes(Mode.VELOCITY, 0)
-    rig.cycles(30)
+    rig.cycles(60)
     assert servo.registers["ccw_angle_limit"] == limit
     assert rig.torque() == [True, True]
     (text,) = rig.events.texts(EventCode.MODE)

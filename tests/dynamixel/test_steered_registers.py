@@ -66,7 +66,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
     servo.silence()
     started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
     started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
-    started.cycles(40)
+    started.cycles(80)
     assert answers == [""]
     assert gain_of(started, 0) == 900
 

@@ -19,7 +19,7 @@ from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlrun.dynamixel.exchange.samples import Samples
-from dxlrun.dynamixel.plan.retry import pause
+from dxlrun.dynamixel.plan.retry import limit_patience, pause
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -214,7 +214,7 @@ class DynamixelHardware:
                 bus.fail(failure)
             if line.done or line.state or failure is not None:
                 servos.reads.begin(line.done)
-                bus.load(servos.reads)
+                bus.load(servos.reads, cyclic=True)
             if line.state == AWAITING:
                 bus.resume(line.at_ns, line.sent_ns, line.deadline_ns)
             for data, at_ns in self._kernel.pieces(index):
@@ -227,7 +227,7 @@ class DynamixelHardware:
         self._lines.clear([bus for bus, _ in waiting])
         for bus, servos in waiting:
             servos.reads.begin()
-            bus.load(servos.reads)
+            bus.load(servos.reads, cyclic=True)
         self._lines.pump()
         for servos in self._servos:
             self._settle(servos)
@@ -369,7 +369,7 @@ class DynamixelHardware:
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
         self._make_devices_safe()
-        programs = [watchdog.release_all(plan) for plan in self._plans]
+        programs = [limit_patience(watchdog.release_all(plan)) for plan in self._plans]
         for problems in self._lines.run(programs):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)

@@ -12,6 +12,8 @@ from msgspec.structs import replace
 Result = TypeVar("Result")
 
 BROADCAST_ID = 0xFE
+NO_REGISTER = -1  # Instead of an address: the status acknowledges an instruction that may change registers
+PRESENCE = -2  # Instead of an address: the status answers a ping
 
 
 class Status(NamedTuple):
@@ -27,6 +29,7 @@ class Awaited(msgspec.Struct, frozen=True):
 
     servo_id: int
     length: int  # Number of its parameter bytes, without stuffing
+    address: int = NO_REGISTER  # The first register that they have, or one of the constants above
 
 
 class Transaction(msgspec.Struct, frozen=True):
@@ -45,6 +48,11 @@ class Transaction(msgspec.Struct, frozen=True):
     `tail_timeout_ns` from the start of the write, and `tail_margin_ns` from the last of the others."""
     tail_timeout_ns: int = 0
     tail_margin_ns: int = 0
+    spare: int = 0
+    """Bytes after those of a read of one servo that can be read with it. While the late reply to an older request
+    would fit, a read asks for more of them."""
+    patience_ns: int = 1 << 62
+    """How long the transaction may be held back while the late reply to an older request would fit."""
 
 
 @unique

@@ -12,7 +12,8 @@ from typing import TypeAlias
 
 from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
+from dxlrun.dynamixel.exchange.owed import OwedReplies
+from dxlrun.dynamixel.plan.line import BITS_PER_BYTE, lengthen
 from dxlrun.dynamixel.port.ports import Port, Ports
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.receiver import Receiver
@@ -20,6 +21,7 @@ from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import (
     BROADCAST_ID,
+    NO_REGISTER,
     Job,
     Outcome,
     Program,
@@ -35,12 +37,11 @@ QUIET_BYTES = 20
 """A line that was silent for so many byte times is silent (docs/reference/protocol.md: drain until it is)."""
 LEAST_QUIET_NS = 200_000
 DRAIN_LIMIT_NS = 5_000_000  # A line that babbles longer than this is not waited for
+PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same for a job that has time
 LOST_LINE_STEP_NS = 200_000  # How often the other lines are looked at while one is lost
 BEAT_NS = 1_000_000  # The longest time between two signs of life, beside one wait
 MOST_LATE_NS = 1_000_000
 """A reply that is later is an accident, as when this process was not running, and no property of the line."""
-MOST_OWED = 8
-"""So many replies of a servo that did not come in time, the newest ones, are known as late when they come."""
 _FORGOTTEN = 6  # With each reply that is less late, 2 ** -6 of a line's lateness is forgotten
 
 FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
@@ -48,7 +49,7 @@ FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
 how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost; when the servos
 were last asked, 0: their watchdogs are not armed; how long these wait, 0: there are none."""
 
-_READY, _AWAITING, _RESTING, _DRAINING = range(4)
+_READY, _AWAITING, _RESTING, _DRAINING, _HOLDING = range(5)
 # to look into an Enum takes as long as to pack a packet's record
 _SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
 _INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
@@ -62,7 +63,8 @@ class Bus:
 
     A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
     several replies to one instruction each counts by itself, whatever became of the others. After a timeout
-    the line is drained until it is silent, and what comes then is stray.
+    the line is drained until it is silent. A reply that may answer an older request does not count, see
+    `OwedReplies`.
     """
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
@@ -91,10 +93,16 @@ class Bus:
             for more in range(1 + one.spare)
         }
         self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
-        self._owed: dict[int, list[int]] = {}
-        """Replies that did not come in time and may come late: their lengths, by ID, the oldest first."""
+        self.owed = OwedReplies(clock.now_ns)
+        """Replies that did not arrive in time and may arrive late."""
         self._written: bytes | bytearray | memoryview = b""  # what was sent last
         self._job: Job | None = None
+        self._cyclic_job = self._waits = False
+        self._held: Transaction | None = (
+            None  # waits until the replies that are owed cannot be taken for its own
+        )
+        self._held_until_ns = 0
+        self._asked_length = 0  # parameters that the job asked for; a read may bring spare bytes
         self._before: Transaction | None = None  # the one before the awaited one
         self._awaited: Transaction | None = None
         self._reply = Reply(_SENT, 0, b"", 0, 0, False)
@@ -116,9 +124,16 @@ class Bus:
         """How late replies on this line came at worst lately, beside the adapter's latency."""
         return self.words[LATE_NS]
 
-    def load(self, job: Job) -> None:
-        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
+    def load(self, job: Job, *, cyclic: bool = False, waits: bool = False) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
+
+        Args:
+            job: The transactions to execute.
+            cyclic: The job reads the states of a cycle, and chooses the lengths of its reads itself.
+            waits: The job has time: a transaction is held back while a late reply could be taken for its own.
+        """
         self.drop()
+        self._cyclic_job, self._waits = cyclic, waits
         if self.failure is None:
             self._job = job
             self._reply.strays = 0
@@ -126,7 +141,7 @@ class Bus:
     def drop(self) -> None:
         """Forget the loaded job; what still comes for it is stray."""
         self._note_owed()
-        self._job = self._awaited = None
+        self._job = self._awaited = self._held = None
         self._state = _READY
 
     def fail(self, error: PortError) -> None:
@@ -169,6 +184,7 @@ class Bus:
         if self.receiver.pending:
             self.receiver.flush()
         self._awaited = transaction
+        self._asked_length = max(one.length for one in transaction.awaited)
         self._last_byte_ns = max(self._last_byte_ns, received_ns)
         self._await(transaction, sent_ns)
         self._deadline_ns = deadline_ns
@@ -216,12 +232,66 @@ class Bus:
         """Hand the reply to the job and start its next transaction; return the time after that."""
         reply, done = self._reply, self._awaited
         if done is not None and reply.outcome is _OK:
-            self._note_lateness(reply.last_ns - reply.sent_ns - done.due_ns - self._latency_ns)
+            self._note_lateness(reply.last_ns - self._sent_ns - done.due_ns - self._latency_ns)
         self._before = done
-        self._awaited = transaction = job.advance(None if done is None else reply)
+        self._awaited = None
+        transaction = job.advance(None if done is None else reply)
         if transaction is None:
             self._job = None
             return 0
+        reply.strays = 0
+        self._asked_length = max((one.length for one in transaction.awaited), default=0)
+        if transaction.packet and not self._cyclic_job:
+            self._receive()  # what arrived before the request is not its reply
+            self._drain_end_ns = self.now_ns() + PATIENT_DRAIN_LIMIT_NS
+            if self.failure is not None or (self._waits and self._hold_back(transaction)):
+                return self.now_ns()
+            transaction, _ = self.choose(transaction)
+        return self._send_awaited(transaction)
+
+    def choose(self, transaction: Transaction) -> tuple[Transaction, int]:
+        """Return a transaction in the length that no owed reply has, and when it can be sent; 0: at once."""
+        best, best_ns = transaction, self.owed.free_ns(transaction)
+        for more in range(1, transaction.spare + 1):
+            if not best_ns:
+                break
+            longer = lengthen(transaction, more, self._dialect, self.byte_ns)
+            free_ns = self.owed.free_ns(longer)
+            if free_ns < best_ns:
+                best, best_ns = longer, free_ns
+        return best, best_ns
+
+    def _hold_back(self, transaction: Transaction) -> bool:
+        """Hold a transaction back until the line is quiet, and no owed reply can be taken for its own."""
+        if not transaction.awaited:
+            return False
+        now_ns = self.now_ns()
+        _, free_ns = self.choose(transaction)
+        # a reply that comes twice comes at once, so the latency of the adapter does not count
+        quiet_ns = min(self._quiet_at() - self._latency_ns, self._drain_end_ns)
+        until_ns = min(max(free_ns, quiet_ns), now_ns + transaction.patience_ns)
+        if until_ns <= now_ns:
+            return False
+        self._held = transaction
+        self._held_until_ns = now_ns + transaction.patience_ns
+        self._state, self._deadline_ns = _HOLDING, until_ns
+        return True
+
+    def _release_held(self, now_ns: int) -> None:
+        """Send the transaction that was held back, or hold it back again for what arrived meanwhile."""
+        transaction, self._held = self._held, None
+        if transaction is not None and now_ns < self._held_until_ns:
+            patient = self._held_until_ns
+            if self._hold_back(transaction):
+                self._held_until_ns = min(self._held_until_ns, patient)
+                return
+        if transaction is not None:
+            self._state = _READY
+            self._send_awaited(self.choose(transaction)[0])
+
+    def _send_awaited(self, transaction: Transaction) -> int:
+        """Send a transaction and await its replies; return the time after that."""
+        self._awaited = transaction
         if self.receiver.pending:
             self.receiver.flush()
         packet = transaction.packet
@@ -229,6 +299,8 @@ class Bus:
         self._await(transaction, self._sent_ns if packet else now_ns)
         # this process may have stood still before the bytes left
         self._deadline_ns = max(self._deadline_ns, now_ns + transaction.timeout_ns)
+        if packet and not self._cyclic_job and all(one.address == NO_REGISTER for one in transaction.awaited):
+            self.owed.note_change(transaction, self._sent_ns)
         return now_ns
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
@@ -249,9 +321,10 @@ class Bus:
         """Await the replies to a transaction whose instruction is on its way."""
         reply = self._reply
         reply.parameters = b""
-        reply.error = reply.strays = 0
+        reply.error = 0
         reply.echoed = False
-        reply.sent_ns = self._sent_ns = started_ns
+        self._sent_ns = started_ns
+        reply.sent_ns = started_ns if self._cyclic_job else self.owed.asked_ns(transaction, started_ns)
         if transaction.awaited:
             reply.outcome = _TIMEOUT
             self._state = _AWAITING
@@ -275,6 +348,9 @@ class Bus:
         elif self._state in (_RESTING, _DRAINING):
             self.receiver.flush()
             self._state = _READY
+        elif self._state == _HOLDING:
+            self.receiver.flush()
+            self._release_held(now_ns)
 
     def _give_up(self, now_ns: int) -> None:
         """End a transaction of which not every reply came in time."""
@@ -330,7 +406,8 @@ class Bus:
             return False
         index, refused = place
         reply = self._reply
-        reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
+        parameters = bytes(status.parameters[: self._asked_length])
+        reply.error, reply.parameters, reply.last_ns = status.error, parameters, last_ns
         self._open &= ~(1 << index)
         if refused:
             self._refused = True
@@ -360,7 +437,13 @@ class Bus:
         for index, one in enumerate(self._awaited.awaited):
             if one.servo_id == servo_id and self._open >> index & 1:
                 refused = error != 0 and self._dialect.refused(error, length, one.length)
-                return (index, refused) if refused or length == one.length else None
+                if not refused and length != one.length:
+                    return None
+                any_age = self._cyclic_job or not self._awaited.patience_ns
+                if self.owed.confuses(self._awaited, one, refusal=refused, any_age=any_age):
+                    return None
+                self.owed.note_answer(self._awaited, one, self._sent_ns)
+                return index, refused
         return None
 
     def _is_fast(self, data: memoryview) -> bool:
@@ -400,16 +483,11 @@ class Bus:
         if self._state != _AWAITING:
             return
         if not awaited.fast:
-            for index, one in enumerate(awaited.awaited):
+            for index in range(len(awaited.awaited)):
                 if self._open >> index & 1:
-                    self._owe(one.servo_id, one.length)
+                    self.owed.add(awaited, index, self._sent_ns)
         elif self._open == (1 << len(awaited.awaited)) - 1:
-            self._owe(*_FAST)
-
-    def _owe(self, servo_id: int, length: int) -> None:
-        lengths = self._owed.setdefault(servo_id, [])
-        lengths.append(length)
-        del lengths[:-MOST_OWED]
+            self.owed.add(awaited, 0, self._sent_ns)
 
     def _stray(self, packet: memoryview) -> PacketKind:
         """Return what an intact packet is that is not awaited, and count it.
@@ -423,10 +501,13 @@ class Bus:
             return PacketKind.ECHO
         status, shape = self._dialect.opened(packet), _FAST
         if status is not None:
-            shape = _FAST if status.servo_id == BROADCAST_ID else (status.servo_id, len(status.parameters))
-            owed = self._owed.get(shape[0], [])
-            if shape[1] in owed:
-                owed.remove(shape[1])
+            fast = status.servo_id == BROADCAST_ID
+            shape = _FAST if fast else (status.servo_id, len(status.parameters))
+            length = len(packet) if fast else shape[1]
+            if self.owed.settle(status.servo_id, length, status.error):
+                if self._state == _HOLDING:  # it may have been what the held transaction waited for
+                    self._deadline_ns = self.now_ns()
+                    self._drain_end_ns = self._deadline_ns + PATIENT_DRAIN_LIMIT_NS
                 return PacketKind.LATE
         if status is None or self._dialect.instructs(packet):
             self.unrequested += 1
@@ -531,7 +612,7 @@ class Lines:
         """
         jobs = [ProgramJob(program) for program in programs]
         for bus, job in zip(self.buses, jobs, strict=True):
-            bus.load(job)
+            bus.load(job, waits=True)
         self.clear(self.buses)
         self.pump()
         return [job.result for job in jobs]

@@ -4,9 +4,8 @@ Servos that can answer in turn are read by one instruction. A servo that misses 
 from the next cycle on, until it answers: in Protocol 1.0 a silent servo ends the chain, in 2.0 it may, so it
 must not stay in it. A device that misses its turn leaves at once: it may cost the servos nothing.
 
-A status carries no sequence number, so a reply that comes cycles late would look current. Replies come in the
-order of their requests, though, and the length of one is known: after a lost reply, a group is asked for one
-more byte (then two, then none again). A late reply then has the wrong length.
+A reply that arrives cycles late would look current. A group is therefore read in the length for which no reply
+is owed (`OwedReplies`), or whose owed replies are the oldest.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.exchange.kernel import PlannedRead, Program
+from dxlrun.dynamixel.exchange.owed import OwedReplies
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -60,7 +60,7 @@ class Cycle(msgspec.Struct, frozen=True):
 class CyclicReads:
     """The job that reads the state of every servo of one bus once."""
 
-    def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
+    def __init__(self, plan: BusPlan, samples: BusSamples, owed: OwedReplies) -> None:
         self._members = plan.members
         count, groups = len(self._members), len(plan.groups)
         self.missed = [0] * count  # Replies in a row that did not arrive
@@ -78,12 +78,14 @@ class CyclicReads:
         self._plan = plan
         self._samples = samples
         self._line = plan_line(plan)
-        self._shape = [0] * groups  # by how many bytes more than its state a group is asked, in turn
-        self._lossy = [False] * groups  # a reply was lost in this cycle
+        self._owed = owed
+        self._planned_at = 0  # version of `owed` that the cycle was planned with
+        self._shape = [0] * groups  # by how many bytes more than its state a group is asked
+        self._lossy: set[int] = set()  # groups that lost a reply in this cycle
         self._broken = [0] * groups  # incomplete fast reads since the last complete one
         self._calm = 0  # cycles of the parser in a row without a loss
         self.cycle = Cycle((), (), None)
-        self.stale = True  # the next cycle is another one
+        self._stale = True  # the next cycle is another one
         self._position = 0  # in its queue
         self._patient = True
         self._made: dict[tuple[int, ...], Request] = {}
@@ -91,10 +93,15 @@ class CyclicReads:
 
     # Planning
 
+    @property
+    def stale(self) -> bool:
+        """True when the next cycle has to be planned again."""
+        return self._stale or self._planned_at != self._owed.version
+
     def plan(self) -> Cycle:
         """Plan the next cycle, before anything of it is asked: as the one before if nothing happened."""
         if self.stale:
-            self.stale = False
+            self._stale, self._planned_at = False, self._owed.version
             silent = tuple(map(bool, self.missed))
             queue = tuple(
                 self._request(number, indices)
@@ -104,6 +111,8 @@ class CyclicReads:
                     [one or apart for one, apart in zip(silent, self.apart, strict=True)],
                 )
             )
+            for number in range(len(self._shape)):
+                self._choose_length(number, [one for one in queue if one.group == number])
             program = self._program(queue) if self._calm >= CALM_CYCLES else None
             self.cycle = Cycle(silent, queue, program)
         return self.cycle
@@ -111,15 +120,14 @@ class CyclicReads:
     def end(self) -> None:
         """End a cycle in which the parser read, or the line was lost: plan the next by what came of it."""
         self.begun = False
-        self.stale = True
+        self._stale = True
         silent = self.cycle.silent
         for number, members in enumerate(self._plan.groups):
-            if self._lossy[number]:
-                # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
-                self._shape[number] += 1
-                self._lossy[number] = False
-            elif not any(silent[index] and not self.away[index] for index in members):
+            if number not in self._lossy and not any(
+                silent[index] and not self.away[index] for index in members
+            ):
                 self._broken[number] = 0  # its fast read was complete
+        self._lossy.clear()
         for group in self.given_up:
             self.plain(group)
         silence = any(missed and not away for missed, away in zip(self.missed, self.away, strict=True))
@@ -139,13 +147,13 @@ class CyclicReads:
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
         self.away[servo] = True
-        self.stale = True
+        self._stale = True
 
     def join(self, servo: int) -> None:
         """Ask a servo again from the next cycle on, with the others: it was found in order."""
         self.away[servo] = False
         self.missed[servo] = 0
-        self.stale = True
+        self._stale = True
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
         """Await replies when they are due by the servos' measured return delays, ns by ID."""
@@ -160,7 +168,7 @@ class CyclicReads:
     def _forget(self) -> None:
         self._made.clear()
         self._programs.clear()
-        self.stale = True
+        self._stale = True
 
     def _request(self, group: int, indices: tuple[int, ...]) -> Request:
         request = self._made.get(indices)
@@ -179,8 +187,24 @@ class CyclicReads:
             request = self._made[indices] = Request(group, indices, patient, short)
         return request
 
+    def _choose_length(self, group: int, requests: Sequence[Request]) -> None:
+        """Read a group in the length whose owed replies are the oldest, best in one that has none.
+
+        One length for all: three silent servos of a group would otherwise ask alike for ever.
+        """
+        count = max((len(one.patient) for one in requests), default=1)
+        first = self._shape[group]
+        self._shape[group] = min(
+            ((first + step) % count for step in range(count)),
+            key=lambda shape: self._owed.newest_ns(one.patient[shape % len(one.patient)] for one in requests),
+        )
+
     def _program(self, queue: Sequence[Request]) -> Program | None:
-        """Return the reads of a calm cycle for the kernel; None where a servo reports more than an alert."""
+        """Return the reads of a calm cycle for the kernel.
+
+        None where a servo reports more than an alert, or where a late reply to a request between the cycles
+        may look like a state: the parser reads then.
+        """
         reads = [
             PlannedRead(
                 self._in_length(one.patient, one.group),
@@ -189,6 +213,8 @@ class CyclicReads:
             )
             for one in queue
         ]
+        if any(self._owed.free_ns(one.transaction, any_age=True) for one in reads):
+            return None
         refusals = 0xFF & ~self._line.dialect.ALERT if self._line.dialect.ALERT else 0
         if any(error & refusals for read in reads for error in read.errors):
             return None
@@ -233,7 +259,7 @@ class CyclicReads:
 
     def _count_loss(self, request: Request, outcome: Outcome) -> None:
         self._patient = False
-        self._lossy[request.group] = True
+        self._lossy.add(request.group)
         if request.patient[0].fast:
             self._broken[request.group] += 1
             if self._broken[request.group] == MOST_BROKEN:

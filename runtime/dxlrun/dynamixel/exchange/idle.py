@@ -49,12 +49,14 @@ class _Task:
         self.begun = False  # True once anything of it was on the line
         self.paused = False
         self.wake_ns = 0
+        self.held_ns = NEVER  # since when its transaction waits for owed replies
         self.starved = 0  # Cycles in a row without time for its next transaction
         self.reported = False
 
     def resume(self, reply: Reply | None) -> bool:
         """Hand over what came of the transaction before, None at the start; return whether one follows."""
         self.begun = reply is not None
+        self.held_ns = NEVER
         try:
             self.next = next(self._program) if reply is None else self._program.send(reply)
         except StopIteration:
@@ -159,9 +161,17 @@ class IdleScheduler:
             if task.servo != WHOLE_BUS and not task.begun:
                 chosen = next((one for one in self.tasks if one.begun and one.servo == task.servo), task)
                 chosen.pressed = min(chosen.pressed, task.pressed)
-            if not chosen.paused or chosen.wake_ns <= now:
+            if (not chosen.paused or chosen.wake_ns <= now) and not self._held_back(chosen, now):
                 return chosen
         return None
+
+    def _held_back(self, task: _Task, now_ns: int) -> bool:
+        """Check whether a transaction has to wait because a late reply could be taken for its own."""
+        wanted = task.next
+        if wanted is None or not wanted.packet or not self.bus.choose(wanted)[1]:
+            return False
+        task.held_ns = min(task.held_ns, now_ns)
+        return now_ns - task.held_ns < wanted.patience_ns
 
     def _resume(self, task: _Task, reply: Reply | None) -> None:
         if not task.resume(reply):
@@ -177,7 +187,7 @@ class IdleScheduler:
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
         """Return the transaction with a timeout that the idle time allows; None: it has to wait."""
         left_ns = self._until_ns - self.now_ns()
-        latest_ns = self._need_ns(wanted, max(self.bus.late_ns, LEAST_MARGIN_NS))
+        latest_ns = self._need_ns(self.bus.choose(wanted)[0], max(self.bus.late_ns, LEAST_MARGIN_NS))
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None

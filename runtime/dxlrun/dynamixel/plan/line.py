@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.dynamixel.wire.dialect import Dialect
-from dxlrun.plan.transaction import BROADCAST_ID, Awaited, Transaction
+from dxlrun.plan.transaction import BROADCAST_ID, PRESENCE, Awaited, Transaction
 
 BITS_PER_BYTE = 10  # 8N1: start bit, eight bits, stop bit (protocol.md, Line)
 LONGEST_RETURN_DELAY_NS = 508_000
@@ -26,7 +27,7 @@ SHORT_TIMEOUT_MARGIN_NS = 1_000_000
 """The same for a servo that is silent already: it must not take the time of the others."""
 
 MOST_SPARE = 2
-"""Two longer forms of a read distinguish its late replies from the newest (`cyclic_reads`)."""
+"""Two longer forms of a read distinguish late replies from the newest (`exchange/owed.py`)."""
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -53,12 +54,13 @@ class Line(msgspec.Struct, frozen=True):
     def ping(self, servo_id: int) -> Transaction:
         """Return a ping."""
         length = self.dialect.PING_LENGTH
-        return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length))
+        return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length, PRESENCE))
 
-    def read(self, servo_id: int, address: int, length: int) -> Transaction:
-        """Return a read of `length` bytes from `address` on."""
+    def read(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
+        """Return a read of `length` bytes from `address` on; up to `spare` bytes after them can be read, too."""
         packet = self.dialect.read(servo_id, address, length)
-        return self._answered(packet, servo_id, Awaited(servo_id, length))
+        read = self._answered(packet, servo_id, Awaited(servo_id, length, address))
+        return replace(read, spare=spare) if spare else read
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
         """Return the read of several servos, each by (ID, address, length); of one alone a plain read.
@@ -67,7 +69,7 @@ class Line(msgspec.Struct, frozen=True):
         """
         if len(requests) == 1:
             return self.read(*requests[0])
-        awaited = tuple(Awaited(servo_id, length) for servo_id, _, length in requests)
+        awaited = tuple(Awaited(servo_id, length, address) for servo_id, address, length in requests)
         packet = self.dialect.read_many(requests, fast=fast)
         if not fast:
             return self._answered(packet, BROADCAST_ID, *awaited)
@@ -100,6 +102,20 @@ class Line(msgspec.Struct, frozen=True):
         return Transaction(
             packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + TIMEOUT_MARGIN_NS, widest
         )
+
+
+def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Transaction:
+    """Return the read of one servo with so many of its spare bytes."""
+    (awaited,) = read.awaited
+    length = awaited.length + more
+    return replace(
+        read,
+        packet=dialect.read(awaited.servo_id, awaited.address, length),
+        awaited=(Awaited(awaited.servo_id, length, awaited.address),),
+        due_ns=read.due_ns + more * byte_ns,
+        timeout_ns=read.timeout_ns + more * byte_ns,
+        widest=dialect.widest(length),
+    )
 
 
 def listen(duration_ns: int) -> Transaction:

@@ -63,7 +63,8 @@ def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bo
 
 def servo_read(line: Line, servo: ServoPlan) -> Transaction:
     """Return the read of one servo's state."""
-    return line.read(servo.servo_id, servo.state.address, servo.state.length)
+    state = servo.state
+    return line.read(servo.servo_id, state.address, state.length, state.spare)
 
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:

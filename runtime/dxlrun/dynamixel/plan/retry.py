@@ -1,8 +1,4 @@
-"""Retries and longer timeouts of programs that have time: start-up, return, tools.
-
-Giving a reply up too early is worse than waiting: it comes later, and looks like the reply to the next
-request (a status packet does not carry what it answers).
-"""
+"""Retries and longer timeouts of programs that have time: start-up, return, tools."""
 
 from __future__ import annotations
 
@@ -16,11 +12,6 @@ from dxlrun.plan.transaction import Outcome, Program, Reply, Result, Transaction
 ATTEMPTS = 3
 LONGER_NS = 240_000_000
 """Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
-DRAIN_NS = 500_000_000
-"""For how long a tool hears what may come late, behind a reply that it gave up."""
-QUIET_NS = 2_000_000
-MOST_LISTENS = 100
-"""A line that is never quiet has another host on it, or noise; it is asked nevertheless."""
 MOST_SILENCE_NS = 960_000_000
 """Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
 
@@ -46,23 +37,17 @@ def pause(duration_ns: int) -> Program[None]:
     yield listen(duration_ns)
 
 
-def drained(program: Program[Result]) -> Program[Result]:
-    """Run a tool's program so that no reply is taken for the next: a status does not carry what it answers.
+def limit_patience(program: Program[Result], patience_ns: int = 0) -> Program[Result]:
+    """Run a program whose transactions are not held back for late replies for longer than a time, ns.
 
-    Behind each lost one it listens for DRAIN_NS before it asks again, behind each other one until nothing has
-    come for as long as a reply takes: one that comes several times is the same.
+    Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request is
+    then charged to the older one, as replies come in the order of their requests; without any patience, a reply
+    to an earlier reading of the same register counts.
     """
     try:
         request = next(program)
         while True:
-            reply = yield request
-            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
-                yield listen(DRAIN_NS)
-            elif request.awaited:
-                for _ in range(MOST_LISTENS):
-                    after = yield listen(request.due_ns + QUIET_NS)
-                    if not after.strays:
-                        break
+            reply = yield replace(request, patience_ns=min(request.patience_ns, patience_ns))
             request = program.send(reply)
     except StopIteration as end:
         result: Result = end.value

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, decoded, side_by_side
-from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.plan.retry import limit_patience, retry, setup_line
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
 
@@ -36,7 +37,8 @@ class Access(NamedTuple):
 
     def reading(self, address: int, size: int) -> Transaction:
         """Return the read of some bytes."""
-        return self.line.read(self.servo.servo_id, address, size)
+        spare = _spare(self.servo.model, self.plan.protocol, address + size)
+        return self.line.read(self.servo.servo_id, address, size, spare)
 
     def writing(self, address: int, data: bytes) -> Transaction:
         """Return the write of some bytes."""
@@ -60,11 +62,9 @@ class Access(NamedTuple):
 
     def read(self, names: Iterable[str]) -> Program[dict[str, int] | None]:
         """Read items, those side by side at once; None when one of them does not come."""
-        table, found = self.table, dict[str, int]()
-        for block in side_by_side(table.items[name] for name in names):
+        found = dict[str, int]()
+        for block in side_by_side(self.items[name] for name in names):
             start, end = block[0].address, block[-1].address + block[-1].size
-            if end - start == 1 and table.readable(start, end + 1):
-                end += 1  # torque enable is one byte, too: a late answer to that is none to this
             reply = yield from self.read_bytes(start, end - start)
             if not reply.answered:
                 return None
@@ -89,13 +89,18 @@ class Access(NamedTuple):
 
     def torque_off(self) -> Program[Reply]:
         """Write torque enable = 0."""
-        return self.write_bytes(self.servo.torque_address, b"\0")
+        return limit_patience(self.write_bytes(self.servo.torque_address, b"\0"))
 
     def reason(self, reply: Reply) -> str:
         """Return why the servo refused, behind a colon; nothing where it did not."""
         return (
             f": {self.line.dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""
         )
+
+
+@lru_cache
+def _spare(model: str, protocol: float, end: int) -> int:
+    return control_table(model, protocol).spare(end, MOST_SPARE)
 
 
 def reach(plan: BusPlan, servo: ServoPlan) -> Access:

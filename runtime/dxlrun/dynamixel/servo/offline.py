@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, limit_patience, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access
 from dxlrun.dynamixel.servo.checks import inspect, inspect_states
@@ -47,7 +49,7 @@ class Offline:
         """Take a silent servo out of the exchange, and stop it where it would go on without an end."""
         loss = self.life.lose(index, FIRST_PROBE_NS)
         if loss.had_torque and self.desired.resting(index) is not None:
-            self.life.do(index, self._stop(index), "the stop")
+            self.life.do(index, limit_patience(self._stop(index)), "the stop")
 
     def _stop(self, index: int) -> Program[None]:
         """Write a goal of 0 to a servo that follows a velocity, an effort or a PWM: it may hear that."""
@@ -90,7 +92,7 @@ class Offline:
         """Switch a servo's torque off and read it back; where that fails, again when it is in order."""
         one = self.life.reach(index)
         for _ in range(ATTEMPTS):
-            yield one.writing(one.servo.torque_address, b"\0")
+            yield replace(one.writing(one.servo.torque_address, b"\0"), patience_ns=0)
             back = yield one.reading(one.servo.torque_address, 1)
             if back.answered and back.parameters[0] == 0:
                 return True

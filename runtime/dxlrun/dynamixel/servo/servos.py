@@ -59,7 +59,7 @@ class Servos:
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count
         self.goals = GoalArrays(plan)  # Builds the sync write
-        self.reads = CyclicReads(plan, samples)
+        self.reads = CyclicReads(plan, samples, idle.bus.owed)
         """The job that reads every servo and every device once."""
         self.devices = Devices(idle, self.reads, samples, device_commands)
         """What is on the bus and is no servo."""

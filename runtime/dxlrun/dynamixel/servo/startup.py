@@ -23,7 +23,7 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, retry, setup_line
+from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, limit_patience, retry, setup_line
 from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, first_reach, reach
@@ -115,7 +115,7 @@ class StartUp:
         """Arm the Bus Watchdogs, which stop the servos where a reply is awaited for too long."""
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
-        self.stage(lambda plan, found: mine[plan.name].watch(found), longer_ns)
+        self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found)), longer_ns)
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no start without it."""

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.plan.retry import limit_patience
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
@@ -53,7 +54,7 @@ def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...
     outcome.
     """
     end_ns = lines.clock.now_ns() + LIMIT_NS if deadline_ns is None else deadline_ns
-    results = lines.run([_limp(plan, lines.clock.now_ns, end_ns) for plan in lines.plans])
+    results = lines.run([limit_patience(_limp(plan, lines.clock.now_ns, end_ns)) for plan in lines.plans])
     outcomes: list[LimpOutcome] = []
     for plan, bus, result in zip(lines.plans, lines.buses, results, strict=True):
         gone = f"torque off could not be sent: {bus.failure}"
@@ -66,7 +67,7 @@ def stand(lines: Lines) -> tuple[str, ...]:
 
     One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
     """
-    found = lines.run([_stand(plan) for plan in lines.plans])
+    found = lines.run([limit_patience(_stand(plan)) for plan in lines.plans])
     return tuple(sentence for one in found for sentence in one or ())
 
 

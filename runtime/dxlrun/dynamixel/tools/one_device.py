@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
 from dxlrun.dynamixel.control_table.devices import device_table
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, drained, extend_timeouts, retry
+from dxlrun.dynamixel.plan.line import MOST_SPARE
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault
-from dxlrun.plan.transaction import Outcome, Program, Result
+from dxlrun.plan.transaction import Outcome, Program, Result, Transaction
 
 
 class OneDevice:
@@ -50,10 +51,14 @@ class OneDevice:
         return f"{item.title} was {before} and is {value}"
 
     def _run(self, program: Program[Result]) -> Result:
-        return self.tool.run(extend_timeouts(drained(program)))
+        return self.tool.run(extend_timeouts(program))
+
+    def _reading(self, item: DeviceItem) -> Transaction:
+        spare = self.table.spare(item.address + item.size, MOST_SPARE)
+        return self.tool.line.read(self.servo_id, item.address, item.size, spare)
 
     def _read(self, item: DeviceItem, *, refused: bool) -> Program[dict[str, int]]:
-        reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
+        reply = yield from retry(self._reading(item))
         if reply.answered:
             raw = item.decode(reply.parameters)
             return {item.name: raw if item.bit is None else raw >> item.bit & 1}

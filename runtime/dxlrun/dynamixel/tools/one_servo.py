@@ -16,7 +16,7 @@ from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_ta
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.plan.retry import drained, extend_timeouts, retry
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
@@ -194,7 +194,7 @@ class OneServo:
 
     def run(self, program: Program[Result]) -> Result:
         """Run a program with longer timeouts: the servo is known to be there."""
-        return self.tool.run(extend_timeouts(drained(program)))
+        return self.tool.run(extend_timeouts(program))
 
     @property
     def command(self) -> str:
@@ -245,13 +245,13 @@ class OneServo:
 
     def _read_block(self, block: Sequence[ControlItem], *, refused: bool) -> Program[dict[str, int]]:
         start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield from retry(self.tool.line.read(self.servo_id, start, end - start))
+        reply = yield from self._reach.read_bytes(start, end - start)
         if reply.answered:
             places = ((item, item.address - start) for item in block)
             return {item.name: item.integer(reply.parameters[at : at + item.size]) for item, at in places}
         found: dict[str, int] = {}
         for item in block:
-            reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
+            reply = yield from self._reach.read_bytes(item.address, item.size)
             if reply.answered:
                 found[item.name] = item.integer(reply.parameters)
             elif reply.outcome is not Outcome.REFUSED:
