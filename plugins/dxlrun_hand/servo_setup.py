@@ -178,7 +178,9 @@ def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[list[str]]
             continue
         table = control_table(servo.model, plan.protocol)
         for each in (yield from compare(one, stored(table, plan, servo))):
-            if each.found != each.register.value:
-                title = table.items[each.register.name].title
+            title = table.items[each.register.name].title
+            if each.found is None:
+                survey.problems.append(f"{one} did not answer when {title} was read")
+            elif each.differs:
                 survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
     return survey.problems

@@ -112,7 +112,10 @@ def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
     line.bus.servo(4).poke("status_return_level", 0)
     (found,) = scan(ToolLine(line), Search((1.0,), (1_000_000,), (4,))).servos
     assert (found.model, found.model_number) == ("", -1)
-    assert found.remarks == ("answers pings but no read: its Status Return Level (16) is 0",)
+    assert found.remarks == (
+        "answered a ping, but did not answer 3 reads of its model number: check its cable and power, and its "
+        "Status Return Level (16)",
+    )
 
 
 def test_an_unknown_model_is_listed_with_its_number():

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable, Mapping
+
 from dxlrun.simulation.bus.line import Transmission, flipped
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import InstructionReceiver
 
+STALLED = "the adapter stalls"
 OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
 
 
@@ -24,6 +28,31 @@ def truncate_next(bus: SimulatedBus, servo_id: int, keep: int) -> None:
 def delay_next(bus: SimulatedBus, servo_id: int, delay_ns: int) -> None:
     """Let a servo's next reply start later."""
     bus.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
+
+
+def disturb_replies(bus: SimulatedBus, servo_id: int, faults: Mapping[int, PacketFault]) -> Callable[[], int]:
+    """Apply faults to a servo's replies by their number from now on; return a function that counts replies.
+
+    A fault whose text is STALLED delays the replies after it, too: they keep their order.
+    """
+    send, count, stalled_until_ns = bus._send_reply, 0, 0
+
+    def send_disturbed(replying: int, reply: Transmission) -> bool:
+        nonlocal count, stalled_until_ns
+        if replying == servo_id:
+            fault = faults.get(count)
+            if fault is not None and fault.text == STALLED:
+                stalled_until_ns = max(stalled_until_ns, reply.first_ns + fault.delay_ns)
+            if reply.first_ns < stalled_until_ns:
+                fault = PacketFault(STALLED, bytes, stalled_until_ns - reply.first_ns)
+                stalled_until_ns += reply.due_ns - reply.first_ns
+            if fault is not None:
+                bus._reply_faults.setdefault(servo_id, deque()).append(fault)
+            count += 1
+        return send(replying, reply)
+
+    bus._send_reply = send_disturbed  # type: ignore[method-assign]
+    return lambda: count
 
 
 def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool = True) -> None:

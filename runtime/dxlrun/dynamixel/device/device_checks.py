@@ -53,7 +53,7 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
                 f"{device.model} is {device.model_number}: correct `model` or the ID"
             )
     for block in device.blocks:
-        reply = yield from retry(line.read(device.servo_id, block.address, block.length))
+        reply = yield from retry(line.read(device.servo_id, block.address, block.length, block.spare))
         if not reply.answered:
             end = block.address + block.length - 1
             why = "refuses to be read" if reply.outcome is Outcome.REFUSED else "cannot be read"

@@ -20,7 +20,7 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import servo_read
-from dxlrun.dynamixel.plan.retry import retry
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.registers import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import describe_error
@@ -320,7 +320,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
         start, end = items[first].address, items[last].address + items[last].size
         reply = yield from one.read_bytes(start, end - start)
         if not reply.answered:
-            found.problems.append(f"{one} {_unreadable(one, reply)}")
+            found.problems.append(f"{one} {_unreadable(one, items[first].title, reply)}")
             return None
         read = decoded(items.values(), start, reply.parameters)
         values |= {name: declared.get(name, raw) for name, raw in read.items()}
@@ -417,11 +417,12 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
     )
 
 
-def _unreadable(one: Access, reply: Reply) -> str:
+def _unreadable(one: Access, title: str, reply: Reply) -> str:
+    """Return why a servo that answered its pings could not be read. Silence says nothing about a register."""
     if reply.outcome is Outcome.TIMEOUT:
         return (
-            f"answers pings but no read: its {one.items['status_return_level'].title} is 0; write "
-            f"{RETURN_ALL} there (writes are carried out, though not acknowledged)"
+            f"answered pings, but did not answer {ATTEMPTS} reads of {title}: check its cable and power, and "
+            f"its {one.items['status_return_level'].title}"
         )
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read{one.reason(reply)}"

@@ -115,15 +115,18 @@ class Reboots:
             yield from self._life.reach(index).write_bytes(lamp, b"\0")
 
     def _lamp(self, index: int) -> int | None:
-        """Return where a servo without a clock has an LED behind torque enable; None: there is none."""
+        """Return the address of an LED of a servo without a clock; None: there is none."""
         one = self._life.reach(index)
         item = None if "realtime_tick" in one.items else one.items.get("led", one.items.get("led_red"))
-        return item.address if item is not None and item.address == one.servo.torque_address + 1 else None
+        return None if item is None else item.address
 
     def _lamp_is(self, index: int) -> Program[int | None]:
-        """Read an LED, behind torque enable: a late answer to that alone is none to this."""
-        reply = yield from self._life.reach(index).read_bytes(self._life.plan.servos[index].torque_address, 2)
-        return reply.parameters[1] if reply.answered else None
+        """Read an LED; None when it was not read."""
+        lamp = self._lamp(index)
+        if lamp is None:
+            return None
+        reply = yield from self._life.reach(index).read_bytes(lamp, 1)
+        return reply.parameters[0] if reply.answered else None
 
     def judge(self, index: int, reply: Reply) -> bool | None:
         """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""

@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
-from dxlrun.dynamixel.plan.line import Line, listen
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
+from dxlrun.dynamixel.plan.line import MOST_SPARE, Line, listen
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.plan.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
@@ -202,7 +202,7 @@ def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
     ping = yield from retry(line.ping(servo_id))
     if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
         return ping, ping
-    return ping, (yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH)))
+    return ping, (yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH, MOST_SPARE)))
 
 
 def look(line: Line, servo_id: int) -> Program[FoundServo]:
@@ -219,14 +219,16 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     device = next(iter(devices_by_number(number, dialect.PROTOCOL)), None)
     if table is None and device is not None:
         known = replace(servo, model=device.model, model_number=number, firmware=firmware, device=True)
-        return (yield from _look_closer(line, device.items, replace(known, remarks=tuple(remarks))))
+        return (
+            yield from _look_closer(line, device.items, device.spare, replace(known, remarks=tuple(remarks)))
+        )
     if table is None:
         remarks.append(f"no control table has its model number {number}: a plug-in can add one")
         return replace(servo, model_number=number, firmware=firmware, remarks=tuple(remarks))
     if reply.error and (named := (yield from _hardware_error(line, servo_id, table))):
         remarks = [named]
     servo = replace(servo, model=table.model, model_number=number, firmware=firmware, remarks=tuple(remarks))
-    return (yield from _look_closer(line, table.items, servo))
+    return (yield from _look_closer(line, table.items, table.spare, servo))
 
 
 def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[str]:
@@ -234,12 +236,15 @@ def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[s
     item = table.items.get(table.errors.item)
     if item is None:
         return ""
-    reply = yield from retry(line.read(servo_id, item.address, item.size))
+    spare = table.spare(item.address + item.size, MOST_SPARE)
+    reply = yield from retry(line.read(servo_id, item.address, item.size, spare))
     value = reply.parameters[0] if reply.answered else 0
     return f"{item.title} is {value}: {table.errors.describe(value)}" if value else ""
 
 
-def _look_closer(line: Line, table: Mapping[str, ControlItem], servo: FoundServo) -> Program[FoundServo]:
+def _look_closer(
+    line: Line, table: Mapping[str, ControlItem], spare: Callable[[int, int], int], servo: FoundServo
+) -> Program[FoundServo]:
     """Read what a robot file needs, and find two servos of one ID: their positions differ."""
     values: dict[str, int] = {}
     names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
@@ -247,7 +252,8 @@ def _look_closer(line: Line, table: Mapping[str, ControlItem], servo: FoundServo
     silent: list[str] = []
     garbled = False
     for item in items:
-        reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
+        more = spare(item.address + item.size, MOST_SPARE)
+        reply = yield from retry(line.read(servo.servo_id, item.address, item.size, more))
         if reply.answered:
             values[item.name] = item.decode(reply.parameters)
         else:
@@ -257,9 +263,7 @@ def _look_closer(line: Line, table: Mapping[str, ControlItem], servo: FoundServo
     if garbled:
         remarks.append("answers garbled now and then: do two servos have this ID? If not, check its cable")
     elif silent:
-        level = table.get("status_return_level")
-        why = "" if level is None else f": is its {level.title} 0?"
-        remarks.append(f"did not answer when {', '.join(silent)} was read{why}")
+        remarks.append(f"did not answer {ATTEMPTS} reads of {', '.join(silent)}: check its cable and power")
     lowest, highest = next((pair for pair in _LIMITS if pair[0] in values and pair[1] in values), ("", ""))
     delay = values.get("return_delay_time")
     return replace(
@@ -280,4 +284,7 @@ def _mute(ping: Reply, reply: Reply, line: Line) -> str:
         return "answered once, and then no more: check its cable and power"
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
-    return "answers pings but no read: its Status Return Level (16) is 0"
+    return (
+        f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: check its cable and power, "
+        "and its Status Return Level (16)"
+    )

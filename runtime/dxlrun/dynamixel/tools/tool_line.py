@@ -124,6 +124,8 @@ class ToolLine:
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
         """Makes transactions for the protocol and the rate that are spoken."""
         self._lines: Lines | None = None
+        self._spoken: dict[tuple[float, int], Lines] = {}
+        """Lines by protocol and rate: a late reply is owed also after another rate was spoken."""
 
     def speak(self, protocol: float, baud_rate: int) -> bool:
         """Change to a protocol and a rate; return whether the adapter can, and stay as it was where not."""
@@ -136,7 +138,10 @@ class ToolLine:
         )
         self.protocol, self.baud_rate = protocol, baud_rate
         self.line = Line(baud_rate, latency_ns, delay_ns, dialect_of(protocol))
-        self._lines = Lines([plan], port.ports, port.clock, self.heard)
+        key = protocol, baud_rate
+        if key not in self._spoken:
+            self._spoken[key] = Lines([plan], port.ports, port.clock, self.heard)
+        self._lines = self._spoken[key]
         return True
 
     def can_run_at(self, baud_rate: int) -> bool:
