@@ -10,8 +10,6 @@ from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 
 

@@ -49,8 +49,8 @@ class Transaction(msgspec.Struct, frozen=True):
     tail_timeout_ns: int = 0
     tail_margin_ns: int = 0
     spare: int = 0
-    """Bytes after those of a read of one servo that can be read with it. While the late reply to an older request
-    would fit, a read asks for more of them."""
+    """Bytes after those of a read of one servo that can be read with it. While the late reply to an older
+    request would fit, a read asks for more of them."""
     patience_ns: int = 1 << 62
     """How long the transaction may be held back while the late reply to an older request would fit."""
 

@@ -4,8 +4,8 @@ Servos that can answer in turn are read by one instruction. A servo that misses 
 from the next cycle on, until it answers: in Protocol 1.0 a silent servo ends the chain, in 2.0 it may, so it
 must not stay in it. A device that misses its turn leaves at once: it may cost the servos nothing.
 
-A reply that arrives cycles late would look current. A group is therefore read in the length for which no reply
-is owed (`OwedReplies`), or whose owed replies are the oldest.
+A reply that arrives cycles late would look current. A group is therefore read in the length for which no
+reply is owed (`OwedReplies`), or whose owed replies are the oldest.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A status packet carries neither an address nor a sequence number, so a late reply looks like the reply to the
 next request for as many bytes. This is the one rule about that, for cycle, idle time, start-up and tools: a
-status counts only while no reply of its ID and length is owed to another request. A request therefore asks for
-a few bytes more, or is held back, until no such reply is owed.
+status counts only while no reply of its ID and length is owed to another request. A request therefore asks
+for a few bytes more, or is held back, until no such reply is owed.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class OwedReplies:
         return True
 
     def note_answer(self, transaction: Transaction, awaited: Awaited, sent_ns: int) -> None:
-        """Note that a request was answered: where older ones were owed a reply, the newest one is owed it now."""
+        """Note that a request was answered: a reply that an older one was owed is owed to this one now."""
         servo_id, length, question = _shape(transaction, awaited)
         for one in self._entries.get(servo_id, ()):
             if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns:
@@ -132,7 +132,7 @@ class OwedReplies:
         return min([sent_ns, *times])
 
     def newest_ns(self, transactions: Iterable[Transaction]) -> int:
-        """Return when the newest request was sent whose late reply would fit one of some transactions; 0: none."""
+        """Return when the newest request was sent whose late reply would fit a transaction; 0: none."""
         times = [
             one.last_ns
             for transaction in transactions

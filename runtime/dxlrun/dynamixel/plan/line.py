@@ -57,7 +57,7 @@ class Line(msgspec.Struct, frozen=True):
         return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length, PRESENCE))
 
     def read(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
-        """Return a read of `length` bytes from `address` on; up to `spare` bytes after them can be read, too."""
+        """Return a read of `length` bytes from `address` on, after which `spare` bytes can be read, too."""
         packet = self.dialect.read(servo_id, address, length)
         read = self._answered(packet, servo_id, Awaited(servo_id, length, address))
         return replace(read, spare=spare) if spare else read

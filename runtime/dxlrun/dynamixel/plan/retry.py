@@ -40,9 +40,9 @@ def pause(duration_ns: int) -> Program[None]:
 def limit_patience(program: Program[Result], patience_ns: int = 0) -> Program[Result]:
     """Run a program whose transactions are not held back for late replies for longer than a time, ns.
 
-    Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request is
-    then charged to the older one, as replies come in the order of their requests; without any patience, a reply
-    to an earlier reading of the same register counts.
+    Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request
+    is then charged to the older one, as replies come in the order of their requests. Without any patience, a
+    reply to an earlier reading of the same register counts.
     """
     try:
         request = next(program)

@@ -285,6 +285,6 @@ def _mute(ping: Reply, reply: Reply, line: Line) -> str:
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
     return (
-        f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: check its cable and power, "
-        "and its Status Return Level (16)"
+        f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: check its cable and "
+        "power, and its Status Return Level (16)"
     )
