@@ -442,7 +442,8 @@ class Bus:
                 any_age = self._cyclic_job or not self._awaited.patience_ns
                 if self.owed.confuses(self._awaited, one, refusal=refused, any_age=any_age):
                     return None
-                self.owed.note_answer(self._awaited, one, self._sent_ns)
+                if not self._cyclic_job:  # the kernel, which reads most cycles, does not note it either
+                    self.owed.note_answer(self._awaited, one, self._sent_ns)
                 return index, refused
         return None
 

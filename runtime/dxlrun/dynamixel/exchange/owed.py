@@ -55,10 +55,7 @@ class OwedReplies:
 
     def add(self, transaction: Transaction, index: int, sent_ns: int) -> None:
         """Note that the reply at `index` of a transaction did not arrive in time."""
-        if transaction.fast:
-            servo_id, length, question = BROADCAST_ID, transaction.widest, transaction.packet
-        else:
-            servo_id, length, question = _shape(transaction, transaction.awaited[index])
+        servo_id, length, question = _shapes(transaction)[index]
         entries = self._entries.setdefault(servo_id, [])
         entries[:] = [one for one in entries if one.last_ns + self.window_ns > sent_ns]
         entry = next((one for one in entries if (one.length, one.question) == (length, question)), None)
