@@ -142,7 +142,7 @@ def inspect_online(protocol: float, faults: Faults) -> tuple[set[str], int]:
         f"{one.joint} {one.model}: {one.problem}"
         for one in identify(rig.plans, ["main_1_joint"], rig.ports, rig.clock).values()
     }
-    (looked,) = _run([_look(rig.plans[0])], rig.plans, rig.ports, rig.clock, NOWHERE)
+    (looked,) = _run([_look(rig.plans[0], {})], rig.plans, rig.ports, rig.clock, NOWHERE)
     rows = {f"{row.item} {row.found}" for row in looked.registers if row.found is not None}
     return reported([*found, *rows, *looked.problems, *looked.remarks]), replies()
 
