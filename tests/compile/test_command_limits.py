@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.compile.joints.limits import beyond_limits
-from dxlrun.contract.controller import CommandModel
+from dxlrun.contract.controller import CommandModel, SpeedPeak
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_controllers.group import (
@@ -18,7 +18,11 @@ from dxlrun_controllers.group import (
     PosVelCommand,
     VelocitiesCommand,
 )
-from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand
+from dxlrun_controllers.motions.trajectory_command import (
+    TrajectoryCommand,
+    flat_trajectory,
+    trajectory_speed_peaks,
+)
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)
@@ -31,6 +35,18 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
     return TrajectoryCommand.model_validate(
         {"points": [{"time": time, "positions": positions} | more for time, positions in points]}
     )
+
+
+def longer(factor: float) -> str:
+    return f": give it more time, {factor:g} times as long"
+
+
+def peaks_of(command: CommandModel) -> list[SpeedPeak]:
+    """Return what a joint_trajectory_controller of both joints says of a command."""
+    if not isinstance(command, TrajectoryCommand):
+        return []
+    names = tuple(joint.name for joint in JOINTS)
+    return list(trajectory_speed_peaks("trajectory", flat_trajectory(command, names), names))
 
 
 @pytest.mark.parametrize(
@@ -66,9 +82,13 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
         (
             trajectory((0.0, (0.0, 0.0)), (0.2, (2.0, 0.4)), (0.3, (2.0, 0.7))),
             [
-                f"free is asked for 10 rad/s from point 1 to 2, {FREE_SPEED}",
-                f"bound is asked for 3 rad/s from point 2 to 3, {BOUND_SPEED}",
+                f"free is asked for 10 rad/s at 0.200 s, from point 1 to 2, {FREE_SPEED}{longer(1.25)}",
+                f"bound is asked for 3 rad/s at 0.300 s, from point 2 to 3, {BOUND_SPEED}{longer(1.5)}",
             ],
+        ),
+        (
+            trajectory((0.0, (0.0, 0.4)), (1.0, (0.0, -1.0)), velocities=(0.0, 0.0)),
+            [f"bound is asked for -2.1 rad/s at 0.500 s, from point 1 to 2, {BOUND_SPEED}{longer(1.05)}"],
         ),
         (
             TrajectoryCommand.model_validate(
@@ -88,7 +108,7 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
 def test_each_value_beyond_a_limit_is_named_with_its_joint_and_the_limit(
     command: CommandModel, sentences: list[str]
 ) -> None:
-    found = beyond_limits(JOINTS, command)
+    found = beyond_limits(JOINTS, command, peaks_of(command))
     assert [one.text for one in found] == sentences
     assert [one.joint for one in found] == [sentence.split()[0] for sentence in sentences]
 

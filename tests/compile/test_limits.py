@@ -17,6 +17,7 @@ from dxlrun.compile.joints.limits import (
 )
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
+from dxlrun.contract.controller import SpeedPeak
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_controllers.group import EffortsCommand, PositionsCommand, VelocitiesCommand
@@ -87,35 +88,48 @@ def test_the_worst_target_beyond_either_limit_is_told_once(
 ) -> None:
     problems = Problems()
     listed = samples(*((index, position, None) for index, position in enumerate(positions)))
-    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems, interpolated=False)
+    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems)
     assert [one.what for one in problems.warnings] == ([told] if told else [])
     if told:
         worst = max(range(2), key=lambda index: max(-1.0 - positions[index], positions[index] - 0.5))
         assert problems.warnings[0].mark.line == 3 + worst
 
 
+def peak(speed: float, time: float) -> SpeedPeak:
+    return SpeedPeak("arm", speed, time, "from point 1 to 2")
+
+
 @pytest.mark.parametrize(
-    ("rows", "interpolated", "told"),
+    ("rows", "peaks", "told"),
     [
-        (((0, 0.0, 2.0), (1, 0.0, -2.0)), True, []),
-        (((0, 0.0, -2.1),), False, ["warning: arm is asked for 2.1 rad/s at 2.000 s, more than 2 rad/s, its velocity limit"]),
-        (((0, 0.0, 2.1), (1, 0.0, -7.9)), False, ["warning: arm is asked for 7.9 rad/s at 3.000 s"]),
-        (((0, 0.0, -8.1),), False, ["arm is asked for 8.1 rad/s at 2.000 s, more than 8 rad/s, the top speed of its servo"]),
-        (((0, -0.5, None), (0.25, 0.5, None)), False, []),  # nothing moves between the two
-        (((0, -0.5, None), (0.25, 0.5, None)), True, ["warning: arm is asked for 4 rad/s at 2.250 s"]),
-        (((0, 0.5, None), (0.25, -0.5, None)), True, ["warning: arm is asked for 4 rad/s at 2.250 s"]),
-        (((0, 0.5, None), (0.1, -0.5, None)), True, ["arm is asked for 10 rad/s at 2.100 s"]),
-        (((0, 0.5, None), (0, -0.5, None)), True, []),  # no time between them: for others to judge
+        (((0, 0.0, 2.0), (1, 0.0, -2.0)), [peak(-2.0, 0.5)], []),
+        (((0, 0.0, -2.1),), [], ["warning: arm is asked for 2.1 rad/s at 2.000 s, more than 2 rad/s, its velocity limit"]),
+        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["warning: arm is asked for 7.9 rad/s at 3.000 s"]),
+        (((0, 0.0, -8.1),), [], ["arm is asked for 8.1 rad/s at 2.000 s, more than 8 rad/s, the top speed of its servo"]),
+        (((0, -0.5, None), (0.25, 0.5, None)), [], []),  # nothing moves between the two
+        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["warning: arm is asked for 4 rad/s at 2.250 s"]),
+        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["warning: arm is asked for 6 rad/s at 2.125 s"]),
+        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["arm is asked for 15 rad/s at 2.050 s"]),
+        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["warning: arm is asked for 3 rad/s at 2.000 s"]),
     ],
 )  # fmt: skip
 def test_speeds_of_either_sign_are_compared(
-    rows: tuple[tuple[float, float | None, float | None], ...], interpolated: bool, told: list[str]
+    rows: tuple[tuple[float, float | None, float | None], ...], peaks: list[SpeedPeak], told: list[str]
 ) -> None:
     problems = Problems()
-    check_samples(samples(*rows), 2 * SOME_S, {"arm": ARM}, problems, interpolated=interpolated)
+    check_samples(samples(*rows), 2 * SOME_S, {"arm": ARM}, problems, peaks)
     found = [str(one).split(": ", 1)[1] for one in (*problems.errors, *problems.warnings)]
     assert len(found) == len(told)
     assert all(one.startswith(start) for one, start in zip(found, told, strict=True)), found
+
+
+def test_a_peak_is_reported_at_the_point_that_its_way_leads_to() -> None:
+    problems = Problems()
+    listed = samples((0, 0.0, 0.0), (1, 0.4, 0.0), (2, -0.4, 0.0))
+    check_samples(listed, 0, {"arm": ARM}, problems, [peak(-2.4, 1.5)])
+    (warning,) = problems.warnings
+    assert warning.mark.line == 5
+    assert "give it more time, 1.2 times as long, or raise the limit" in warning.fix
 
 
 @pytest.mark.parametrize(

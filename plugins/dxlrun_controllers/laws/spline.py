@@ -26,10 +26,14 @@ coefficients."""
 _HEAD = 4
 _TRIES = 12
 """In which a bridge becomes so long that it is not too fast."""
-_BETWEEN = 1.01
-"""Speeds between those that are looked at are higher by less than this factor."""
-_SHARES = np.linspace(0, 1, 17)[:, None] ** np.arange(5) * np.arange(1, 6)
-"""What the coefficients of a quintic piece count for its speed, at so many shares of its time."""
+_SHORTER = 1.001
+"""By so much more than it is too fast a bridge is made longer: its speed does not fall in proportion."""
+_SHARES = np.linspace(1, 0, 17)
+"""Shares of a piece's time from which its peak is searched: its speed has at most three extremes. The end
+comes first, as a constant speed is that of the way to the end."""
+_APART = 1 / 16
+_STEPS = 3
+"""Of Newton's method, which doubles the digits in each: that of a cubic's parabola is exact after one."""
 
 
 class SplineSample:
@@ -87,6 +91,58 @@ def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -
         position *= t
         position += coefficients
     acceleration *= 2.0
+
+
+def peak_velocities(piece: Floats, duration: float | Floats) -> tuple[Floats, Floats]:
+    """Return the velocity of the largest magnitude on each piece, rad/s, and its time, s from its start.
+
+    `piece` has the shape (order, pieces), `duration` is in s, of all pieces or of each. This is the one
+    place where the peak of a spline is found. The velocity of a cubic is a parabola, that of a quintic has
+    the extremes of a quartic: Newton's method finds the one next to the highest of some samples.
+    """
+    order = len(piece)
+    powers = np.asarray(duration, dtype=np.float64) ** np.arange(order - 1)[:, None]
+    speed = piece[1:] * np.arange(1, order)[:, None] * powers  # coefficients of the share of the time
+    slope = speed[1:] * np.arange(1, order - 1)[:, None]
+    bend = slope[1:] * np.arange(1, order - 2)[:, None]
+    sampled = _SHARES[:, None] ** np.arange(order - 1) @ speed
+    best = np.abs(sampled).argmax(axis=0)
+    highest, share = sampled[best, np.arange(piece.shape[1])], _SHARES[best]
+    lower, upper = np.maximum(share - _APART, 0.0), np.minimum(share + _APART, 1.0)
+    near = share
+    for _ in range(_STEPS):
+        bent = _horner(bend, near)
+        step = np.divide(_horner(slope, near), bent, out=np.zeros_like(near), where=bent != 0.0)
+        near = np.minimum(np.maximum(near - step, lower), upper)
+    refined = _horner(speed, near)
+    higher = np.abs(refined) > np.abs(highest)
+    return np.where(higher, refined, highest), np.where(higher, near, share) * duration
+
+
+def _horner(coefficients: Floats, at: Floats) -> Floats:
+    value = np.zeros_like(at)
+    for coefficient in coefficients[::-1]:
+        value = value * at + coefficient
+    return value
+
+
+def trajectory_peaks(data: Floats) -> list[tuple[float, float, int]]:
+    """Return for each joint of a flat trajectory its peak velocity, when, s, and on which piece, from 0.
+
+    Nothing where the trajectory has one point: the way there is not known.
+    """
+    count, joints, order = map(int, data[:START_IN].tolist())
+    if count < 2:
+        return []
+    times = data[_HEAD : _HEAD + count]
+    pieces = data[_HEAD + count + 6 * joints : flat_size(data)].reshape(count - 1, order, joints)
+    flat = np.ascontiguousarray(pieces.transpose(1, 0, 2)).reshape(order, -1)
+    speed, at = peak_velocities(flat, np.repeat(np.diff(times), joints))
+    speed, at = speed.reshape(-1, joints), at.reshape(-1, joints)
+    rows = np.abs(speed).argmax(axis=0).tolist()
+    return [
+        (float(speed[row, joint]), float(times[row] + at[row, joint]), row) for joint, row in enumerate(rows)
+    ]
 
 
 def smooth_velocities(times: Floats, positions: Floats) -> Floats:
@@ -200,10 +256,10 @@ class Trajectory:
             else:
                 joined.rest_at(self._last[0])
             solve(QUINTIC, bridge_s, now.rows, joined.rows, self._bridge)
-            speeds = np.abs(_SHARES @ (self._bridge[1:] * bridge_s ** np.arange(5.0)[:, None]))
-            haste = _BETWEEN * float((speeds / limits.speed).max())
+            haste = float((np.abs(peak_velocities(self._bridge, bridge_s)[0]) / limits.speed).max())
             if haste <= 1.0:
                 break
+            haste *= _SHORTER
         self.bridge_s, self._tail_s = bridge_s, max(end_s, bridge_s)
         if bridge_s < end_s:
             self._sample_points(end_s, joined)
@@ -238,6 +294,11 @@ class Trajectory:
         """Position of the last point, as it was asked, rad."""
         position: Floats = self._last[0]
         return position
+
+    def bridge_speeds(self) -> Floats:
+        """Return the highest speed of each joint on the bridge, rad/s."""
+        speeds: Floats = np.abs(peak_velocities(self._bridge, self.bridge_s)[0])
+        return speeds
 
     def first_way(self, now: SplineSample) -> Floats:
         """Return the way from `now` to the first point, rad."""

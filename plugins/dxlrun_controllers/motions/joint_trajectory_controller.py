@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from enum import Enum, auto, unique
 from typing import Annotated, ClassVar, Final, Literal, Self
 
@@ -22,6 +23,7 @@ from dxlrun import (
     Interfaces,
     Outcome,
     ParametersModel,
+    SpeedPeak,
     Tolerance,
 )
 from dxlrun_controllers.joints import (
@@ -47,6 +49,7 @@ from dxlrun_controllers.motions.trajectory_command import (
     TrajectoryCommand,
     flat_chunk,
     flat_trajectory,
+    trajectory_speed_peaks,
 )
 
 SPEED_SLOPE: Final = 2.0
@@ -137,6 +140,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if isinstance(command, TrajectoryCommand):
             return flat_trajectory(command, parameters.joints)
         return super().prepare(kind, command, parameters)
+
+    @classmethod
+    def speed_peaks(
+        cls, kind: str, data: NDArray[np.float64], parameters: TrajectoryParameters
+    ) -> Iterator[SpeedPeak]:
+        """Yield the highest speed of each joint between the points, at the controller's factor of speed."""
+        return trajectory_speed_peaks(kind, data, parameters.joints, parameters.speed)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -320,16 +330,21 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
         A first point at time 0 is to be reached within a period.
         """
-        way = np.abs(self._trajectory.first_way(self._path)) * self._moved * self._speed
-        time_s = max(self._trajectory.bridge_s, self.context.period_ns * 1e-9)
-        if not (way > self._speed_limit * time_s * (1 + 1e-9)).any():
+        trajectory, period_s = self._trajectory, self.context.period_ns * 1e-9
+        way = np.abs(trajectory.first_way(self._path)) * self._moved * self._speed
+        time_s = max(trajectory.bridge_s, period_s)
+        speeds = way / period_s
+        if trajectory.bridge_s > 0:
+            speeds = trajectory.bridge_speeds() * self._moved * self._speed
+        if not (speeds > self._speed_limit * (1 + 1e-9)).any():
             return False
-        row = int((way / self._speed_limit).argmax())
+        row = int((speeds / self._speed_limit).argmax())
         joint, limit = self.context.joints[row], self._speed_limit[row]
+        needed_s = math.ceil(1e3 * time_s * speeds[row] / limit - 1e-6) * 1e-3
         text = (
             f"joint {joint} has {way[row]:.4g} to go to the first point in {time_s:.4g} s, at "
-            f"{way[row] / time_s:.4g} a second, more than its limit of {limit:.4g}: give the point "
-            f"{math.ceil(1e3 * way[row] / limit) * 1e-3:.4g} s or more, as its time or by start_in"
+            f"{speeds[row]:.4g} a second, more than its limit of {limit:.4g}: give the point "
+            f"{needed_s:.4g} s or more, as its time or by start_in"
         )
         goal, self._goal = self._goal, None
         if goal is not None:

@@ -28,6 +28,7 @@ from dxlrun import (
     Interfaces,
     Outcome,
     ParametersModel,
+    SpeedPeak,
     Tolerance,
 )
 from dxlrun_controllers.joints import (
@@ -40,7 +41,16 @@ from dxlrun_controllers.joints import (
     row_of,
     take_where_heard,
 )
-from dxlrun_controllers.laws.spline import CUBIC, DECELERATION, LINEAR, SplineSample, Stop, evaluate, solve
+from dxlrun_controllers.laws.spline import (
+    CUBIC,
+    DECELERATION,
+    LINEAR,
+    SplineSample,
+    Stop,
+    evaluate,
+    peak_velocities,
+    solve,
+)
 
 HIGHEST_RATE = 10.0
 """Of a motion's own time over the loop's: so few steps at most are passed in a period."""
@@ -191,6 +201,41 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         return {name: sum(map(lengths.__getitem__, parameters.chain(name))) for name in known}
 
     @classmethod
+    def speed_peaks(
+        cls, kind: str, data: NDArray[np.float64], parameters: KeyframeParameters
+    ) -> Iterator[SpeedPeak]:
+        """Yield the highest speed of each joint on the ways between poses; the first pose is approached.
+
+        A joint that a motion does not name before a pose comes there from where it was: its way is not known.
+        """
+        names = list(parameters.motions)
+        first, speed, repeat = names[int(data[0])], float(data[1]), int(data[2])
+        at: dict[str, float] = {}
+        highest: dict[str, SpeedPeak] = {}
+        begin_s = 0.0
+        for name in parameters.chain(first):
+            motion = parameters.motions[name]
+            rate = min(speed * motion.speed * parameters.speed, HIGHEST_RATE)
+            # the third repetition goes the ways of the second one
+            rounds = min(repeat if name == first else motion.repeat, 2)
+            for number, step in [*enumerate(motion.steps, 1)] * rounds:
+                moved = [joint for joint in step.pose if joint in at]
+                time_s = step.time * 1e-9 / rate
+                ends = np.zeros((2, 2, len(moved)))
+                ends[:, 0] = [at[joint] for joint in moved], [step.pose[joint] for joint in moved]
+                order = LINEAR if step.interpolation == "linear" else CUBIC
+                piece = np.zeros((order, len(moved)))
+                solve(order, time_s, ends[0], ends[1], piece)
+                peaks, times = peak_velocities(piece, time_s)
+                where, key = f"on the way to step {number} of {name}", f"motions.{name}"
+                for joint, peak, time in zip(moved, peaks.tolist(), times.tolist(), strict=True):
+                    if joint not in highest or abs(peak) > abs(highest[joint].speed):
+                        highest[joint] = SpeedPeak(joint, peak, begin_s + time, where, key)
+                at.update(step.pose)
+                begin_s += time_s + step.pause * 1e-9 / rate
+        yield from highest.values()
+
+    @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:
         """Return the motion's number, speed, and repetitions. Raises ValueError for an unknown motion."""
         if not isinstance(command, PlayCommand):
@@ -206,8 +251,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         super().on_configure(context)
         parameters, count = self.parameters, len(context.joints)
         self._lower, self._upper = context.limits.lower, context.limits.upper
-        speeds = finite_or(context.limits.velocity, np.inf)
-        self._closing = np.minimum(speeds, CLOSING_SPEED)
+        self._speeds = finite_or(context.limits.velocity, np.inf)
+        self._closing = np.minimum(self._speeds, CLOSING_SPEED)
         self._posvel = parameters.command_interface == "posvel"
         self._now = SplineSample(count)
         """Where the joints are sent, rad, and how fast, in rad a second of the motion's own time."""
@@ -377,8 +422,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.clip(end[0], self._lower, self._upper, out=end[0])
         self._step_s, self._pause_s = step.time * 1e-9, step.pause * 1e-9
         if softly:
-            farthest = float(np.abs(end[0] - start[0]).max())
-            needed = PEAK * farthest / self.parameters.approach * self._rate
+            slowest = np.minimum(self._speeds, self.parameters.approach)
+            needed = PEAK * float((np.abs(end[0] - start[0]) / slowest).max()) * self._rate
             if needed > self._step_s:
                 self._total_s += (needed - self._step_s) / self._motion.speed
                 self._step_s = needed

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from dxlrun import CommandModel, Duration, Floats, RestSpeed, Tolerance
+from dxlrun import CommandModel, Duration, Floats, RestSpeed, SpeedPeak, Tolerance
 from dxlrun_controllers.joints import check_size, or_number, row_of
-from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, flatten, smooth_velocities
+from dxlrun_controllers.laws.spline import (
+    CUBIC,
+    LINEAR,
+    QUINTIC,
+    flatten,
+    smooth_velocities,
+    trajectory_peaks,
+)
 
 SPLICED: Final = 2.0
 """Behind a flat trajectory, of the joints that it moves when it is spliced; else 1, and 0 of all others."""
@@ -217,6 +224,18 @@ def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tup
         velocity=row("goal_tolerance", "velocity"),
         settle_s=np.nan if settle_s is None else settle_s,
     )
+
+
+def trajectory_speed_peaks(
+    kind: str, data: Floats, joints: tuple[str, ...], factor: float = 1.0
+) -> Iterator[SpeedPeak]:
+    """Yield the highest speed of each joint between the points of a prepared trajectory or chunk.
+
+    It is played `factor` times as fast; times are those of the points.
+    """
+    flat = data[len(ChunkHead._fields) :] if kind == "chunk" else data
+    for joint, (speed, time, piece) in zip(joints, trajectory_peaks(flat), strict=False):
+        yield SpeedPeak(joint, speed * factor, time, f"from point {piece + 1} to {piece + 2}")
 
 
 def _columns(named: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:

@@ -7,14 +7,16 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.limits import report_speed
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark, left_out_names
-from dxlrun.contract.controller import Interfaces
+from dxlrun.contract.controller import Interfaces, SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
@@ -339,6 +341,31 @@ def check_robot(
             continue
         for one in found:
             file.error(_mismatch_mark(file.description, name, one.at), f"{name} {one.what}", one.fix)
+
+
+def check_motions(
+    file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
+) -> None:
+    """Compare the motions of the file, which controllers play by their names, with the joints' speeds."""
+    for name, controller in controllers.items():
+        cls, parameters = controller.offer.controller, controller.parameters
+        seen: set[SpeedPeak] = set()  # a motion that follows others is a part of each of them
+        try:
+            for motion in cls.motions(parameters):
+                command = cls.Commands["play"].model_validate({"motion": motion})
+                data = np.ascontiguousarray(cls.prepare("play", command, parameters), dtype="<f8")
+                seen.update(cls.speed_peaks("play", data, parameters))
+        except Exception as error:
+            breach = raised("tell the speeds of its motions", error)
+            at_fault(file, "controller", name, controller.offer.distribution, breach)
+            continue
+        told: set[tuple[str, str]] = set()
+        for peak in sorted(seen, key=lambda peak: -abs(peak.speed)):
+            if peak.joint in joints and (peak.joint, peak.at) not in told:
+                told.add((peak.joint, peak.at))
+                mark = _mismatch_mark(file.description, name, peak.at)
+                where = f" at {peak.time:.3f} s, {peak.where}"
+                report_speed(joints[peak.joint].plan, peak.speed, where, mark, file)
 
 
 def _names_motor(joint: CompiledJoint) -> bool:

@@ -32,7 +32,7 @@ from dxlrun.compile.samples import (
     formula_texts,
     listed_samples,
 )
-from dxlrun.contract.controller import Controller
+from dxlrun.contract.controller import Controller, SpeedPeak
 from dxlrun.description.document import refusal
 from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
 from dxlrun.description.problems import sentences_of
@@ -79,11 +79,15 @@ def compile_motion(
         if controller is None or not samples:
             continue
         lead_ns = LEAD_NS if kind == TRAJECTORY and samples[0].t_ns == 0 else 0
-        check_samples(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
+        commands: tuple[ScheduledCommand, ...] = ()
+        peaks: Sequence[SpeedPeak] = ()
         try:
             commands = commands_of(controller, kind, samples, part.start, lead_ns)
+            peaks = speed_peaks(controller, commands, samples[0].mark)
         except InputError as error:
             problems.extend(error.problems)
+        check_samples(samples, part.start + lead_ns, plans, problems, peaks)
+        if not commands:
             continue
         end_ns = part.start + lead_ns + samples[-1].t_ns + _settle_ns(controller)
         parts.append(
@@ -267,6 +271,25 @@ def prepared(
             request=msgspec.json.encode(payload).decode(),
         )
     raise refusal(mark, f"{controller.plan.name} refuses this: {reason}", "change the motion")
+
+
+def speed_peaks(
+    controller: CompiledController, commands: Sequence[ScheduledCommand], mark: Mark
+) -> list[SpeedPeak]:
+    """Return the highest speeds of joints on the way of a trajectory, by the controller's own code.
+
+    A group controller has no way between its targets. Raises InputError.
+    """
+    if len(commands) != 1 or commands[0].kind != TRAJECTORY:
+        return []
+    (command,) = commands
+    data = np.frombuffer(command.data, "<f8")
+    try:
+        return list(controller.offer.controller.speed_peaks(command.kind, data, controller.parameters))
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        what = f"{controller.plan.name} does not know the speeds of this: {reason}"
+        raise refusal(mark, what, f"report it to the author of {controller.offer.distribution}") from error
 
 
 def command_kind(controller: type[Controller[Any]]) -> str | None:

@@ -11,6 +11,7 @@ import msgspec
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import (
+    check_motions,
     check_robot,
     compile_controllers,
     compile_modes,
@@ -189,6 +190,7 @@ def compile_robot(
     check_source_names(file, sources, (one.plan for one in controllers.values()))
     check_limp_joints(file, (one.plan for one in controllers.values()))
     check_robot(file, joints, urdf, controllers)
+    check_motions(file, joints, controllers)
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, devices, modes)
     policies = compile_policies(file, joints, buses)

@@ -116,6 +116,20 @@ class Mismatch(msgspec.Struct, frozen=True):
     """A joint, or a key of the controller: `payload.link`; empty: the controller itself"""
 
 
+class SpeedPeak(msgspec.Struct, frozen=True):
+    """The highest speed of a joint on the way that a command describes."""
+
+    joint: str
+    speed: float
+    """rad/s, of a linear joint m/s, with its sign"""
+    time: float
+    """s, in the time of the command: that of its points"""
+    where: str
+    """The part of the way: `from point 1 to 2`"""
+    at: str = ""
+    """The key of the controller that describes the way: `motions.curl`; empty: the command does"""
+
+
 @unique
 class Outcome(StrEnum):
     """How a goal ended."""
@@ -371,6 +385,15 @@ class Controller(ABC, Generic[P]):
             if isinstance(values, Sized) and len(values) != len(joints):
                 raise ValueError(f"{len(values)} {what} for {len(joints)} joints ({', '.join(joints)})")
         return np.hstack([np.asarray(values, dtype=np.float64) for values in fields.values()])
+
+    @classmethod
+    def speed_peaks(cls, kind: str, data: NDArray[np.float64], parameters: P) -> Iterable[SpeedPeak]:
+        """Return the highest speed of each joint on the way of a prepared command; a pure function.
+
+        The runtime compares them with the limits of the joints: in a file before a run, in a command before
+        it is taken. Values that are fields of the command need no peak.
+        """
+        return ()
 
     def on_configure(self, context: Context) -> None:
         """Prepare for real time; keep `context`."""

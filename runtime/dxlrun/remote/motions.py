@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -12,16 +13,18 @@ from msgspec import structs
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joints.limits import check_samples
+from dxlrun.compile.joints.limits import PEAK_OVER_MEAN, check_samples
 from dxlrun.compile.motions import (
     SETTLE_NS,
     TRAJECTORY,
     affordable,
     commands_of,
     playable,
+    speed_peaks,
 )
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
+from dxlrun.contract.controller import SpeedPeak
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.steering import Play
 from dxlrun.description.motion import MotionDescription
@@ -191,7 +194,11 @@ def _faster(target: SampledTarget, speed: float) -> SampledTarget:
 
 
 def _check(part: _Part, running: Running, problems: Problems) -> None:
-    check_samples(part.samples, 0, running.joints, problems, interpolated=part.kind == TRAJECTORY)
+    peaks: Sequence[SpeedPeak] = ()
+    with suppress(InputError):  # a command that cannot be given is reported when it is made
+        commands = commands_of(part.controller, part.kind, part.samples, 0, 0)
+        peaks = speed_peaks(part.controller, commands, part.samples[0].mark)
+    check_samples(part.samples, 0, running.joints, problems, peaks)
     for joint, target in part.samples[0].targets.items():
         if target.position is not None and not math.isfinite(running.position(joint)):
             problems.error(target.mark, f"{joint} has not answered yet", "play the motion when it has")
@@ -209,7 +216,9 @@ def _way_ns(part: _Part, running: Running) -> int:
         for joint, target in part.samples[0].targets.items()
         if target.position is not None
     )
-    longest = max((way / min(speed, SOFT_SPEED) for way, speed in ways if way > _STILL), default=0.0)
+    smooth = any(target.velocity is not None for target in part.samples[0].targets.values())
+    peak = PEAK_OVER_MEAN if smooth and part.kind == TRAJECTORY else 1.0  # else the way has one speed
+    longest = max((way / min(speed / peak, SOFT_SPEED) for way, speed in ways if way > _STILL), default=0.0)
     return max(_LEAST_NS, round(longest * 1e9)) if longest else 0
 
 

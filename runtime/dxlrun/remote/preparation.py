@@ -239,7 +239,8 @@ class Preparation:
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
             data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
-            beyond = tuple(beyond_limits(known.joints, command))
+            peaks = controller.speed_peaks(kind, np.frombuffer(data, "<f8"), known.parameters)
+            beyond = tuple(beyond_limits(known.joints, command, peaks))
         return Prepared(plan.name, kind, data, beyond, body)
 
     def known(self, plan: ControllerPlan) -> Known:

@@ -120,9 +120,9 @@ def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once():
 @pytest.mark.parametrize(("limit", "closing"), [(np.nan, CLOSING_SPEED), (0.2, 0.2)])
 def test_at_the_end_it_holds_and_the_goal_is_reached_once(limit, closing):
     robot = started(ONE | POSVEL, limits={"velocity": limit})
-    robot.send(0.0, "trajectory", points=points([9, 10]))
+    robot.send(0.0, "trajectory", points=points([9, 10]) if np.isnan(limit) else one(0.8, time=10.0))
     seen(robot, (0.2, 9.99, 10.0, 10.02, 19.0))
-    np.testing.assert_allclose(robot.commands.position, thesis(10.0)[0])
+    np.testing.assert_allclose(robot.commands.position, thesis(10.0)[0] if np.isnan(limit) else 0.8)
     assert robot.commands.velocity[0] == closing
     assert robot.goal.ended == [(Outcome.REACHED, "after 10.000 s", "a", pytest.approx(0, abs=0.02))]
 
@@ -378,7 +378,7 @@ def test_a_splice_where_nothing_is_played_begins_at_once_and_one_that_is_too_fas
     np.testing.assert_allclose(seen(robot, (2.4, 2.5, 3.0))[:, 0], [0.9, 0.8, 0.8 - 1 / 2 / DECELERATION])
     outcome, told, *_ = robot.goal.ended[0]
     assert outcome is Outcome.ABORTED
-    assert told.startswith("joint a has 0.5 to go to the first point in 0.1 s, at 5 a second")
+    assert told.startswith("joint a has 0.5 to go to the first point in 0.1 s, at 9.819 a second")
 
 
 def test_a_cancel_before_its_start_ends_a_spliced_trajectory():
@@ -572,6 +572,17 @@ def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(time
     assert robot.goal.outcome is None
     robot.send(0.1, "trajectory", joints=["a"], points=one(0.33, time=0))
     assert robot.goal.outcome is None, "it does not move b, and a jump within a period is none"
+
+
+def test_the_way_to_the_first_point_is_judged_by_its_peak():
+    """From rest to rest on a cubic: 1.5 times the mean speed."""
+    robot = started(ONE, limits={"velocity": 2.0})
+    there = [{"time": 0.5, "positions": [1.1], "velocities": [0.0]}]
+    robot.send(0.0, "trajectory", points=there)
+    told = "joint a has 0.8 to go to the first point in 0.5 s, at 2.4 a second, more than its limit of 2"
+    assert robot.goal.ended[0][1].startswith(f"{told}: give the point 0.6 s or more")
+    robot.send(0.1, "trajectory", points=[there[0] | {"time": 0.6}])
+    assert robot.goal.outcome is None
 
 
 def test_a_refused_trajectory_brings_a_motion_to_rest():

@@ -14,12 +14,40 @@ from dxlrun_controllers.laws.spline import (
     Trajectory,
     evaluate,
     flatten,
+    peak_velocities,
     smooth_velocities,
     solve,
 )
 
 values = st.floats(-10, 10)
 boundary = st.tuples(values, values, values)
+
+
+@pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
+def test_the_peak_of_a_piece_is_that_of_its_roots(order):
+    """The velocity has its extremes at the ends and at the roots of its derivative."""
+    chance = np.random.default_rng(order)
+    for duration in (0.05, 0.7, 3.0):
+        piece = chance.normal(size=(order, 200)) * chance.uniform(0, 3) ** np.arange(order)[:, None]
+        found, times = peak_velocities(piece, duration)
+        for column, speed, at in zip(piece.T, found, times, strict=True):
+            velocity = np.polynomial.Polynomial(column).deriv()
+            roots = velocity.deriv().roots() if order > LINEAR else []
+            inner = [root.real for root in roots if abs(root.imag) < 1e-9 and 0 < root.real < duration]
+            highest = max(abs(velocity(time)) for time in (0.0, duration, *inner))
+            assert abs(speed) == pytest.approx(highest, rel=1e-9)
+            assert velocity(at) == pytest.approx(speed, rel=1e-9)
+
+
+@pytest.mark.parametrize(("order", "factor"), [(LINEAR, 1.0), (CUBIC, 3 / 2), (QUINTIC, 15 / 8)])
+def test_the_peak_from_rest_to_rest_is_a_known_factor_of_the_mean(order, factor):
+    ends = np.zeros((2, 3, 2))
+    ends[1, 0] = 0.4, -0.6
+    piece = np.zeros((order, 2))
+    solve(order, 0.5, *ends, piece)
+    found, times = peak_velocities(piece, 0.5)
+    np.testing.assert_allclose(found, np.array([0.8, -1.2]) * factor)
+    np.testing.assert_allclose(times, 0.5 if order == LINEAR else 0.25)
 
 
 @settings(max_examples=80, deadline=None)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from dxlrun.compile.problems import Problems
-from dxlrun.contract.controller import CommandModel
+from dxlrun.contract.controller import CommandModel, SpeedPeak
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
 
@@ -20,6 +21,9 @@ _TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the
 
 
 _ROUNDING = 1e-9  # Part of a speed that differences of positions and times may be off
+_MOST_LONGER = 1000  # Times as long; more is a mistake in a number, not in a time
+PEAK_OVER_MEAN = 15 / 8
+"""Highest speed of a quintic from rest to rest over its mean speed; that of a cubic is lower."""
 
 
 class Interval(msgspec.Struct, frozen=True):
@@ -83,16 +87,14 @@ def check_samples(
     start_ns: int,
     joints: Mapping[str, JointPlan],
     problems: Problems,
-    *,
-    interpolated: bool,
+    peaks: Iterable[SpeedPeak] = (),
 ) -> None:
     """Check the targets of joints against their limits: once for each joint, with the worst of them.
 
     Warn of positions beyond the limits, and of speeds beyond the file's; refuse speeds above the top speed of
-    a servo. The speeds are the targets', and with `interpolated`, where a controller moves from sample to
-    sample, the mean speed between two samples, which every path through both reaches.
+    a servo. The speeds are the targets' and the `peaks` of the way between them.
     """
-    farthest, fastest = _worst(samples, joints, interpolated)
+    farthest, fastest = _worst(samples, joints, peaks)
     for joint, (_, sample, position) in farthest.items():
         where = position_text(position, joints[joint].linear).removeprefix("+")
         problems.warning(
@@ -102,27 +104,56 @@ def check_samples(
             "the gate will hold it at the limit; change the motion or the limits",
         )
     for joint, (speed, t_ns, mark) in fastest.items():
-        plan = joints[joint]
-        if speed <= plan.highest_speed * (1 + _ROUNDING):
-            continue
-        unit = speed_unit(plan.linear)
-        asked = f"{joint} is asked for {speed:.4g} {unit} at {(start_ns + t_ns) * 1e-9:.3f} s"
-        if plan.top_speed is not None and speed > plan.top_speed * (1 + _ROUNDING):
-            problems.error(
-                mark,
-                f"{asked}, more than {plan.top_speed:.4g} {unit}, the top speed of its servo",
-                "give it more time, or a shorter way",
-            )
-        else:
-            problems.warning(
-                mark,
-                f"{asked}, more than {plan.highest_speed:.4g} {unit}, its velocity limit",
-                "the gate will hold it at the limit, so it comes late; give it more time, or raise the limit",
-            )
+        report_speed(joints[joint], speed, f" at {(start_ns + t_ns) * 1e-9:.3f} s", mark, problems)
+
+
+def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problems: Problems) -> None:
+    """Report a speed of a file that its joint cannot reach: an error, or a warning where the servo can.
+
+    There the gate holds the joint at the limit of the file, and its goal is late or missed.
+    """
+    excess = excess_speed(joint, speed, where)
+    if excess is None:
+        return
+    if excess.beyond_servo:
+        problems.error(mark, excess.text, f"{excess.fix}, or a shorter way")
+    else:
+        fix = f"the gate will hold it at the limit, so it comes late; {excess.fix}, or raise the limit"
+        problems.warning(mark, excess.text, fix)
+
+
+class ExcessSpeed(NamedTuple):
+    """A speed above the limit of a joint, and what to do about it."""
+
+    text: str
+    fix: str
+    beyond_servo: bool
+    """True: above the top speed of its servo"""
+
+
+def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | None:
+    """Compare a speed, rad/s or m/s, with the highest one of a joint; None: the joint can reach it.
+
+    Every speed that a file or a client asks for is compared here.
+    """
+    most, top = joint.highest_speed, joint.top_speed
+    if abs(speed) <= most * (1 + _ROUNDING):
+        return None
+    beyond_servo = top is not None and abs(speed) > top * (1 + _ROUNDING)
+    register = _register_limit(joint, "velocity")
+    own = beyond_servo or most != joint.velocity
+    limit = register or ("the top speed of its servo" if own else "its velocity limit")
+    shown = top if beyond_servo and top is not None and not register else most
+    unit = speed_unit(joint.linear)
+    text = f"{joint.name} is asked for {speed:.4g} {unit}{where}, more than {shown:.4g} {unit}, {limit}"
+    fix = "give it more time"
+    if 0 < abs(speed) < _MOST_LONGER * most:
+        fix += f", {math.ceil(100 * abs(speed) / most - 1e-6) / 100:g} times as long"
+    return ExcessSpeed(text, fix, beyond_servo)
 
 
 def _worst(
-    samples: Sequence[Sample], joints: Mapping[str, JointPlan], interpolated: bool
+    samples: Sequence[Sample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
 ) -> tuple[dict[str, tuple[float, Sample, float]], dict[str, tuple[float, int, Mark]]]:
     """Return by joint the position that is farthest beyond its limits, and the highest speed, with places."""
     farthest: dict[str, tuple[float, Sample, float]] = {}
@@ -132,7 +163,6 @@ def _worst(
         if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
             fastest[joint] = abs(speed), t_ns, mark
 
-    before: dict[str, tuple[int, float]] = {}
     for sample in samples:
         for joint, target in sample.targets.items():
             if joint not in joints:
@@ -144,11 +174,12 @@ def _worst(
             excess = max(joints[joint].lower - target.position, target.position - joints[joint].upper)
             if excess > farthest.get(joint, (_TOLERANCE, sample, 0.0))[0]:
                 farthest[joint] = (excess, sample, target.position)
-            t_ns, position = before.get(joint, (sample.t_ns, 0.0))
-            if interpolated and sample.t_ns > t_ns:
-                speed = (target.position - position) / ((sample.t_ns - t_ns) * 1e-9)
-                note(joint, speed, sample.t_ns, target.mark)
-            before[joint] = sample.t_ns, target.position
+    times = [sample.t_ns for sample in samples]
+    for peak in peaks:
+        t_ns = round(peak.time * 1e9)
+        target = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
+        if peak.joint in joints and target is not None:
+            note(peak.joint, peak.speed, t_ns, target.mark)
     return farthest, fastest
 
 
@@ -159,24 +190,36 @@ class BeyondLimit(NamedTuple):
     text: str
 
 
-def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[BeyondLimit]:
+def beyond_limits(
+    joints: Sequence[JointPlan], command: CommandModel, peaks: Iterable[SpeedPeak] = ()
+) -> list[BeyondLimit]:
     """Return each value of a command that its joint cannot follow.
 
     `joints`: those of the controller, in its order. Positions (rad) are compared with the position limits,
-    velocities (rad/s) and efforts with the lower one of the file's limit and the servo's own; between two
-    points of a trajectory the mean speed, which every path through both reaches. Of a command that names its
-    `joints`, the values are theirs. A field that has not one number a joint is for the controller's `prepare`
-    to judge.
+    velocities (rad/s), the `peaks` of the way and efforts with the lower one of the file's limit and the
+    servo's own. Of a command that names its `joints`, the values are theirs. A field that has not one number
+    a joint is for the controller's `prepare` to judge.
     """
     values = command.model_dump()
+    known = {joint.name: joint for joint in joints}
     named = values.get("joints")
     if isinstance(named, list | tuple):
-        known = {joint.name: joint for joint in joints}
         joints = [known[name] for name in named if name in known]
     points = values.get("points")
     if isinstance(points, Sequence) and all(isinstance(point, Mapping) for point in points):
-        return list(_beyond_in_points(joints, points))
-    return list(_beyond(joints, values, ""))
+        found = [
+            beyond
+            for number, point in enumerate(points, 1)
+            for beyond in _beyond(joints, point, f" in point {number}")
+        ]
+    else:
+        found = list(_beyond(joints, values, ""))
+    for peak in peaks:
+        joint = known.get(peak.joint)
+        where = f" at {peak.time:.3f} s, {peak.where}"
+        if joint is not None and (excess := excess_speed(joint, peak.speed, where)) is not None:
+            found.append(BeyondLimit(joint.name, f"{excess.text}: {excess.fix}"))
+    return found
 
 
 def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[BeyondLimit]:
@@ -186,7 +229,8 @@ def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: st
             text = f"{joint.name} is sent to {written}{where}, outside its limits {limits_of(joint)}"
             yield BeyondLimit(joint.name, text)
     for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
-        yield from _too_fast(joint, speed, where)
+        if (excess := excess_speed(joint, speed, where)) is not None:
+            yield BeyondLimit(joint.name, excess.text)
     for joint, effort in zip(joints, _row(joints, values, "efforts"), strict=False):
         if abs(effort) > joint.highest_effort:
             most, own = joint.highest_effort, joint.highest_effort != joint.effort
@@ -199,36 +243,6 @@ def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: st
             most, limit = joint.highest_pwm, _register_limit(joint, "pwm") or "the full voltage"
             text = f"{joint.name} is asked for {pwm:.6g}{where}, more than {most:.6g}, {limit}"
             yield BeyondLimit(joint.name, text)
-
-
-def _beyond_in_points(
-    joints: Sequence[JointPlan], points: Sequence[Mapping[str, object]]
-) -> Iterator[BeyondLimit]:
-    before: tuple[float, Sequence[float]] | None = None
-    for number, point in enumerate(points, 1):
-        yield from _beyond(joints, point, f" in point {number}")
-        time, positions = point.get("time"), _row(joints, point, "positions")
-        if not isinstance(time, int | float) or not positions:
-            before = None
-            continue
-        if before is not None and time > before[0]:
-            where = f" from point {number - 1} to {number}"
-            for joint, start, end in zip(joints, before[1], positions, strict=True):
-                yield from _too_fast(joint, (end - start) / (time - before[0]), where)
-        before = time, positions
-
-
-def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[BeyondLimit]:
-    if abs(speed) > joint.highest_speed * (1 + _ROUNDING):
-        own = joint.highest_speed != joint.velocity
-        limit = "the top speed of its servo" if own else "its velocity limit"
-        limit = _register_limit(joint, "velocity") or limit
-        unit = speed_unit(joint.linear)
-        yield BeyondLimit(
-            joint.name,
-            f"{joint.name} is asked for {speed:.6g} {unit}{where}, more than {joint.highest_speed:.6g} "
-            f"{unit}, {limit}",
-        )
 
 
 def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:

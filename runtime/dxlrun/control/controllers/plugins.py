@@ -45,6 +45,7 @@ _METHODS = (
     "mismatches",
     "motions",
     "prepare",
+    "speed_peaks",
     "on_configure",
     "on_activate",
     "on_command",
