@@ -25,12 +25,13 @@ class Desk:
     """Two sensors and a device before them, as the loop has them."""
 
     now_ns: int = 1_000 * MS
+    noisy: tuple[str, ...] = ()
     events: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         sensors = tuple(
-            SensorPlan(name, "any", "", "{}", STATES, 10 * MS, timeout_ns=50 * MS)
-            for name in ("imu", "other")
+            SensorPlan(name, "any", "", "{}", STATES, 10 * MS, timeout_ns=50 * MS, noisy=noisy)
+            for name, noisy in (("imu", self.noisy), ("other", ()))
         )
         sources = (
             SourcePlan("foot", "device", ("force.x",)),
@@ -90,6 +91,49 @@ def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(de
     for _ in range(3):
         desk.cycle()
     assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample since the start")]
+
+
+def bring(desk: Desk, x: float, y: float, seconds: float) -> list[tuple[bool, int]]:
+    """Bring the same sample every 10 ms; return validity and age of each cycle."""
+    found = []
+    for _ in range(round(seconds * 100)):
+        desk.sample(x, y)
+        found.append(desk.cycle(10)[1:])
+    return found
+
+
+def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
+    desk = Desk(noisy=STATES)
+    assert all(valid for valid, _ in bring(desk, 1.0, 2.0, 0.2))
+    valid, ages = zip(*bring(desk, 1.0, 2.0, 0.3), strict=True)
+    assert not any(valid[1:])
+    assert list(ages[1:]) == [(200 + 10 * more) * MS for more in range(2, 31)]
+    ((code, text),) = desk.told()
+    assert (code, text) == (
+        EventCode.SENSOR_LOST,
+        "sensor imu is stuck: it brings the same sample for 210 ms",
+    )
+    desk.sample(1.0, 2.5)
+    assert desk.cycle(10) == ([1.0, 2.5], True, 10 * MS)
+    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+
+
+def test_a_sensor_is_not_stuck_while_one_noisy_value_changes_or_it_has_no_noise():
+    desk = Desk(noisy=STATES)
+    for turn in range(100):
+        desk.sample(1.0, 0.1 * (turn % 2))
+        assert desk.cycle(10)[1:] == (True, 10 * MS)
+    assert all(valid for valid, _ in bring(Desk(), 1.0, 2.0, 3.0))
+
+
+def test_few_equal_samples_of_a_slow_sensor_and_many_of_a_fast_poll_are_no_sign():
+    slow, polled = Desk(noisy=STATES), Desk(noisy=STATES)
+    for _ in range(19):  # 380 ms
+        slow.sample(1.0)
+        assert slow.cycle(20)[1]
+    for turn in range(400):  # a device at 10 Hz, asked every ms
+        polled.sample(float(turn // 100))
+        assert polled.cycle(1)[1]
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])

@@ -171,6 +171,49 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     assert replayed.compared == len(found.cycles)
 
 
+class _Stuck:
+    """Brings the sample of a time again and again from then on, with new times."""
+
+    def __init__(self, robot, from_ns: int) -> None:
+        self._robot, self._from_ns = robot, from_ns
+        self._read, self._kept = robot.sensors["imu"].read, None
+
+    def __call__(self, values):
+        t_ns = self._read(values)
+        if t_ns >= self._from_ns:
+            self._kept = values.copy() if self._kept is None else self._kept
+            values[:] = self._kept
+        return t_ns
+
+
+NOISY = "gyroscope: {noise_density: 1.0e-4}, accelerometer: {noise_density: 2.0e-3}"
+
+
+@pytest.mark.parametrize("on_lost", ["continue", "stop"])
+def test_a_stuck_sensor_is_a_lost_one_in_the_run_and_its_replay(crane, tmp_path, monkeypatch, on_lost):
+    entry = f"{{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: {on_lost}, {NOISY}}}"
+    log = tmp_path / "run.mcap"
+    robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=2.0), log=log)
+    monkeypatch.setattr(robot.sensors["imu"], "read", _Stuck(robot, 1_000_000_000))
+    result = robot.run()
+    found = read_log(log)
+    ((name, text),) = [(event.name, event.text) for event in found.events if event.source == "imu"]
+    assert name == "sensor_lost"
+    assert re.fullmatch(r"sensor imu is stuck: it brings the same sample for 2\d\d ms", text)
+    assert result.reason == ("ended" if on_lost == "continue" else "fault")
+    assert found.cycles["woken_ns"][-1] * 1e-9 == pytest.approx(
+        2.0 if on_lost == "continue" else 1.2, abs=0.1
+    )
+    assert replay_log(log).same
+
+
+def test_a_simulated_imu_without_noise_is_not_accused(crane, tmp_path):
+    log = run(crane(), tmp_path / "run.mcap", (0.0, 0.0))
+    assert [event.text for event in log.events if event.source == "imu"] == []
+    rates = states(log)["imu/angular_velocity.z"]
+    assert (rates[-50:] == rates[-1]).all(), "it does bring the same sample"
+
+
 def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatch):
     entry = "{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: stop}"
     robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=1.0))

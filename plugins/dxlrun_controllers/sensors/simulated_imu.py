@@ -106,6 +106,14 @@ class SimulatedImu(Sensor[ImuParameters]):
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     @classmethod
+    def noisy(cls, parameters: ImuParameters) -> tuple[str, ...]:
+        """Return the states that the file gives noise; without noise a link at rest shows the same."""
+        gyroscope, accelerometer = parameters.gyroscope, parameters.accelerometer
+        groups = ["angular_velocity"] if gyroscope.noise_density or gyroscope.random_walk else []
+        groups += ["linear_acceleration"] if accelerometer.noise_density or accelerometer.random_walk else []
+        return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
+
+    @classmethod
     def links(cls, parameters: ImuParameters) -> tuple[str, ...]:
         """Return the link that it sits on."""
         return (parameters.link,)

@@ -103,7 +103,7 @@ class EventCode(IntEnum):
     SENSOR = 52
     """A sensor, or its process, reports: it cannot be opened, ended, was opened again, or has a sentence."""
     SENSOR_LOST = 53
-    """A sensor brought nothing for its timeout, or values that are not finite: its row is not valid."""
+    """A sensor brought nothing new for its timeout, or values that are not finite: its row is not valid."""
     SENSOR_BACK = 54
     """A sensor that was lost brings samples again."""
     TAKEOVER = 58

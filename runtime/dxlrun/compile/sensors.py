@@ -9,8 +9,9 @@ from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.sensors.offer import names_breach
+from dxlrun.control.sensors.offer import SensorOffer, names_breach
 from dxlrun.description.bus import SIMULATED
+from dxlrun.description.form import ParametersModel
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
@@ -46,15 +47,10 @@ def _compiled(
     parameters = parameters_of(file, "sensor", name, offer.distribution, offer.sensor.Parameters)
     if parameters is None:
         return None
-    try:
-        states, links = offer.sensor.states(parameters), offer.sensor.links(parameters)
-    except Exception as error:  # foreign code
-        at_fault(file, "sensor", name, offer.distribution, raised("name its states and links", error))
+    names = _names(file, name, offer, parameters)
+    if names is None:
         return None
-    if breach := names_breach(states, links):
-        what, fix = breach
-        at_fault(file, "sensor", name, offer.distribution, (what, f"report it to its author: {fix}"))
-        return None
+    states, links, noisy = names
     _check_links(file, name, links, known)
     rate = entry.rate or file.robot.loop.rate
     period_ns = round(1e9 / rate)
@@ -76,7 +72,29 @@ def _compiled(
         on_lost=entry.on_lost,
         links=links,
         simulated=offer.sensor.simulated,
+        noisy=noisy,
     )
+
+
+def _names(
+    file: RobotFile, name: str, offer: SensorOffer, parameters: ParametersModel
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] | None:
+    """Return the states of a sensor, its links, and the states with noise; None where its code is wrong."""
+    sensor = offer.sensor
+    try:
+        states, links = sensor.states(parameters), sensor.links(parameters)
+        breach = names_breach(states, links)
+        noisy = () if breach else sensor.noisy(parameters)
+    except Exception as error:  # foreign code
+        at_fault(file, "sensor", name, offer.distribution, raised("name its states and links", error))
+        return None
+    if not breach and not (isinstance(noisy, tuple) and set(noisy) <= set(states)):
+        breach = f"returns {noisy!r} from noisy", "return a tuple of its states"
+    if breach:
+        what, fix = breach
+        at_fault(file, "sensor", name, offer.distribution, (what, f"report it to its author: {fix}"))
+        return None
+    return states, links, noisy
 
 
 def _check_links(file: RobotFile, name: str, links: Collection[str], known: Collection[str] | None) -> None:

@@ -15,6 +15,10 @@ from dxlrun.description.form import ParametersModel
 P = TypeVar("P", bound=ParametersModel)
 
 
+INERTIAL = ("angular_velocity.", "linear_acceleration.")
+"""States of an IMU. Their noise is about one unit of the last digit or more: of an MPU-6050 4 and 8 units."""
+
+
 class SensorContext(msgspec.Struct, frozen=True):
     """What a sensor gets when it is opened."""
 
@@ -67,6 +71,14 @@ class Sensor(ABC, Generic[P]):
         """Return the links of the robot's URDF whose motion it senses: it is then a simulated sensor, and
         needs simulated servos."""
         return ()
+
+    @classmethod
+    def noisy(cls, parameters: P) -> tuple[str, ...]:
+        """Return the states whose noise is above their resolution: a sensor is stuck while all of them stay.
+
+        Without one of its own: the angular velocity and the linear acceleration of an IMU.
+        """
+        return tuple(state for state in cls.states(parameters) if state.startswith(INERTIAL))
 
     def open(self, context: SensorContext) -> None:
         """Open the device; keep `context`."""

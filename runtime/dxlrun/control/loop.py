@@ -295,7 +295,7 @@ class Loop:
             self.gate.ease_in(self.manager.wait_for(self._lost.rows))
 
     def _look_at_needed_sensors(self) -> None:
-        """End the run when a sensor brought nothing for its timeout; by the record, which a replay has."""
+        """End the run when a sensor brought nothing new for its timeout; by the record, as in a replay."""
         ages_ns = self.record.sources.age_ns
         for row, sensor in self._needed:
             age_ns = ages_ns.item(row)

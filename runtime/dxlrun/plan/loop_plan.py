@@ -214,6 +214,8 @@ class SensorPlan(msgspec.Struct, frozen=True):
     links: tuple[str, ...] = ()
     """Of the URDF, whose simulated motion it senses; empty: it measures the real world."""
     simulated: bool = False  # It can be stepped on virtual time
+    noisy: tuple[str, ...] = ()
+    """States that never stay the same together: as long as they do, the sensor is stuck."""
 
 
 class ControllerPlan(msgspec.Struct, frozen=True):

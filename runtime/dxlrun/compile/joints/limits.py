@@ -177,9 +177,9 @@ def _worst(
     times = [sample.t_ns for sample in samples]
     for peak in peaks:
         t_ns = round(peak.time * 1e9)
-        target = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
-        if peak.joint in joints and target is not None:
-            note(peak.joint, peak.speed, t_ns, target.mark)
+        aimed = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
+        if peak.joint in joints and aimed is not None:
+            note(peak.joint, peak.speed, t_ns, aimed.mark)
     return farthest, fastest
 
 

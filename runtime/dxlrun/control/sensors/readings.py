@@ -16,6 +16,11 @@ _GONE = (SlotState.FAILED, SlotState.ENDED)
 """The device is not there, or the process is not."""
 
 
+MOST_EQUAL = 20
+STUCK_NS = 200_000_000
+"""A sensor is stuck after so many equal samples, and so much time. With noise of only 0.3 units of the last
+digit the six values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. The time
+is for a driver that is called more often than its device measures. [i]"""
 QUIET_NS = 100_000_000
 """Between two sentences of a sensor that is there: one that says something in each cycle fills no log."""
 
@@ -24,7 +29,8 @@ class Readings:
     """The loop's end of all slots.
 
     A row is valid while its sensor is there, and its newest sample is finite and younger than its timeout.
-    Values and age are those of the last finite sample for ever. What changes is an event, once.
+    Values and age are those of the last finite sample for ever. The samples of a stuck sensor, whose noisy
+    values stay the same, are as old as the first of them. What changes is an event, once.
     """
 
     def __init__(
@@ -59,6 +65,9 @@ class _Row:
         self._valid, self._age_ns = record.sources.valid, record.sources.age_ns
         self._are_finite = np.zeros(len(plan.states), np.bool_)
         self._t_ns = self._begun_ns = -1
+        self._noisy = np.array([plan.states.index(state) for state in plan.noisy], dtype=np.intp)
+        self._equal, self._since_ns = 0, -1
+        """How many samples equal the one before, and the time of the first of them."""
         self._quiet_ns = 0
         self._finite = True
         self._lost = False
@@ -69,8 +78,7 @@ class _Row:
         if t_ns is not None:
             self._finite = bool(np.isfinite(reader.sample, out=self._are_finite).all())
             if self._finite:
-                np.copyto(self._values, reader.sample)
-                self._t_ns = min(t_ns, now_ns)
+                self._take(reader.sample, min(t_ns, now_ns))
         if self._begun_ns < 0:
             self._begun_ns = now_ns
         known = self._t_ns >= 0
@@ -86,6 +94,21 @@ class _Row:
             self._lost = lost
             self._report(silent, age_ns)
 
+    @property
+    def _stuck(self) -> bool:
+        return self._equal >= MOST_EQUAL and self._t_ns == self._since_ns
+
+    def _take(self, sample: Floats, t_ns: int) -> None:
+        """Take a sample and its time; that of the first one where samples stay the same for too long."""
+        noisy = self._noisy
+        if noisy.size and np.array_equal(sample[noisy], self._values[noisy]):
+            self._equal += 1
+        else:
+            self._equal, self._since_ns = 0, t_ns
+        stuck = self._equal >= MOST_EQUAL and t_ns - self._since_ns >= STUCK_NS
+        self._t_ns = self._since_ns if stuck else t_ns
+        np.copyto(self._values, sample)
+
     def _say(self, text: str) -> None:
         severity = Severity.ERROR if self._reader.state in _GONE else Severity.INFO
         self._events.emit(EventCode.SENSOR, severity, self._plan.name, f"sensor {self._plan.name}: {text}")
@@ -100,6 +123,8 @@ class _Row:
             values = zip(self._plan.states, self._reader.sample.tolist(), strict=True)
             wrong = ", ".join(f"{state} is {value}" for state, value in values if not math.isfinite(value))
             text = f"sensor {name}: {wrong}; its values are not used"
+        elif silent and self._stuck:
+            text = f"sensor {name} is stuck: it brings the same sample for {age_ns / 1e6:.0f} ms"
         elif silent:
             since = f"for {age_ns / 1e6:.0f} ms" if age_ns >= 0 else "since the start"
             text = f"sensor {name} brought no sample {since}"
