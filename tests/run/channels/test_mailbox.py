@@ -81,6 +81,20 @@ def test_a_full_mailbox_refuses_and_loses_nothing(both):
     assert both.writer.post(command(sent, data))
 
 
+@pytest.mark.parametrize("beyond", [0, 1, record_size(0)])
+def test_mailbox_can_be_filled_to_its_last_byte_and_no_further(both, beyond):
+    def encoded_in(size, number):
+        """Return a command that takes so many bytes, without the header of its record."""
+        return command(number, bytes(2 * size - len(encode_command(command(number, bytes(size))))))
+
+    sizes = [LONGEST_COMMAND] * 3
+    room = mailbox.capacity(0) - sum(map(record_size, sizes))
+    sizes.append(room - record_size(0) + beyond)
+    posted = [both.writer.post(encoded_in(size, number)) for number, size in enumerate(sizes)]
+    assert posted == [True, True, True, beyond == 0]
+    assert [one.number for one in both.take_all()] == [0, 1, 2, 3][: sum(posted)]
+
+
 @pytest.mark.parametrize("size", [LONGEST_COMMAND + 1, 10_000_000])
 def test_what_is_too_long_is_refused(both, size):
     assert not both.writer.post(command(1, bytes(size)))

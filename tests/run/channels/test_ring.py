@@ -115,6 +115,20 @@ def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(mak
     assert all_of(reader) == [Gap(1), event(b"b" * 100)]
 
 
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_gap_has_a_record_at_least_where_the_count_of_records_is_damaged(make, number):
+    descriptor = make(512, 64)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    append(writer, b"one", b"two")
+    assert all_of(reader) == [event(b"one"), event(b"two")]
+    append(writer, b"three")
+    os.pwrite(descriptor, b"X", HEADER + 2 * record_size(3) + RECORD_HEADER)
+    os.pwrite(descriptor, struct.pack("<Q", number), NUMBER)
+    assert all_of(reader) == [Gap(1)]
+    append(writer, b"four")
+    assert all_of(reader) == [event(b"four")]
+
+
 @pytest.mark.parametrize("at", range(record_size(3)))
 def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make, at):
     descriptor = make(512, 64)
