@@ -204,6 +204,48 @@ def test_a_servo_that_is_added_later_leaves_the_others_as_they_are():
     assert joined.plant.angle[1] == -1.0
 
 
+def test_motor_of_a_servo_keeps_its_state_when_another_servo_is_added():
+    """Voltage, integral, temperature and time under overload."""
+
+    def told(joins: bool) -> list[object]:
+        noted: list[object] = []
+        mechanics = one(pid(0.3, 1.0, i=2.0), Load(friction=0.8))
+        mechanics.supply(0, 8.0)
+        mechanics.heat(0, 50.0)
+        mechanics.watch(0, lambda: noted.append((mechanics.grid_ns, mechanics.overloaded(0))))
+        mechanics.advance(700_000_000)
+        if joins:
+            mechanics.add(MOTOR, Load(), -1.0)
+        mechanics.advance(950_000_000)
+        moved = state(mechanics)
+        mechanics.command(0, pid(50.0, 9.0))
+        mechanics.plant.jam(0, True)
+        mechanics.advance(1_500_000_000)
+        if joins:
+            mechanics.add(MOTOR, Load(), -1.0)
+            mechanics.plant.jam(0, True)
+        mechanics.advance(4 * S)
+        return [moved, state(mechanics), float(mechanics.strain.temperature[0]), noted]
+
+    alone, joined = told(False), told(True)
+    assert joined == alone
+    assert any(overloaded for _, overloaded in alone[3])  # type: ignore[attr-defined]
+
+
+def test_overload_that_ends_is_not_added_to_the_next_one():
+    mechanics = one()
+    overloaded = []
+    for burst in range(3):
+        begun = 2 * burst * S
+        mechanics.command(0, pid(50.0, 9.0))
+        mechanics.plant.jam(0, True)
+        mechanics.advance(begun + 700_000_000)
+        overloaded.append(mechanics.overloaded(0))
+        mechanics.command(0, LIMP)
+        mechanics.advance(begun + 2 * S)
+    assert overloaded == [False] * 3
+
+
 def times_of(mechanics: Mechanics, planned: tuple[int, ...]) -> list[int]:
     times: list[int] = []
     for t_ns in planned:
@@ -236,6 +278,18 @@ def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew():
         speeds.append(mechanics.plant.velocity.item(index))
     assert speeds[1] == pytest.approx(speeds[0])
     assert speeds[0] < -0.1
+
+
+@pytest.mark.parametrize("by", [-0.45, 0.3, 0.45])
+def test_geared_load_turns_with_a_shaft_that_is_put_within_half_a_turn(by: float):
+    speeds = []
+    for put in (Mechanics.place, Mechanics.recount):
+        load = Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
+        mechanics = one(LIMP, load, 2.0)
+        put(mechanics, 0, 2.0 + by * math.tau)
+        mechanics.advance(50_000_000)
+        speeds.append(mechanics.plant.velocity.item(0))
+    assert speeds[1] == speeds[0] != 0.0
 
 
 # Heat and overload

@@ -54,12 +54,22 @@ def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms):
     assert moved[ends + 1] > 0.0
 
 
-def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet():
-    bus = bus_of("XM430-W350", 2.0, response_delay_ns=20 * MS)
-    way(bus, 3000, 10 * MS)
+@pytest.mark.parametrize(
+    ("model", "protocol", "item"),
+    [
+        ("XM430-W350", 2.0, "torque_enable"),
+        ("XM430-W350", 2.0, "goal_pwm"),
+        ("AX-12A", 1.0, "torque_enable"),
+        ("AX-12A", 1.0, "torque_limit"),
+    ],
+)
+def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet(model, protocol, item):
+    """By Torque Enable, and by a limit of 0."""
+    bus = bus_of(model, protocol, response_delay_ns=20 * MS)
+    way(bus, 700, 10 * MS)
     servo = bus.servo(1)
-    servo.registers["torque_enable"] = 0
-    servo.shaft.plan(("torque_enable",))
+    servo.registers[item] = 0
+    servo.shaft.plan((item,))
     bus.advance(200 * MS)
     assert servo.position == pytest.approx(2.0)
     assert servo.velocity == 0.0
