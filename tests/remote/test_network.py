@@ -14,8 +14,9 @@ from tests.remote.conftest import STOP, Door
 
 from dxlrun.channels.answers import Code
 from dxlrun.errors import DxlrunError, InputError
+from dxlrun.remote.asked import LONGEST_ORIGIN
 from dxlrun.remote.client import RemoteRobot, connect
-from dxlrun.remote.network.certificates import client_context, keys_place, server_context
+from dxlrun.remote.network.certificates import client_context, counts, keys_place, server_context
 from dxlrun.remote.network.commander import LEASE_S
 from dxlrun.remote.network.listener import MOST_UNPROVED, Listener
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
@@ -202,6 +203,16 @@ def test_a_revoked_certificate_is_refused_at_once_also_on_a_connection_that_is_o
     assert [command.kind for command in net.desk.taken] == ["halt", "stop"]
 
 
+@pytest.mark.parametrize("written", ["0AFB12", "0afb12", "77\n0aFb12\n"])
+def test_serial_of_a_revoked_certificate_counts_in_upper_and_lower_case(written, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    keys_place().mkdir(parents=True)
+    (keys_place() / "revoked").write_text(written)
+    until = {"notAfter": "Jan  1 00:00:00 2100 GMT"}
+    assert not counts(until | {"serialNumber": "0AFB12"})
+    assert counts(until | {"serialNumber": "0AFB13"})
+
+
 def test_one_client_commands_and_another_one_may_stop_or_take_over(desk):
     anna, bert, here = ("anna", Role.ADMIN), ("bert", Role.COMMAND), ("process 7", Role.ADMIN)
     switch = ("POST", "/switch", {"activate": [], "deactivate": ["left"]})
@@ -232,9 +243,16 @@ def test_one_client_commands_and_another_one_may_stop_or_take_over(desk):
     assert json.loads(desk.taken[5].data) == {"client": "anna", "instead": "bert"}
 
 
-def test_a_name_that_a_client_chose_does_not_hide_that_of_its_certificate(desk):
-    desk.ask("POST", "/stop", client=("anna", Role.COMMAND), headers=[("x-dxlrun-client", b"bert")])
-    assert desk.taken[-1].origin == "anna: bert"
+@pytest.mark.parametrize("chosen", [b"bert", b"process 7", b"b" * 200, b"client bert: bert"])
+def test_a_name_that_a_client_chose_does_not_hide_that_of_its_certificate(desk, chosen):
+    desk.ask("POST", "/stop", client=("client anna", Role.COMMAND), headers=[("x-dxlrun-client", chosen)])
+    assert desk.taken[-1].origin == f"client anna: {chosen.decode()}"[:LONGEST_ORIGIN]
+
+
+@pytest.mark.parametrize("chosen", [b"", b"   ", b"\x00\x1b"])
+def test_client_without_a_name_of_its_own_has_that_of_its_certificate(desk, chosen):
+    desk.ask("POST", "/stop", client=("client anna", Role.COMMAND), headers=[("x-dxlrun-client", chosen)])
+    assert desk.taken[-1].origin == "client anna"
 
 
 @pytest.mark.campaign

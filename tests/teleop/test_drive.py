@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -112,3 +113,24 @@ def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -
         else:
             assert abs(before - found[0][1]) > 50, found  # ticks: on the way, all the time
             assert len(moved) > 10
+
+
+def test_client_that_stood_still_moves_on_from_where_the_joint_is(tmp_path: Path) -> None:
+    """It does not make up for the time in which it did not run."""
+    run = DrivenRobot(arm(tmp_path), 2.5, {})
+
+    def begin(client: RemoteRobot) -> Callable[[float], object]:
+        drive = Drive(client, banks_of(client, (), 8), 1.0)
+
+        def step(now: float) -> None:
+            if not 1.2 <= now < 1.7:
+                drive.step(Given((0.5,), 0.9 <= now < 2.0), now)
+
+        return step
+
+    run.run(begin)
+    goals = goals_of(run, *POSITION)[1]
+    steps = [(at, abs(value - before)) for (_, before), (at, value) in pairwise(goals)]
+    usual = max(step for at, step in steps if 0.9 < at < 1.2)
+    assert {at for at, _ in steps if at >= 1.7}
+    assert max(step for at, step in steps if at >= 1.2) <= 2 * usual

@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from tests.kit.awaited import until
@@ -15,6 +15,8 @@ from tests.kit.fuzzed_http import Said, stands
 from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, settled, written
 from tests.view.served import Served
 
+from dxlrun import Refused, RemoteRobot
+from dxlrun_view.actions import stopped
 from dxlrun_view.live import LiveRobot
 from dxlrun_view.server import HEADER
 
@@ -145,3 +147,21 @@ def test_a_robot_that_does_not_run_is_waited_for(run: Run) -> None:
     robot.close()
     assert "nowhere" in shown.problem
     assert shown.columns == ()
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
+    asked: list[str] = []
+
+    class Robot:
+        def torque(self, joints: str, on: bool, release: bool) -> None:
+            asked.append(f"torque of {joints}: {on}")
+            if refused:
+                raise Refused("another client commands this robot")
+
+        def stop(self, wait: bool) -> None:
+            asked.append("stop")
+
+    said = stopped(cast("RemoteRobot", Robot()))
+    assert asked == ["torque of all: False", *(["stop"] if refused else [])]
+    assert ("the run ends" in said) is refused

@@ -126,3 +126,26 @@ def test_only_meshes_of_the_urdf_are_given_away(
         mesh_file(tmp_path / "robot", f"package://{tmp_path.name}/meshes/a.stl") == tmp_path / "meshes/a.stl"
     )
     assert mesh_file(tmp_path, "package://other/meshes/b.stl") is None
+
+
+def test_mesh_that_the_urdf_does_not_name_is_not_served(
+    recorded: RecordedRobot, serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the folder of the robot, and in those next to and above it."""
+    folder = tmp_path / "robot"
+    for path in (
+        "robot/named.stl",
+        "robot/other.stl",
+        "robot/urdf/other.dae",
+        "beside/other.obj",
+        "other.stl",
+    ):
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_bytes(path.encode())
+    monkeypatch.setattr(RecordedRobot, "folder", folder)
+    monkeypatch.setattr(recorded, "urdf", lambda: '<robot><mesh filename="named.stl"/></robot>')
+    served = serve(recorded)
+    assert served.ask("/mesh?name=named.stl") == (200, b"robot/named.stl")
+    others = ("other.stl", "other.dae", "../beside/other.obj", "../other.stl", "package://beside/other.obj")
+    for name in (*others, str(tmp_path / "other.stl"), "package://robot/named.stl", "./named.stl"):
+        assert served.ask(f"/mesh?name={name}")[0] == 404, name
