@@ -138,73 +138,106 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return (os.cpu_count() or 1) if whole else 0
 
 
-EXTRAS = {
-    "bokeh": "report",
-    "duckdb": "logs",
-    "fsspec": "store",
-    "matplotlib": "report",
-    "mujoco": "physics",
-    "pyarrow": "logs",
-    "scipy": "identify",
-    "twine": "release",
-    "websockets": "foxglove",
-    "ziglang": "release",
-    **dict.fromkeys(
-        ("Phidget22", "ahrs", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
-        "foreign",
-    ),
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "report": ("bokeh", "matplotlib"),
+    "logs": ("duckdb", "pyarrow"),
+    "store": ("fsspec", "s3fs"),
+    "physics": ("mujoco",),
+    "identify": ("scipy", "matplotlib"),
+    "sweep": ("pyarrow", "matplotlib"),
+    "foxglove": ("websockets",),
+    "network": ("cryptography",),
+    "release": ("twine", "ziglang"),
+    "foreign": ("Phidget22", "ahrs", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
 }
-"""What the test extra leaves out: which extra of dxlrun brings which module."""
-MISSING = {module for module in EXTRAS if find_spec(module) is None}
+"""Extras that the extra `test` does not have, each with its modules."""
+MISSING = {module for modules in EXTRAS.values() for module in modules if find_spec(module) is None}
 
 
-def missing_extra(text: str) -> str:
-    """Return the extra that a failure lacks: of a module that is not found, or as dxlrun itself words it."""
-    modules = re.findall(r"No module named '(\w+)", text)
-    asked = re.findall(r"dxlrun\[(\w+)\]", text)
-    absent = {EXTRAS[module] for module in MISSING}
-    return next((EXTRAS[module] for module in modules if module in MISSING), "") or next(
-        (extra for extra in asked if extra in absent or (extra == "sweep" and "logs" in absent)), ""
-    )
+def extra_of(error: BaseException | None) -> str:
+    """Return the extra whose missing module an import did not find; empty where that is not the error."""
+    root = (getattr(error, "name", None) or "").partition(".")[0]
+    if not isinstance(error, ImportError) or root not in MISSING:
+        return ""
+    return next(extra for extra, modules in EXTRAS.items() if root in modules)
+
+
+def is_own_import(excinfo: pytest.ExceptionInfo[BaseException], item: pytest.Item) -> bool:
+    """Check whether an import statement of the tests raised an error, not a function that they called.
+
+    Behind the last frame of the tests there is then nothing but the code of modules.
+    """
+    frames = list(excinfo.traceback)
+    tests = [index for index, frame in enumerate(frames) if _is_of_tests(Path(frame.path), item)]
+    return bool(tests) and all(frame.name == "<module>" for frame in frames[tests[-1] + 1 :])
+
+
+def _is_of_tests(path: Path, item: pytest.Item) -> bool:
+    return path == item.path or path.is_relative_to(Path(__file__).parent)
 
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 
-def not_run(report: Report, where: pytest.Item | pytest.Collector) -> Report:
-    """Make a skip of a failure for want of an extra: CI installs them all."""
-    if MISSING and report.failed:
-        text = report.longreprtext + "".join(content for _, content in report.sections)
-        if extra := missing_extra(text):
-            report.outcome = "skipped"
-            report.longrepr = (str(where.path), 0, f"needs dxlrun[{extra}]")
+def skip(report: Report, where: pytest.Item | pytest.Collector, extra: str) -> Report:
+    """Make a skip of a failure whose error is a missing extra: CI installs them all."""
+    if extra and report.failed:
+        report.outcome = "skipped"
+        report.longrepr = (str(where.path), 0, f"needs dxlrun[{extra}]")
     return report
 
 
+def named_extra(reason: str) -> str:
+    """Return the extra that the reason of a skip names, ours or that of `pytest.importorskip`; else empty."""
+    if needed := re.search(r"needs dxlrun\[(\w+)\]", reason):
+        return needed[1]
+    module = re.search(r"No module named '([\w.]+)'", reason)
+    return extra_of(ModuleNotFoundError(name=module[1])) if module else ""
+
+
 class Extras:
-    """Skips failures for want of an extra; a plugin, as hooks of this file miss those of other conftests."""
+    """Skips what lacks an extra; a plugin, as hooks of this file miss those of other conftests.
+
+    That is what imports a missing module itself, and what is marked with its extra, as tests of commands are:
+    `pytest.mark.needs("report")`. A failure of any other kind stays one, whatever its text has.
+    """
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        for item in items:
+            for mark in item.iter_markers("needs"):
+                if not MISSING.isdisjoint(EXTRAS[mark.args[0]]):
+                    item.add_marker(pytest.mark.skip(reason=f"needs dxlrun[{mark.args[0]}]"))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(
-        self, item: pytest.Item
+        self, item: pytest.Item, call: pytest.CallInfo[None]
     ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        return not_run((yield), item)
+        report = yield
+        error = call.excinfo
+        return skip(
+            report, item, extra_of(error.value) if error is not None and is_own_import(error, item) else ""
+        )
 
     @pytest.hookimpl(wrapper=True)
     def pytest_make_collect_report(
         self, collector: pytest.Collector
     ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-        return not_run((yield), collector)
+        report = yield
+        call = getattr(report, "call", None)  # pytest keeps it in a report of a failure
+        if call is None or call.excinfo is None:
+            return report
+        error = call.excinfo.value  # its cause is the import's error
+        return skip(report, collector, extra_of(getattr(error, "cause", None) or error.__cause__))
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Name in one line what was not run for want of extras."""
-        lacking: dict[str, set[str]] = {}
+        absent: dict[str, set[str]] = {}
         for report in terminalreporter.stats.get("skipped", []):
             path, _, reason = report.longrepr if isinstance(report.longrepr, tuple) else ("", 0, "")
-            if extra := missing_extra(reason):
-                lacking.setdefault(f"dxlrun[{extra}]", set()).add(Path(path).stem.removeprefix("test_"))
-        if lacking:
-            parts = (f"{', '.join(sorted(files))} needs {extra}" for extra, files in sorted(lacking.items()))
+            if extra := named_extra(reason):
+                absent.setdefault(f"dxlrun[{extra}]", set()).add(Path(path).stem.removeprefix("test_"))
+        if absent:
+            parts = (f"{', '.join(sorted(files))} needs {extra}" for extra, files in sorted(absent.items()))
             terminalreporter.write_line(f"not run: {'; '.join(parts)}")
 
 

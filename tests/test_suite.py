@@ -45,21 +45,39 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 0 < float(pytestconfig.getini("timeout")) <= 120
 
 
-def test_what_lacks_an_extra_is_skipped_and_named_in_one_line(tmp_path: Path) -> None:
+SKIPS = {
+    "import": "import not_there",
+    "part": "from not_there.part import thing",
+    "marked": "raise RuntimeError('it is marked with its extra')",
+}
+FAILURES = {
+    "other_module": "import not_there_either",
+    "message": "raise RuntimeError('Arrow needs pyarrow: pip install dxlrun[table]')",
+    "output": "print(\"No module named 'not_there'; dxlrun[table]\")\n    assert 1 == 2",
+    "own_error": "raise ImportError('not_there')",
+    "called": "call()",
+}
+CALLED = """
+import pytest
+
+code = compile("def call():\\n    import not_there\\n", "/elsewhere/product.py", "exec")
+exec(code)
+"""
+
+
+def test_only_an_own_import_or_a_mark_skips_what_lacks_an_extra(tmp_path: Path) -> None:
+    """A failure stays one, whatever it says: of a module that a command lacks, too."""
     (tmp_path / "test_import.py").write_text("import not_there\n")
-    lacking = (
-        "import not_there_either\n",  # in no table: a failure like any other
-        "raise RuntimeError('Arrow needs pyarrow: pip install dxlrun[table]')\n",
-        "raise RuntimeError('plots: pip install dxlrun[report]')\n",  # it is installed, or in no table
-    )
-    source = "".join(f"def test_{number}():\n    {line}\n\n" for number, line in enumerate(lacking))
-    source += "def test_import():\n    import not_there\n"
+    tests = [f"def test_{name}():\n    {body}\n" for name, body in (SKIPS | FAILURES).items()]
+    marked = "def test_marked", '@pytest.mark.needs("table")\ndef test_marked'
+    source = "\n".join([CALLED, *tests]).replace(*marked)
     conftest = (ROOT / "tests/conftest.py").read_text()
-    table = re.sub(r"EXTRAS = \{.*?\n\}", 'EXTRAS = {"not_there": "table"}', conftest, flags=re.DOTALL)
+    table = re.sub(r"(EXTRAS: .*?= )\{.*?\n\}", r'\1{"table": ("not_there",)}', conftest, flags=re.DOTALL)
     ran = pytest_on(source, tmp_path, str(tmp_path), "-n", "0", conftest=table)
-    assert "2 failed, 3 skipped" in ran.stdout, ran.stdout
+    assert f"{len(FAILURES)} failed, {len(SKIPS) + 1} skipped" in ran.stdout, ran.stdout
     assert "not run: import, made_up needs dxlrun[table]\n" in ran.stdout
-    assert {*re.findall(r"^FAILED .*::(\w+)", ran.stdout, re.MULTILINE)} == {"test_0", "test_2"}
+    failed = re.findall(r"^FAILED .*::test_(\w+)", ran.stdout, re.MULTILINE)
+    assert sorted(failed) == sorted(FAILURES)
 
 
 def test_a_property_draws_the_same_examples_again() -> None:

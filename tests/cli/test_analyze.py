@@ -23,6 +23,7 @@ def log(dxlrun: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return path
 
 
+@pytest.mark.needs("report")
 def test_a_report_is_written_beside_the_output(dxlrun: Callable, log: Path, tmp_path: Path):
     target = tmp_path / "report.html"
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.examples import as_parameters
 
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
@@ -229,6 +230,7 @@ def test_simulations_inside_sentences_are_understood(
     assert lines or page != "tools.md"
 
 
+@pytest.mark.needs("report")
 def test_analyze_md_its_commands_read_logs(dxlrun: Dxlrun, clone: Path) -> None:
     lines = list(commands("analyze.md"))
     assert len(lines) == 4
@@ -242,7 +244,7 @@ def test_analyze_md_its_commands_read_logs(dxlrun: Dxlrun, clone: Path) -> None:
     assert (clone / "run.html").exists()
 
 
-@pytest.mark.parametrize("robot", sorted((ROOT / "robots").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("robot", as_parameters(sorted((ROOT / "robots").glob("*.yaml"))))
 def test_every_robot_of_the_clone_is_checked_and_runs(
     dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: Path
 ) -> None:

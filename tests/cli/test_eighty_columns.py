@@ -122,6 +122,7 @@ def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
     terminal.show(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
 
 
+@pytest.mark.needs("logs")
 @pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20", "wolfgang", "mechanics"])
 def test_a_log(dxlrun: Callable[..., Any], seen: Seen, name: str, tmp_path: Path) -> None:
     log = tmp_path / f"{name}.mcap"

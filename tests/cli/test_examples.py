@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.examples import as_parameters
 
 from dxlrun.cli import examples
 from dxlrun.compile.robot import compile_files
@@ -32,7 +33,7 @@ def test_every_robot_is_listed_with_its_motions(dxlrun: Callable):
     assert {motion for one in listed.values() for motion in one["motions"]} == motions
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", as_parameters(NAMES))
 def test_a_copy_is_whole_and_is_what_it_was_copied_from(dxlrun: Callable, tmp_path: Path, name: str):
     target = tmp_path / "mine"
 

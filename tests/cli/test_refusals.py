@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
+NEEDED = {"identify": "identify", "sweep": "sweep"}
+"""Commands that are refused for want of their extra before anything else."""
 WITHOUT_JSON = (
     "robots/",
     "setup",
@@ -42,7 +44,8 @@ def _cases() -> Iterator[Any]:
     ):
         for block in part.strip().split("\n\n"):
             words, *said = (line.removeprefix("  ") for line in block.split("\n"))
-            yield pytest.param(words, said, code, id=words)
+            extra = NEEDED.get(words.split()[0])
+            yield pytest.param(words, said, code, id=words, marks=pytest.mark.needs(extra) if extra else ())
 
 
 @pytest.fixture

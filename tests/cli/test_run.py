@@ -100,6 +100,7 @@ def test_a_run_names_its_log_and_what_reads_it(dxlrun: Callable, runs: Runs, tor
     ]
 
 
+@pytest.mark.needs("report")
 @pytest.mark.parametrize("code", [0, 130])
 def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyze(
     dxlrun: Callable, torso: Path, meanwhile: Meanwhile, code: int

@@ -121,6 +121,7 @@ def reader(
         print(process.communicate()[0])  # of a failed test, how its robot fared
 
 
+@pytest.mark.needs("report")
 def test_an_arm_in_ten_minutes(reader: Callable[[str], Reader]) -> None:
     page = reader("arm.md")
     refused = page.until("dxlrun check arm.yaml", code=2)
@@ -140,6 +141,7 @@ def test_an_arm_in_ten_minutes(reader: Callable[[str], Reader]) -> None:
     assert (page.place / "arm.html").read_text().startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.needs("report")
 def test_a_controller_in_ten_lines(reader: Callable[[str], Reader]) -> None:
     page = reader("controller.md")
     assert re.search(

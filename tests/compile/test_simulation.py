@@ -85,6 +85,7 @@ def test_a_linear_joint_has_a_mass_and_forces() -> None:
     assert bus.servos[0].load == expected
 
 
+@pytest.mark.needs("physics")
 def test_servos_that_share_joints_are_simulated_together() -> None:
     plan = compile_text(_with_bodies(_joint(SIMULATED, "{inertia: 0.02 kg m^2}"))).plan
     coupling = CouplingPlan("arms", (0, 1), (1, 0), ((0.5, 0.5), (0.5, -0.5)), ((1, 1), (1, -1)))
@@ -173,6 +174,7 @@ def test_without_a_word_each_joint_moves_by_itself() -> None:
     assert simulation_of(compile_text(SIMULATED).plan).bodies is None
 
 
+@pytest.mark.needs("physics")
 def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
     # the first joint of the file stands on the second bus
     two = SIMULATED.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
@@ -188,6 +190,7 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
     )
 
 
+@pytest.mark.needs("physics")
 def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
     loose = URDF.replace(
         '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'

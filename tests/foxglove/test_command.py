@@ -29,6 +29,7 @@ def test_the_network_is_served_with_tls_alone() -> None:
         foxglove(key=Path("key.pem"))
 
 
+@pytest.mark.needs("foxglove")
 def test_a_robot_has_to_run() -> None:
     with pytest.raises(DxlrunError, match="no robot runs"):
         foxglove()

@@ -10,7 +10,14 @@ from tests.kit.laws import Case, Story, cases
 
 from dxlrun_controllers.plugin import dxlrun_controllers
 
-EACH = pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in cases()])
+PHYSICS = pytest.mark.needs("physics")
+EACH = pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=[PHYSICS] * case.name.startswith("gravity_compensation"))
+        for case in cases()
+    ],
+)
 
 
 def test_no_type_is_left_out() -> None:

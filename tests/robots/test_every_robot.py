@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.clients import command_of, played
+from tests.kit.examples import as_parameters
 
 from dxlrun.compile.robot import compile_files
 
@@ -17,7 +18,7 @@ LONGEST_S = 4.0
 ODD_TWIN = "right_shoulder_lateral_joint is not a mirror image"
 
 
-@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", as_parameters(sorted(ROBOTS.glob("*.yaml"))))
 def test_every_robot_compiles_and_has_motions(path):
     compiled = compile_files(path, {}, [])
 
@@ -28,7 +29,7 @@ def test_every_robot_compiles_and_has_motions(path):
     assert path in {command_of(motion).robot for motion in MOTIONS} or path.stem in others
 
 
-@pytest.mark.parametrize("path", MOTIONS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", as_parameters(MOTIONS))
 def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     command = command_of(path)
     assert command.motion == path

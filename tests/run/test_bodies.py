@@ -57,6 +57,7 @@ def _held(folder: Path, physics: str) -> dict[str, tuple[float, float]]:
     }
 
 
+@pytest.mark.needs("physics")
 def test_the_weight_of_both_links_hangs_on_the_shoulder(tmp_path):
     held = _held(tmp_path, "mujoco")
     (shoulder, shoulder_effort), (elbow, elbow_effort) = held["shoulder"], held["elbow"]

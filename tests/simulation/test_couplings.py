@@ -189,6 +189,7 @@ def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone():
     assert [*moved.angle] == [*pair.angle, *single.angle]
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize("in_bodies", [True, False])
 def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
     reverse = Coupling(
@@ -231,6 +232,7 @@ def bodies(
     return made([PlantJoint(motor, NO_LOAD, references[row]) for row in sorted(references)])
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize("per_rad", [0.25, -0.25, 2.0])
 def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
     held = bodies(ARMS, [UrdfJoint("pitch", 1.5, per_rad)])
@@ -240,6 +242,7 @@ def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
     assert (held.angle[0] - 1.5) * per_rad > 0.01
 
 
+@pytest.mark.needs("physics")
 def test_a_body_on_a_slide_is_held_by_its_weight():
     lift = urdf(link("a"), joint("lift", "base", "a", kind="prismatic", axis="0 0 1"))
     per_rad = 0.01
@@ -254,6 +257,7 @@ def test_a_body_on_a_slide_is_held_by_its_weight():
     )
 
 
+@pytest.mark.needs("physics")
 def test_a_slide_is_not_moved_by_a_joint_that_turns():
     both = urdf(
         link("a"),
@@ -266,6 +270,7 @@ def test_a_slide_is_not_moved_by_a_joint_that_turns():
     assert moved.angle[0] == 0.5
 
 
+@pytest.mark.needs("physics")
 def test_two_servos_hold_a_body_together():
     held = bodies(ARMS, [None, None], msgspec.structs.replace(on_one_axis(), joints=("pitch",)))
     run(held, 1.0, drive=[0.7 * PULL, -0.3 * PULL], damping=0.3)
@@ -275,6 +280,7 @@ def test_two_servos_hold_a_body_together():
     assert held.angle[0] == pytest.approx(-held.angle[1], abs=2e-3)
 
 
+@pytest.mark.needs("physics")
 def test_a_differential_holds_two_bodies():
     held = bodies(ARMS, [None, None], differential())
     # half of the sum is pitch, half of the difference roll: torques M' t
@@ -285,6 +291,7 @@ def test_a_differential_holds_two_bodies():
     assert held.angle[1] > 1.02
 
 
+@pytest.mark.needs("physics")
 def test_bodies_move_as_coupled_joints_do():
     load = Load(MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     coupled = plant(differential(load, load))
@@ -296,6 +303,7 @@ def test_bodies_move_as_coupled_joints_do():
     assert abs(coupled.angle[0]) > 0.3
 
 
+@pytest.mark.needs("physics")
 def test_a_joint_that_mimics_moves_with_the_one_it_mimics():
     grip = urdf(
         link("a"), joint("pitch", "base", "a"), link("b"),
@@ -311,6 +319,7 @@ def test_a_joint_that_mimics_moves_with_the_one_it_mimics():
     assert held.angle[0] > 0.05
 
 
+@pytest.mark.needs("physics")
 def test_a_blocked_body_stays():
     held = bodies(ARMS, [UrdfJoint("pitch", 0.0, 1.0), UrdfJoint("roll", 0.0, 1.0)])
     held.jam(0, True)

@@ -64,7 +64,8 @@ def rubbing(torque: float, pull: float) -> float:
     return motor.friction + motor.load_friction * abs(torque + pull)
 
 
-both = pytest.mark.parametrize("physics", ["independent", "mujoco"])
+by_mujoco = pytest.param("mujoco", marks=pytest.mark.needs("physics"))
+both = pytest.mark.parametrize("physics", ["independent", by_mujoco])
 
 
 @both
@@ -94,6 +95,7 @@ def test_a_limp_arm_falls_and_swings(hang, physics):
     assert pull <= rubbing(0.0, pull) + 0.003
 
 
+@pytest.mark.needs("physics")
 def test_both_ways_of_moving_show_the_host_the_same(hang):
     lines = [hang("independent"), hang("mujoco")]
     for line in lines:

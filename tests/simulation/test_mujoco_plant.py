@@ -34,6 +34,7 @@ def _plant(
     return mujoco_plant(UrdfBodies(text, joints))([PlantJoint(rotor, load, angle) for angle in placed])
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
 def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     load = Load(inertia=MASS * ARM**2, friction=0.05)
@@ -52,6 +53,7 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     assert np.abs(moved - expected).max() < 0.01 * np.ptp(expected)
 
 
+@pytest.mark.needs("physics")
 def test_a_joint_with_weight_swings_as_an_independent_one():
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     bodies = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
@@ -62,12 +64,14 @@ def test_a_joint_with_weight_swings_as_an_independent_one():
     assert bodies.angle[0] == pytest.approx(alone.angle[0], abs=0.02)
 
 
+@pytest.mark.needs("physics")
 def test_a_limp_arm_ends_hanging_down():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     run(plant, 10.0, damping=0.3)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize(("reference", "direction"), [(0.0, 1), (2.5, 1), (2.5, -1), (-1.0, -1)])
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.0])
 def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angle):
@@ -79,6 +83,7 @@ def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angl
     assert plant.angle[0] > servo_angle + 0.01, "a positive torque turns a servo counter-clockwise"
 
 
+@pytest.mark.needs("physics")
 def test_friction_holds_what_it_can_hold():
     holding = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
     run(holding, 10.0)
@@ -88,7 +93,13 @@ def test_friction_holds_what_it_can_hold():
     assert slipping.angle[0] < -0.05
 
 
-@pytest.mark.parametrize("bodies", [True, False], ids=["bodies", "independent"])
+@pytest.mark.parametrize(
+    "bodies",
+    [
+        pytest.param(True, id="bodies", marks=pytest.mark.needs("physics")),
+        pytest.param(False, id="independent"),
+    ],
+)
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
 def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies):
     gear = msgspec.structs.replace(ROTOR, load_friction=0.2)
@@ -100,6 +111,7 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies)
     assert (plant.angle[0] < -0.05) == falls
 
 
+@pytest.mark.needs("physics")
 def test_damping_and_friction_of_the_urdf_are_added():
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
     bodies = _plant(rubbed, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.1))
@@ -107,6 +119,7 @@ def test_damping_and_friction_of_the_urdf_are_added():
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
 
+@pytest.mark.needs("physics")
 def test_the_shoulder_feels_what_the_elbow_does():
     joints = (UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, 1))
     # both links stretched out: the lower weight hangs on two levers
@@ -119,12 +132,14 @@ def test_the_shoulder_feels_what_the_elbow_does():
     assert folded.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
+@pytest.mark.needs("physics")
 def test_servos_are_distinguished_by_their_joints_names():
     plant = _plant(TWO, UrdfJoint("elbow", 1.0, -1), UrdfJoint("shoulder", 3.0, 1))
     run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
     assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
 
 
+@pytest.mark.needs("physics")
 def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests():
     text = urdf(
         link("upper"), link("lower"), link("finger"), joint("shoulder", "base", "upper"),
@@ -141,6 +156,7 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_res
     assert plant.angle[2] == alone.angle[0] > 1.5
 
 
+@pytest.mark.needs("physics")
 def test_a_joint_with_a_servo_of_its_own_mimics_nojoint():
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
@@ -152,6 +168,7 @@ def test_a_joint_with_a_servo_of_its_own_mimics_nojoint():
     assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
+@pytest.mark.needs("physics")
 def test_a_servo_that_is_added_later_moves_by_itself():
     make = mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(make(()).angle) == 0
@@ -160,6 +177,7 @@ def test_a_servo_that_is_added_later_moves_by_itself():
     assert plant.angle == pytest.approx([0.0, 2.0], abs=1e-6)
 
 
+@pytest.mark.needs("physics")
 def test_a_joint_is_placed_at_rest():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     run(plant, 0.2)
@@ -169,6 +187,7 @@ def test_a_joint_is_placed_at_rest():
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
 
 
+@pytest.mark.needs("physics")
 def test_two_runs_are_the_same_to_the_last_bit():
     def once() -> list[float]:
         plant = _plant(
@@ -180,6 +199,7 @@ def test_two_runs_are_the_same_to_the_last_bit():
     assert once() == once()
 
 
+@pytest.mark.needs("physics")
 def test_missing_meshes_and_pictures_are_no_error():
     mesh = '<geometry><mesh filename="package://no_package/has/this.stl"/></geometry>'
     shapes = f"<visual>{mesh}</visual><collision>{mesh}</collision>"
@@ -195,6 +215,7 @@ def test_missing_meshes_and_pictures_are_no_error():
     assert plant.angle == pytest.approx([0.0, 0.0], abs=1e-4)
 
 
+@pytest.mark.needs("physics")
 def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
     plant = _plant(
@@ -205,6 +226,7 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     assert plant.angle[0] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.needs("physics")
 def test_the_torso_moves():
     text = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
     joints = (UrdfJoint("left_shoulder_swing_joint", 1.0, -1), UrdfJoint("head_yaw_joint", 2.6, 1))
@@ -213,6 +235,7 @@ def test_the_torso_moves():
     assert np.isfinite(plant.angle).all()
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -240,6 +263,7 @@ def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch):
         mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
 
 
+@pytest.mark.needs("physics")
 def test_a_hand_turns_a_body_evenly():
     mechanics = Mechanics(0, mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),))))
     mechanics.add(ROTOR, NO_LOAD, 0.0)

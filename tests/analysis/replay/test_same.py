@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.anew import command, edited
+from tests.kit.examples import as_parameters
 from tests.kit.stories import differing, replayed, silence
 
 from dxlrun.compile.robot import compile_files
@@ -36,7 +37,7 @@ def motions_for(robot: Path) -> list[Path]:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("robot", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("robot", as_parameters(sorted(ROBOTS.glob("*.yaml"))))
 def test_seconds_of_each_robot_or_as_many_cycles_as_one_of_100_hz_has(robot: Path, tmp_path: Path) -> None:
     """`DXLRUN_REPLAY_S=60` makes it a minute, for the campaign before a release."""
     longest = float(os.environ.get("DXLRUN_REPLAY_S", "4"))

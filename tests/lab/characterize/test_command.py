@@ -28,6 +28,7 @@ def slow_bus(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.needs("report")
 def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
     virtual, real, running = commands_of("experiments.md", "characterize", "\n## characterize")
     done = dxlrun(*virtual)

@@ -150,6 +150,7 @@ def logging_to(log: Path | None) -> Any:
     return SimpleNamespace(name="pair", info=lambda: {"log": log and str(log)})
 
 
+@pytest.mark.needs("identify")
 def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys):
     """One that records none; one that deletes parts and runs, and one that would have to be started."""
     with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):

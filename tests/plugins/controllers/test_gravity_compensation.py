@@ -84,6 +84,7 @@ def rod(name: str, mimic: str = "") -> str:
     )
 
 
+@pytest.mark.needs("physics")
 def test_joints_that_mimic_another_move_and_count_for_it() -> None:
     """A second rod turns twice as far from 0.5 rad on, a third one against that one."""
     shape = '<collision><origin xyz="0 0 9"/><geometry><box size="1 1 1"/></geometry></collision>'
@@ -117,6 +118,7 @@ def needed(q: tuple[float, float], up: np.ndarray = UP, payload: float = 0.0) ->
     return torque
 
 
+@pytest.mark.needs("physics")
 def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
     """The same weight from a motor file's load: m g l sin(q) at a level axis."""
     urdf = URDF[: URDF.index('<joint name="b"')] + "</robot>"
@@ -144,6 +146,7 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
     assert started({"joints": ["a"]}, urdf=urdf, limits={"upper": 0.71}, **one).update(0)[0] == 0.71
 
 
+@pytest.mark.needs("physics")
 def test_what_was_not_heard_yet_is_not_held() -> None:
     robot = started({})
     robot.activate()
@@ -153,6 +156,7 @@ def test_what_was_not_heard_yet_is_not_held() -> None:
     assert np.isfinite(robot.update(0.02, follow=False)).all()
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
 def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> None:
     robot = started({"command_interface": interface}, present=(0.5, -0.4))
@@ -168,6 +172,7 @@ def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> N
     assert command == pytest.approx([0.25 + alone, 0.0])
 
 
+@pytest.mark.needs("physics")
 def test_payload_other_joints_and_orientation_count() -> None:
     more = {
         "joints": ["a"],
@@ -193,6 +198,7 @@ def test_payload_other_joints_and_orientation_count() -> None:
     output(0.0, np.array([0.0, 1.0, 0.0]))
 
 
+@pytest.mark.needs("physics")
 def test_a_velocity_is_passed_on() -> None:
     keys: dict[str, Any] = {"limits": {"velocity": 3.0}}
     robot = started({"command_interface": "posvel"}, **keys)
@@ -234,6 +240,7 @@ def refused(tmp_path: Path) -> Callable[..., list[str]]:
 JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 
 
+@pytest.mark.needs("physics")
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
@@ -265,7 +272,6 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 def test_what_is_missing_is_one_sentence_at_its_place(
     refused: Callable[..., list[str]], tmp_path: Path, change: tuple[str, str, str], at: str, what: str
 ) -> None:
-    pytest.importorskip("mujoco")
     found = [line for line in refused(*change) if "physics: mujoco" not in line]
     lines = [line for line in found if what in line]
     assert lines, found
@@ -285,8 +291,8 @@ def test_without_mujoco_it_is_refused(
     )
 
 
+@pytest.mark.needs("physics")
 def test_a_joint_without_a_weight_is_refused(refused: Callable[..., list[str]], tmp_path: Path) -> None:
-    pytest.importorskip("mujoco")
     for mass in ('"0.15"', '"0.25"'):
         refused("urdf", mass, '"0"')
     (line,) = refused()
