@@ -68,6 +68,7 @@ SILENT = re.compile(
     r"belonged to no packet|is probed once a second|answers again$|(reply was|replies in a row were) lost"
 )
 
+TORQUE_OFF = {"hardware: torque is off on the servo", "torque was switched off again on every servo"}
 Faults = Mapping[int, PacketFault]
 Program = Callable[[float, Faults], tuple[set[str], int]]
 """Runs something on a servo of a protocol whose replies have faults; returns what it reported, each value by
@@ -113,7 +114,10 @@ def start(protocol: float, faults: Faults) -> tuple[set[str], int]:
         rig.hardware.start()
     except StartUpError as error:
         sentences = error.sentences
-    return reported([*sentences, *texts(rig.events.list)]), replies()
+    found = reported([*sentences, *texts(rig.events.list)])
+    if any(text in TORQUE_OFF for text in found):  # after a start that failed: judged by the servo
+        assert not rig.servo(1).registers["torque_enable"]
+    return found - TORQUE_OFF, replies()
 
 
 def look_again(protocol: float, faults: Faults) -> tuple[set[str], int]:
