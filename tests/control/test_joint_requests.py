@@ -277,18 +277,26 @@ def test_a_commanded_joint_that_gets_torque_begins_where_it_is(story):
 
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.UNKNOWN])
 @pytest.mark.parametrize("release", [False, True])
-def test_torque_is_refused_where_a_command_would_be_followed_at_once(story, mode, release):
+def test_torque_on_deactivates_controllers_of_limp_joints_only_with_release(story, mode, release):
     limp = story.shows(1, torque=Torque.OFF, mode=mode)
     story.run(6, {2: [limp, story.torques("j2", "j1", on=True, release=release)]})
-    assert story.what == ([(2, True), (1, True)] if release else [])
+    assert story.what == [(2, True), (1, True)]
     assert story.column("active") == [1, 1] + [0 if release else 1] * 4
-    assert release or story.answer() == COMMANDED
 
 
-def test_joints_with_torque_are_no_reason_to_refuse_it(story):
+def test_torque_on_keeps_controllers_of_joints_with_torque(story):
     driven = story.shows(slice(None), mode=Mode.EFFORT)
-    story.run(5, {2: [driven, story.torques("j0", "j1", "j2", on=True)]})
+    story.run(5, {2: [driven, story.torques("j0", "j1", "j2", on=True, release=True)]})
     assert story.what == [(0, True), (1, True), (2, True)]
+    assert story.column("active") == [1] * 5
+
+
+def test_controller_of_a_joint_that_is_given_torque_begins_again(story):
+    limp, given = story.shows(1, torque=Torque.OFF), story.shows(1, torque=Torque.GIVEN)
+    story.run(12, {3: limp, 5: given, 6: story.shows(1, torque=Torque.ON)})
+    text = "begins again where its joints are: j1 was given torque where it is"
+    assert story.events.texts(EventCode.POLICY) == [text]
+    assert story.column("active") == [1] * 12
 
 
 @pytest.mark.parametrize("torque", [Torque.ON, Torque.OFF, Torque.RELEASED])

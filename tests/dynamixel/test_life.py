@@ -42,7 +42,7 @@ def one():
 
 def put(servo, state):
     servo.states[0] = state
-    servo.losses = {0: life.Loss(True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
+    servo.losses = {0: life.Loss(True, True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
     servo.reads.away[0] = state is ServoState.OFFLINE
 
 
@@ -79,7 +79,7 @@ def test_no_state_gets_goals_but_by_torque_that_was_read():
 def test_a_servo_that_its_watchdog_stopped_follows_no_goal_at_full_speed():
     """Its goal may have moved on meanwhile: it is limp, or returns slowly."""
     after = {TRANSITIONS[state][event] for state, event in LEGAL if event is ServoEvent.WATCHDOG}
-    assert after == life.POWERLESS | {ServoState.STOPPED}
+    assert after == life.POWERLESS | {ServoState.STOPPED, ServoState.GIVEN}
 
 
 def test_a_released_servo_gets_no_goals_on_any_way_but_a_return_or_a_request():
@@ -153,6 +153,10 @@ class Story:
             self.rig.cycles(5)
         elif state is ServoState.OFFLINE:
             self.lose()
+        elif state is ServoState.GIVEN:
+            self.reset()
+            self.rig.anchors = False
+            self.rig.hardware.switch_torque(1, True)
         elif state in (ServoState.RETURNING, ServoState.STOPPED):
             self.rig.goals.position[1] += 1.0
             self.lose()
@@ -186,17 +190,7 @@ class Story:
             for _ in range(30):
                 self.miss()
             return
-        self.servo.silence(False)  # lost while it changes its mode
-        self.until(ServoState.TORQUED)
-        hardware, clock = self.rig.hardware, self.rig.clock
-        self.rig.set_modes(0, Mode.VELOCITY, 0)
-        self.servo.silence()
-        for _ in range(30):
-            deadline_ns = clock.now_ns() + self.rig.period_ns
-            hardware.read()
-            hardware.write()
-            hardware.idle(deadline_ns - 1_000_000)
-            clock.wait_until(deadline_ns)
+        self.rig.hardware.stop()
 
     def watchdog(self):
         if self.state is ServoState.LIMP:
@@ -218,9 +212,24 @@ class Story:
         self.rig.buses[0].plug_in()
         self.rig.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
 
-    def returned(self):
+    def torque_given(self):
         if self.state is ServoState.LIMP:
             self.requested()
+        elif self.state is ServoState.OFFLINE:
+            self.lost()
+        else:
+            self.rig.set_modes(0, Mode.VELOCITY, 0)
+        self.servo.silence(False)
+        for _ in range(60):
+            self.rig.cycle()
+            if self.state is ServoState.GIVEN and self.rig.states.mode[1] != Mode.UNKNOWN:
+                return
+
+    def anchored(self):
+        self.rig.anchors = True
+        self.rig.cycle()
+
+    def returned(self):
         self.servo.silence(False)
         self.until(ServoState.RETURNING)
 

@@ -169,6 +169,9 @@ class Hardware:
     def idle(self, until_ns: int) -> None:
         pass
 
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        pass
+
     def set_modes(self, modes: np.ndarray) -> None:
         self.asked.append(modes.tolist())
         self._coming = {}

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tests.kit.decoded import decode_packets
 from tests.kit.line_faults import corrupt_next, truncate_next
 
-from dxlrun.channels.cycle import Commands, SourceStates, States
+from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover
@@ -105,10 +105,12 @@ class Rig:
     device_commands: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     restless: float = 0.0
     """rad by which every goal goes to and fro, so that each is sent in every cycle: what stays is not."""
+    anchors: bool = True  # Joints that were given torque get their goals, as the loop does
 
     def cycle(self, *, idle: bool = True) -> None:
         start = self.clock.now_ns()
         self.hardware.read()
+        self.anchor()
         self.restless = -self.restless
         self.goals.position[:] += self.restless
         self.hardware.write()
@@ -117,6 +119,13 @@ class Rig:
             self.hardware.idle(deadline)
         assert self.clock.now_ns() <= deadline or not idle
         self.clock.wait_until(deadline)
+
+    def anchor(self) -> None:
+        """Set the goals of joints that were given torque to where they are, as the loop does."""
+        given = (self.states.torque == Torque.GIVEN) & self.states.valid
+        if given.any() and self.anchors:
+            np.copyto(self.goals.position, self.states.position, where=given)
+            self.hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def cycles(self, count: int) -> None:
         for _ in range(count):

@@ -18,7 +18,6 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -94,8 +93,9 @@ def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run):
     back = one.ask(1300, "switch", activate=["arm"], deactivate=[])
     log = one.run()
     assert all(isinstance(one.answer(number), Done) for number in (off, on, back))
-    assert one.torque(log, 1) == [Torque.ON, Torque.RELEASED, Torque.ON] or one.torque(log, 1) == [
-        Torque.ON, Torque.RELEASED, Torque.OFF, Torque.ON,
+    shown = one.torque(log, 1)
+    assert [torque for torque in shown if torque not in (Torque.OFF, Torque.DOUBT)] == [
+        Torque.ON, Torque.RELEASED, Torque.GIVEN, Torque.ON,
     ]  # fmt: skip
     assert one.torque(log, 0) == one.torque(log, 2) == [Torque.ON]
     position, goal = log.cycles["position"][:, 1], log.cycles["goal_position"][:, 1]
@@ -257,8 +257,8 @@ def test_a_reboot_that_never_ends_is_a_loss(run):
     assert not judge(totals).good
 
 
-def test_torque_comes_back_softly_while_a_controller_goes_on(run):
-    """A servo that rebooted is moved by hand and gets torque: the first goal is where it stands."""
+def test_joint_holds_where_it_is_when_torque_is_requested_under_an_active_controller(run):
+    """A servo that rebooted is turned by hand and gets torque: the old command does not move it."""
     one = run(duration_s=2.5)
     bus = one.robot.buses[0]
     servo = bus.servo(2)
@@ -273,11 +273,8 @@ def test_torque_comes_back_softly_while_a_controller_goes_on(run):
     given = log.cycles["torque"][:, 1] == Torque.ON
     late = given & (log.cycles["cycle"] > 100)
     first = int(np.flatnonzero(late)[0])
-    goal, stands = log.cycles["goal_position"][:, 1], 2.5 - np.pi
-    assert abs(goal[first] - stands) < 0.02
-    assert np.abs(np.diff(goal[first:])).max() <= SLOW_SPEED * 0.01 + 1e-9
-    assert np.abs(np.diff(log.cycles["position"][first:, 1])).max() < 0.02
-    assert abs(goal[-1]) < abs(stands)  # and goes where its controller commands
+    for shown in ("goal_position", "position"):
+        assert np.abs(log.cycles[shown][first:, 1] - (2.5 - np.pi)).max() < 0.005
 
 
 PLAYER = ROBOT.replace(

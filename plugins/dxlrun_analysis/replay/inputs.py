@@ -148,6 +148,9 @@ class RecordedHardware:
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
         """Switch nothing and report nothing: the states have the result."""
 
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        """Send nothing: the states have the result."""
+
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
         """Reboot nothing and report nothing: the states have the result."""
 

@@ -93,6 +93,8 @@ class Torque(IntEnum):
     """It is not known: the servo is lost."""
     REBOOTING = 6
     """The servo reboots because a client requested it: that it is silent is no loss."""
+    GIVEN = 7
+    """It was just given torque where it is: the loop's goal becomes that, and its controllers start again."""
 
 
 LIMP = (Torque.OFF, Torque.RELEASED)
@@ -147,7 +149,7 @@ class States:
         for row in rows:
             if not self.valid.item(row):
                 return row, "has not answered"
-            if self.torque.item(row) == Torque.DOUBT:
+            if self.torque.item(row) in (Torque.DOUBT, Torque.GIVEN):
                 return row, "has not confirmed its torque"
         return None
 

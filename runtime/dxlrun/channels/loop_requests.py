@@ -53,8 +53,8 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle; those of positions may stay when
-    torque is switched on."""
+    """Deactivate the controllers that command the joints, in the same cycle. Without it torque off is refused
+    while there are any; torque on starts them again where the joints are."""
 
 
 class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -61,6 +61,12 @@ class Hardware(Protocol):
         from the next read on.
         """
 
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        """Let joints that were just given torque (`Torque.GIVEN`) get goals from this cycle's write on.
+
+        The loop has set their goals to where the joints are; until this call they get none.
+        """
+
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
         """Reboot a joint's servo in idle time; `done` is called when it is in order again, or is given up."""
 

@@ -160,20 +160,24 @@ class Gate:
             self._joints[known][rows] = self._record.goals.position[rows]
 
     def enter_modes(self) -> None:
-        """Give the joints whose mode has changed goals that move nothing in the new one; after a read.
+        """Anchor the joints whose mode has changed; after a read."""
+        changed = self._record.states.mode != self._joints["mode"]
+        self._take_modes()
+        self.anchor(changed)
 
-        A joint that is led to a position holds where it is, and follows its next commands slowly.
+    def anchor(self, rows: NDArray[np.bool_]) -> None:
+        """Give these joints goals that move nothing: the measured position, or 0, by their mode.
+
+        They are at rest, and follow their next commands slowly for a second. `rows`: shape (joints,).
         """
         states, goals = self._record.states, self._record.goals
-        changed = states.mode != self._joints["mode"]
-        self._take_modes()
-        goals.values[:, changed] = np.nan
+        goals.values[:, rows] = np.nan
         led = np.isin(states.mode, (Mode.POSITION, Mode.EFFORT_POSITION))
-        np.copyto(goals.position, states.position, where=changed & led)
+        np.copyto(goals.position, states.position, where=rows & led)
         for mode, interface in _NEUTRAL.items():
-            getattr(goals, interface)[changed & (states.mode == mode)] = 0.0
-        self._rest(changed)
-        self.ease_in(np.flatnonzero(changed).tolist())
+            getattr(goals, interface)[rows & (states.mode == mode)] = 0.0
+        self._rest(rows)
+        self.ease_in(np.flatnonzero(rows).tolist())
 
     def ease_in(self, rows: Sequence[int] | None = None) -> None:
         """Limit the steps of the coming second to SLOW_SPEED, of all joints or of these rows.

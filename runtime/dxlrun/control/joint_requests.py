@@ -16,10 +16,7 @@ from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
-
-_LED = (Mode.POSITION, Mode.EFFORT_POSITION)
 
 
 class _Pending(msgspec.Struct):
@@ -88,8 +85,8 @@ class JointRequests:
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
-            abrupt = self._abrupt(rows)
-            released = self._release(abrupt, self._switching.commanding(abrupt), request.release, time_ns)
+            names = self._switching.commanding(self._limp(rows)) if request.release else ()
+            released = self._release(rows, names, request.release, time_ns)
         else:
             released = self._release(rows, self._switching.stopped_by(rows), request.release, time_ns)
         if isinstance(released, Refusal):
@@ -161,15 +158,9 @@ class JointRequests:
     def _labels(self, joints: Sequence[str]) -> tuple[str, ...]:
         return tuple(self._joints[self._rows[joint]].label for joint in joints)
 
-    def _abrupt(self, rows: dict[str, int]) -> dict[str, int]:
-        """Return the limp joints that would follow a controller's commands at once when they get torque.
-
-        Goal positions begin where a joint stands, and move slowly from there; a velocity or an effort that is
-        commanded has no such beginning.
-        """
-        states = self._record.states
-        limp = {joint: row for joint, row in rows.items() if states.torque[row] in LIMP}
-        return {joint: row for joint, row in limp.items() if states.mode[row] not in _LED}
+    def _limp(self, rows: dict[str, int]) -> dict[str, int]:
+        torque = self._record.states.torque
+        return {joint: row for joint, row in rows.items() if torque[row] in LIMP}
 
     def _release(
         self, rows: dict[str, int], names: tuple[str, ...], release: bool, time_ns: int

@@ -16,6 +16,7 @@ from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States,
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.clock import Clock
 from dxlrun.contract.hardware import Hardware
+from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
@@ -109,6 +110,7 @@ class Loop:
     """None: the robot has none, or a replay's record has them already."""
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
+    _anchoring: Anchoring = field(init=False)
     _overruns: Overruns = field(init=False)
     _paused_cycles: int = field(default=0, init=False)
     _time_ns: int = field(default=0, init=False)
@@ -138,6 +140,7 @@ class Loop:
             if one.on_lost == "stop"
         )
         joints, switching = self.plan.joints, self.manager.switching
+        self._anchoring = Anchoring(joints, self.hardware, switching, self.gate, self.record)
         self.steering = Steering(
             self.inbox,
             self.plan,
@@ -145,6 +148,7 @@ class Loop:
             JointRequests(joints, self.hardware, switching, self.record, self._answer),
             Halt(joints, switching, self.record, self._answer),
             self.gate,
+            self._anchoring,
             self.schedule,
             self.record,
             self.events,
@@ -243,6 +247,8 @@ class Loop:
         read_ns = now_ns()
         if record.states.mode.tobytes() != self.gate.modes:
             self.gate.enter_modes()
+        if Torque.GIVEN in record.states.torque.tobytes():
+            self._anchoring.anchor_given(max(self._time_ns, time_ns))
         valid = record.states.valid
         all_valid = valid.tobytes() == self._all_valid
         if self._motion:
@@ -316,7 +322,7 @@ class Loop:
         if not motion.over:
             self._log_policy(name, policy.text)
             if self.steering.paused_until_ns:
-                self.steering.resume()
+                self.steering.resume(self._time_ns)
             self._motion = motion
             try:
                 while not motion.over:

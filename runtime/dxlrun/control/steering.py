@@ -27,6 +27,7 @@ from dxlrun.channels.loop_requests import (
     TorqueRequest,
     Unload,
 )
+from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
@@ -91,6 +92,7 @@ class Steering:
     joints: JointRequests
     halt: Halt
     gate: Gate
+    anchoring: Anchoring
     schedule: Schedule
     record: CycleRecord
     events: EventSink
@@ -147,7 +149,7 @@ class Steering:
             if answer is not None:
                 self.inbox.answer(command.number, answer)
         if 0 < self.paused_until_ns < record.woken_ns:
-            self.resume()
+            self.resume(time_ns)
             what = "its controllers are deactivated, and the joints are held"
             if not (ends := self._stale("no client ended the pause")):
                 commanding = manager.switching.commanding(record.layout.joints)
@@ -210,15 +212,17 @@ class Steering:
         if self.paused:
             return Refusal(Code.PAUSED_ALREADY)
         self.stood = True
+        self.anchoring.begin_pause()
         self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
         self._set_cycle_limit()
         return None
 
-    def resume(self) -> Refusal | None:
+    def resume(self, time_ns: int) -> Refusal | None:
         """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
         if not self.paused:
             return Refusal(Code.NOT_PAUSED)
         self.paused_until_ns = 0
+        self.anchoring.end_pause(time_ns)
         self.gate.ease_in()
         self._set_cycle_limit()
         return None
@@ -290,7 +294,7 @@ class Steering:
             case _ if command.kind == "pause":
                 found = self.pause()
             case _ if command.kind == "resume":
-                found = self.resume()
+                found = self.resume(time_ns)
             case _:
                 self.finish()
         return found

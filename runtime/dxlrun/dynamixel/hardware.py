@@ -290,6 +290,12 @@ class DynamixelHardware:
         servos, index = self._place(row)
         (servos.requests.torque_on if on else servos.requests.torque_off)(index, done)
 
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        """Let the servos of joints that were given torque get goals; see `Servos.follow_goals`."""
+        for row in rows:
+            servos, index = self._place(row)
+            servos.follow_goals(index)
+
     def reboot(self, row: int, done: Done) -> None:
         """Reboot a joint's servo in idle time; see `Requests`."""
         servos, index = self._place(row)

@@ -195,6 +195,15 @@ class ServoPlan(msgspec.Struct, frozen=True):
         """Write a position of the joint, rad or m, for a person: `12.3 deg`, `4.56 mm`."""
         return f"{position * 1e3:.2f} mm" if self.linear else f"{math.degrees(position):.1f} deg"
 
+    def outside_limits(self, raw: int, lower_tick: int, upper_tick: int) -> str:
+        """Return the problem and its fix for a position outside limits, all in ticks; follows the name."""
+        first, last = sorted(map(self.joint_position, (lower_tick, upper_tick)))
+        lower = self.position_text(first).partition(" ")[0]  # the unit follows the upper limit
+        return (
+            f"stands at {self.position_text(self.joint_position(raw))}, outside its limits "
+            f"{lower}..{self.position_text(last)}: move the joint inside by hand"
+        )
+
     def step_text(self, step: float) -> str:
         """Write a step of the joint, rad or m: `12 deg`, `5 mm`."""
         return f"{step * 1e3:.0f} mm" if self.linear else f"{math.degrees(step):.0f} deg"

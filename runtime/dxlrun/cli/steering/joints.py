@@ -42,7 +42,8 @@ def torque(
     """Switch the torque of joints on or off while the robot runs: `dxlrun torque off elbow_joint`.
 
     Off: the joint is limp, and stays so whatever policies say. On: its servo is checked as at the start, and
-    holds where it stands. Returns when that was read back.
+    holds where it is; a controller that commands the joint begins again there. Returns when the torque was
+    read back.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def torque(
     joints
         Joints; the name of a group or controller means its joints, `all` every joint.
     release
-        Deactivate the controllers that command the joints; without it they are a reason to refuse.
+        Deactivate the controllers that command the joints; without it they are a reason to refuse `off`.
     """
     names = _named(joints)
     with robot_of(chosen, f"torque {state}") as robot:

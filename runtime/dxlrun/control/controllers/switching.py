@@ -133,6 +133,29 @@ class Switching:
         self._events.emit(EventCode.TAKEOVER, Severity.WARNING, requester, text)
         self._take(step, time_ns, None, f"{requester}: {why}")
 
+    def restart(self, joints: Collection[str], why: str, time_ns: int) -> None:
+        """Activate again every active controller that commands one of these joints, with those above it.
+
+        Each begins where its joints and their goals are now. Its goal is aborted with the reason `why`. The
+        commands of one whose stream ended stay withheld.
+        """
+        again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
+        withheld = [managed for managed in again if managed.withheld]
+        for managed in again:
+            text = f"begins again where its joints are: {why}"
+            self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
+            self._deactivate(managed, time_ns, why)
+        if self.fault is not None:
+            return
+        named = {managed.plan.name: managed for managed in again}
+        names = [name for name in lowers_first(list(named), self.standing.known) if name in named]
+        failed: list[_Failed] = []
+        self._activate_all([named[name] for name in names], time_ns, failed)
+        self._fall_back_all(failed, time_ns)
+        for managed in withheld:
+            if managed.active:
+                managed.hold(time_ns)
+
     def end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
         """Take a controller that broke its contract out of the robot, and let a fallback take over.
 

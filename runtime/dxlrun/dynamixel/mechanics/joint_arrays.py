@@ -16,6 +16,7 @@ from dxlrun.plan.mechanics_plan import MechanicsPlan
 _WORSE: tuple[Torque, ...] = (
     Torque.ON,
     Torque.DOUBT,
+    Torque.GIVEN,
     Torque.RELEASED,
     Torque.OFF,
     Torque.REBOOTING,
@@ -70,7 +71,8 @@ class JointArrays:
         self.residual: Floats = np.zeros((count, servos))
         """How far each servo is from where the joints would have it, rad or m: s - M^+ M s."""
         self._offset: Floats = np.zeros((count, servos))
-        self._fade = 0.0
+        self._fade: Floats = np.zeros((count, 1))
+        """The part of `_offset` that is in the servos' goals still."""
         self._last_goal: Floats = np.full((count, joints), np.nan)
         self._last_speed: Floats = np.full((count, joints), np.nan)
         self._speeds: Floats = np.full((count, servos), np.nan)
@@ -87,11 +89,19 @@ class JointArrays:
         self.goals.values[:, self._rows] = found[:, self._coupling, self._column]
         self._offset[:] = given[0] - self._times(self._inverse, found[0])
         self._offset[~np.isfinite(self._offset)] = 0.0
-        self._fade = 1.0
+        self._fade.fill(1.0)
 
     def fade(self, share: float) -> None:
-        """Take a share of what servos disagreed by at the start from their goals, until they are equal."""
-        self._fade = max(0.0, self._fade - share)
+        """Take a share of what servos disagreed by from their goals, until they agree."""
+        np.maximum(0.0, self._fade - share, out=self._fade)
+
+    def anchor(self, index: int) -> None:
+        """Let the servos of a coupling hold where each is when the goals of its joints are where these are.
+
+        Servos that disagree a little keep that for the moment: `fade` takes it from them.
+        """
+        self._offset[index] = np.nan_to_num(self.residual[index])
+        self._fade[index] = 1.0
 
     def read(self) -> None:
         """Fill the joints' states from those of the servos."""

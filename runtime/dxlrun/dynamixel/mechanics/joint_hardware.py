@@ -21,7 +21,7 @@ FADE_NS = 1_000_000_000
 """In which time servos that disagree a little at the start are brought together: 1.5 deg a second at most by
 default."""
 AGREES = 0.7  # Part of the tolerance below which servos that disagreed agree again
-_HAS_TORQUE = (Torque.ON, Torque.DOUBT)
+_HAS_TORQUE = (Torque.ON, Torque.DOUBT, Torque.GIVEN)
 
 Done = Callable[[str], None]
 RegisterDone = Callable[[str, int | None], None]
@@ -273,6 +273,13 @@ class JointHardware:
             done(problem)
         else:
             self._ask(index, "on" if on else "off", servos, done)
+
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        """Let the servos of joints that were given torque get goals; each begins where it is."""
+        for index in dict.fromkeys(self._coupling(row) for row in rows):
+            if index is not None:
+                self._arrays.anchor(index)
+        self._hardware.follow_goals([servo for row in rows for servo in self._plan.servo_rows(row)])
 
     def reboot(self, row: int, done: Done) -> None:
         """Reboot all servos of a joint."""

@@ -438,12 +438,7 @@ def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
         return f"reports position {raw}, beyond its {servo.max_tick} ticks"
     if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
         return ""
-    first, last = sorted(map(servo.joint_position, (servo.lower_tick, servo.upper_tick)))
-    lower = servo.position_text(first).partition(" ")[0]  # the unit stands behind the upper one
-    return (
-        f"stands at {servo.position_text(servo.joint_position(raw))}, outside its limits "
-        f"{lower}..{servo.position_text(last)}: move the joint inside by hand"
-    )
+    return servo.outside_limits(raw, servo.lower_tick, servo.upper_tick)
 
 
 def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> str:

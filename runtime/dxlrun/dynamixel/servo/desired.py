@@ -19,7 +19,7 @@ from dxlrun.dynamixel.exchange.idle import Urgency
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.servo.life import Life, ServoEvent
+from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import compare, merged, settle
 from dxlrun.dynamixel.servo.torque_limits import unlimit
@@ -53,6 +53,10 @@ class DesiredState:
     def mode(self, index: int) -> Mode:
         """Return the mode in which a servo is, or shall be as soon as it can."""
         return self._modes[index]
+
+    def mode_shown(self, index: int) -> Mode:
+        """Return the mode that the robot's states show; UNKNOWN while the mode changes."""
+        return self._goals.modes[index]
 
     def resting(self, index: int) -> tuple[int, bytes] | None:
         """Return where a servo that is led to no position has its goal, and that of standing still."""
@@ -124,11 +128,7 @@ class DesiredState:
             return
         if problem:
             mode = yield from modes.mode_now(one)
-            life.on(index, ServoEvent.DOUBT)
-        else:
-            torque = yield from one.read_torque()
-            if not (torque.answered and torque.parameters[0] == 1):
-                life.on(index, ServoEvent.DOUBT)  # lost unnoticed, and a goal may switch it on
+        life.give_torque(index)
         self._changing[index] = False
         if problem:
             life.report(EventCode.MODE, Severity.ERROR, index, f"{problem}; it is in {_words(mode)}")

@@ -5,10 +5,15 @@
                        | watchdog         | watchdog    ^
                        v                  v             | caught up
                     STOPPED <-------------'             |
-                     ^    '-- torque on --> RETURNING --'     doubt, watchdog: back to STOPPED
-                     | returned
+                     ^ ^  '-- torque on --> RETURNING --'     doubt, watchdog: back to STOPPED
+            anchored | | returned
+      torque given -> GIVEN
       lost ---> OFFLINE -- returned limp --> LIMP
-      release -> RELEASED -- requested --> LIMP -- returned --> STOPPED
+      release -> RELEASED -- requested --> LIMP -- torque given --> GIVEN
+
+TORQUE_GIVEN is the one way to torque after the start, from any state but RELEASED. Only `modes.hold` writes
+torque on: it sets the goal to the measured position first. The servo then gets no goal until the loop's goal
+is where the joint is, too (ANCHORED), and its torque was read once more.
 
 What drives it are programs, generators that yield transactions to a bus and end in an event:
 
@@ -16,17 +21,17 @@ What drives it are programs, generators that yield transactions to a bus and end
 |---|---|---|
 | start-up: check, set up, hold, confirm | `startup.py`, `checks.py` | ENGAGED, TORQUE_ON |
 | read torque enable, hardware error, torque limit | `servos.py` | TORQUE_ON, TORQUE_OFF, DOUBT, LOST |
-| probe an offline servo, and take it back | `offline.py` | RETURNED (then TORQUE_ON) or RETURNED_LIMP |
+| probe an offline servo, and take it back | `offline.py` | TORQUE_GIVEN; RETURNED, TORQUE_ON; RETURNED_LIMP |
 | read Realtime Tick, which shows a reboot | `offline.py`, `slow_registers.py` | LOST |
 | switch torque off, until it is requested | `requests.py` | RELEASE, then LOST where it fails |
-| switch torque on at a client's request | `requests.py` | REQUESTED; RETURNED (then TORQUE_ON) or RELEASE |
+| switch torque on at a client's request | `requests.py` | REQUESTED; TORQUE_GIVEN or RELEASE |
 | reboot at a client's request | `requests.py` | LOST; its return is that of an offline servo |
-| change a mode | `desired.py`, `modes.py` | DOUBT where torque was not confirmed |
+| change a mode | `desired.py`, `modes.py` | TORQUE_GIVEN; DOUBT where the mode is not confirmed |
 | revive a servo its watchdog stopped | `watchdog_monitor.py` | WATCHDOG, then LOST where it fails |
 
 The cyclic exchange itself has three events: a lost reply is DOUBT, many in a row are LOST, and a position
-near the goal is CAUGHT_UP. Which servos get goals, how fast they may follow them, and which are read in a
-cycle follows from the state, and is changed nowhere else.
+near the goal is CAUGHT_UP. The loop has one: ANCHORED. Which servos get goals, how fast they may follow them,
+and which are read in a cycle follows from the state, and is changed nowhere else.
 """
 
 from __future__ import annotations
@@ -61,6 +66,8 @@ class ServoState(Enum):
     """As HOLDING, after its watchdog stopped it or it was offline: it will go to its goal slowly."""
     RETURNING = "returning"
     """Has torque for certain, and goes to its goal at RETURN_SPEED at most, until it has caught up."""
+    GIVEN = "given torque"
+    """Has torque again, and holds where it is: it gets no goals before the loop's goals are there, too."""
     OFFLINE = "offline"
     """Out of the cyclic reads; probed now and then, and taken back when it is in order."""
     RELEASED = "released"
@@ -82,48 +89,59 @@ class ServoEvent(Enum):
     CAUGHT_UP = "caught up"  # It is near its goal again
     LOST = "lost"
     """It leaves the cyclic reads: silent, rebooted, its line was gone, or it cannot be trusted."""
-    RETURNED = "returned"  # It is in order again, and its torque is on
+    RETURNED = "returned"  # It takes part again, and kept its torque and its goal meanwhile
     RETURNED_LIMP = "returned limp"  # It is in order again, without torque
+    TORQUE_GIVEN = "torque given"
+    """Its torque was switched on where it is, or it has torque with a goal that this run did not give it."""
+    ANCHORED = "anchored"  # The loop's goals for it are where it is
     REQUESTED = "requested"
-    """A client requests torque: RETURNED follows when it is there, RELEASE when the servo is not in order."""
+    """A client requests torque: TORQUE_GIVEN follows, or RELEASE when the servo cannot get it."""
     RELEASE = "release"  # A client, a policy or the robot file switches its torque off
 
 
 _ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
 """From every state in which a servo is read."""
+_ENGAGED = {**_ONLINE, ServoEvent.TORQUE_GIVEN: ServoState.GIVEN}
+"""From every state in which a servo may have torque."""
 _S, _E = ServoState, ServoEvent
 
 TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
     {
         _S.LIMP: {
-            **_ONLINE,
+            **_ENGAGED,
             **dict.fromkeys((_E.REQUESTED, _E.TORQUE_OFF, _E.DOUBT, _E.WATCHDOG), _S.LIMP),
             _E.ENGAGED: _S.HOLDING,
-            _E.RETURNED: _S.STOPPED,
         },
         _S.HOLDING: {
-            **_ONLINE,
+            **_ENGAGED,
             _E.DOUBT: _S.HOLDING,
             _E.TORQUE_ON: _S.TORQUED,
             _E.TORQUE_OFF: _S.LIMP,
             _E.WATCHDOG: _S.STOPPED,
         },
-        _S.TORQUED: {**_ONLINE, _E.DOUBT: _S.HOLDING, _E.WATCHDOG: _S.STOPPED},
+        _S.TORQUED: {**_ENGAGED, _E.DOUBT: _S.HOLDING, _E.WATCHDOG: _S.STOPPED},
         _S.STOPPED: {
-            **_ONLINE,
+            **_ENGAGED,
             **dict.fromkeys((_E.DOUBT, _E.WATCHDOG), _S.STOPPED),
             _E.TORQUE_ON: _S.RETURNING,
             _E.TORQUE_OFF: _S.LIMP,
         },
         _S.RETURNING: {
-            **_ONLINE,
+            **_ENGAGED,
             **dict.fromkeys((_E.DOUBT, _E.WATCHDOG), _S.STOPPED),
             _E.CAUGHT_UP: _S.TORQUED,
+        },
+        _S.GIVEN: {
+            **_ENGAGED,
+            **dict.fromkeys((_E.DOUBT, _E.WATCHDOG), _S.GIVEN),
+            _E.TORQUE_OFF: _S.LIMP,
+            _E.ANCHORED: _S.STOPPED,
         },
         _S.OFFLINE: {
             # of RELEASE, `Loss.released` is kept until the servo is back
             **dict.fromkeys((_E.DOUBT, _E.LOST, _E.RELEASE), _S.OFFLINE),
             _E.RETURNED: _S.STOPPED,
+            _E.TORQUE_GIVEN: _S.GIVEN,
             _E.RETURNED_LIMP: _S.LIMP,
         },
         _S.RELEASED: {
@@ -143,6 +161,7 @@ _SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE)
 _SHOWN: Mapping[ServoState, Torque] = {
     **dict.fromkeys(GETS_GOALS, Torque.ON),
     **dict.fromkeys(IN_DOUBT, Torque.DOUBT),
+    ServoState.GIVEN: Torque.GIVEN,
     ServoState.LIMP: Torque.OFF,
     ServoState.OFFLINE: Torque.LOST,
     ServoState.RELEASED: Torque.RELEASED,
@@ -170,6 +189,7 @@ class Loss(msgspec.Struct):
 
     had_torque: bool
     """It had torque when it was lost: torque that is off now shows a reboot, where no clock does."""
+    kept_goal: bool  # Its goal is the last one that the loop sent
     limp_reported: bool  # That it has no torque was reported already
     released: bool  # It is to be RELEASED when it is back
     rebooted: bool  # A reboot was counted since it took part
@@ -177,6 +197,11 @@ class Loss(msgspec.Struct):
     probing: bool = False  # A probe is under way, or waits for idle time
     problem: str = ""  # Why it could not be taken back, as reported last
     reboot: RequestedReboot | None = None  # The client's request that it is offline for
+
+    @property
+    def kept_torque(self) -> bool:
+        """True where torque that is still on is the torque that the servo had, with the goal that it had."""
+        return self.had_torque and self.kept_goal and not self.rebooted
 
 
 class Life:
@@ -224,6 +249,13 @@ class Life:
             self.reads.join(index)
         return after
 
+    def give_torque(self, index: int) -> None:
+        """Record that `modes.hold` gave a servo torque where it is; of a lost one: its goal is another."""
+        if self.offline(index):
+            self.losses[index].kept_goal = False
+        elif self.states[index] not in POWERLESS:
+            self.on(index, ServoEvent.TORQUE_GIVEN)
+
     def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
         """Take a servo out of the exchange, to be probed after a while until it is in order."""
         self.on(index, ServoEvent.LOST)
@@ -252,6 +284,7 @@ class Life:
         powerless = before in POWERLESS if earlier is None else earlier.limp_reported
         return Loss(
             had_torque=not powerless,
+            kept_goal=before is not ServoState.GIVEN if earlier is None else earlier.kept_goal,
             limp_reported=powerless,
             released=before is ServoState.RELEASED if earlier is None else earlier.released,
             rebooted=earlier is not None and earlier.rebooted,

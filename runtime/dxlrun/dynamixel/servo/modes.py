@@ -181,7 +181,7 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
         beyond = abs(position - present)
         unwound = servo.continuous and beyond * servo.rad_per_tick > FARTHEST_INWARD
         if beyond > 1 and (unwound or not inward):
-            return Held("stands outside its limits, or left them before torque was switched on")
+            return Held(servo.outside_limits(present, mode.lower_tick, mode.upper_tick))
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
         most_effort, problem = yield from _most_effort(one, mode)

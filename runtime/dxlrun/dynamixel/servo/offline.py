@@ -157,18 +157,22 @@ class Offline:
         return self.life.plan.servos[index].torque_on_return and not self.reboots.exhausted(index)
 
     def _take_back(self, index: int, loss: Loss, torqued: bool, mode: Mode) -> None:
-        life = self.life
-        life.on(index, ServoEvent.RETURNED if torqued else ServoEvent.RETURNED_LIMP)
+        life, how = self.life, "limp: it gets no goals"
+        if loss.released or not torqued:
+            life.on(index, ServoEvent.RETURNED_LIMP)
+        elif loss.kept_torque and self.desired.mode_shown(index) is mode:
+            life.on(index, ServoEvent.RETURNED)
+            life.on(index, ServoEvent.TORQUE_ON)
+            how = "with the torque and the goal that it kept"
+        else:
+            life.on(index, ServoEvent.TORQUE_GIVEN)
+            how = "holding where it is"
         self.desired.returned(index, mode)
-        holds = torqued and not loss.released
-        how = "holding where it stands" if holds else "limp: it gets no goals"
         life.report(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
         if loss.released:
             life.on(index, ServoEvent.RELEASE)
             if torqued:
                 self.switch_off(index, ignore)
-        elif holds:
-            life.on(index, ServoEvent.TORQUE_ON)
         if not (torqued or loss.limp_reported or loss.released):
             life.report_limp(index, 0)
         problem = "" if loss.rebooted else "answers, but did not start anew"

@@ -1,8 +1,8 @@
 """Requests of clients for single servos of one bus: torque on or off, reboot; carried out in idle time.
 
-Torque is switched on as for a servo that returns: check, registers, mode, goal := where it stands, torque,
-read back, Bus Watchdog; it then goes to its goal slowly. A servo without torque on request stays so whatever
-happens to it, until it is requested.
+Torque is switched on as for a servo that returns: check, registers, mode, goal := measured position, torque,
+read back, Bus Watchdog. The loop's goal becomes the measured position, too. A servo without torque on request
+stays so whatever happens to it, until it is requested.
 """
 
 from __future__ import annotations
@@ -73,10 +73,9 @@ class Requests:
             life.on(index, ServoEvent.RELEASE)
             yield from self._offline.limp(index)
         else:
-            life.on(index, ServoEvent.RETURNED)
+            life.on(index, ServoEvent.TORQUE_GIVEN)
             self._desired.returned(index, mode)
-            life.on(index, ServoEvent.TORQUE_ON)
-            text = "has torque, as requested: it holds where it stands"
+            text = "has torque, as requested: it holds where it is"
             life.report(EventCode.TORQUE_ON, Severity.INFO, index, text)
         if problem:
             life.report(EventCode.TORQUE_ON, Severity.WARNING, index, f"gets no torque: it {problem}")

@@ -137,7 +137,7 @@ class Servos:
         """Report that the line is back: its servos were without a host, and maybe without power."""
         self._line_lost = False
         for index in range(len(self._rows)):
-            self.life.lose(index)
+            self.life.lose(index).kept_goal = False
         self.devices.found()
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
@@ -174,13 +174,21 @@ class Servos:
             self._report_errors()
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
-        """Let the returning servos that have caught up follow their goals as fast as these say."""
+        """Let the returning servos that have caught up follow their goals as fast as these say.
+
+        A servo that follows no position has nothing to catch up with.
+        """
         if ServoState.RETURNING not in self.life.states:
             return
         for index, (row, servo) in enumerate(zip(self._rows, self._plan.servos, strict=True)):
             off = abs(goals.position[row] - states.position[row])
-            if self.life.states[index] is ServoState.RETURNING and off < CAUGHT_UP * servo.ratio:
+            if self.life.states[index] is ServoState.RETURNING and not off >= CAUGHT_UP * servo.ratio:
                 self.life.on(index, ServoEvent.CAUGHT_UP)
+
+    def follow_goals(self, index: int) -> None:
+        """Let a servo that was given torque get goals, as soon as its torque was read once more."""
+        if self.life.states[index] is ServoState.GIVEN:
+            self.life.on(index, ServoEvent.ANCHORED)
 
     def _count_losses(self, now_ns: int) -> None:
         life, missed = self.life, self.reads.missed

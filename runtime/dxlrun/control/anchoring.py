@@ -1,0 +1,72 @@
+"""Anchoring: joints that may have been moved without the loop begin again where they are.
+
+Decided by the record of the cycle, so that a replay decides the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import CycleRecord, Floats, Torque
+from dxlrun.contract.hardware import Hardware
+from dxlrun.control.controllers.switching import Switching
+from dxlrun.control.gate import Gate
+from dxlrun.description.modes import Mode
+from dxlrun.plan.loop_plan import JointPlan
+
+MOVED = 0.0873
+"""rad; 5 deg: a joint that was moved farther in a pause begins again where it is. One that follows an effort
+coasts or sags by less. [i]"""
+MOVED_LINEAR = 0.005  # m; the same for a linear joint [i]
+_HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
+"""Modes in which a servo with torque keeps its goal while the controllers stand still."""
+
+
+class Anchoring:
+    """Sets goals to where joints are, and starts the controllers of these joints again."""
+
+    def __init__(
+        self,
+        joints: Sequence[JointPlan],
+        hardware: Hardware,
+        switching: Switching,
+        gate: Gate,
+        record: CycleRecord,
+    ) -> None:
+        self._names = tuple(joint.name for joint in joints)
+        self._moved = np.array([MOVED_LINEAR if joint.linear else MOVED for joint in joints])
+        self._hardware = hardware
+        self._switching = switching
+        self._gate = gate
+        self._record = record
+        self._paused_at: Floats = record.states.position.copy()
+
+    def anchor_given(self, time_ns: int) -> None:
+        """Anchor the joints that were given torque, and let their servos get goals; after a read.
+
+        One whose reply is missing waits for it: it is not known where the joint is.
+        """
+        states = self._record.states
+        given = (states.torque == Torque.GIVEN) & states.valid
+        if given.any():
+            self._anchor(given, "was given torque where it is", time_ns)
+            self._hardware.follow_goals(np.flatnonzero(given).tolist())
+
+    def begin_pause(self) -> None:
+        """Remember where the joints are when the controllers stop."""
+        np.copyto(self._paused_at, self._record.states.position)
+
+    def end_pause(self, time_ns: int) -> None:
+        """Anchor the joints that do not hold a position and were moved in the pause."""
+        states = self._record.states
+        moved = ~np.isin(states.mode, _HOLDING) & (np.abs(states.position - self._paused_at) > self._moved)
+        if moved.any():
+            self._anchor(moved, "was moved while the loop was paused", time_ns)
+
+    def _anchor(self, rows: NDArray[np.bool_], why: str, time_ns: int) -> None:
+        names = [self._names[row] for row in np.flatnonzero(rows).tolist()]
+        self._gate.anchor(rows)
+        self._switching.restart(names, f"{' and '.join(names)} {why}", time_ns)
