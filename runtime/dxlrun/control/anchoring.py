@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.answers import MOST_NAMED
 from dxlrun.channels.cycle import CycleRecord, Floats, Torque
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
@@ -52,7 +53,7 @@ class Anchoring:
         states = self._record.states
         given = (states.torque == Torque.GIVEN) & states.valid
         if given.any():
-            self._anchor(given, "was given torque where it is", time_ns)
+            self._anchor(given, "torque was given again", time_ns)
             self._hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def begin_pause(self) -> None:
@@ -64,9 +65,10 @@ class Anchoring:
         states = self._record.states
         moved = ~np.isin(states.mode, _HOLDING) & (np.abs(states.position - self._paused_at) > self._moved)
         if moved.any():
-            self._anchor(moved, "was moved while the loop was paused", time_ns)
+            self._anchor(moved, "moved in the pause", time_ns)
 
     def _anchor(self, rows: NDArray[np.bool_], why: str, time_ns: int) -> None:
         names = [self._names[row] for row in np.flatnonzero(rows).tolist()]
+        more = f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else ""
         self._gate.anchor(rows)
-        self._switching.restart(names, f"{' and '.join(names)} {why}", time_ns)
+        self._switching.restart(names, f"{why}: {', '.join(names[:MOST_NAMED])}{more}", time_ns)

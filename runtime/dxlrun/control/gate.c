@@ -14,6 +14,8 @@
 #define BRAKING_S 0.1   /* s; a joint in velocity mode may come nearer to a position limit by as much of the way that
 is left in this time, so it comes to rest there, and with an acceleration limit this is how long a velocity counts to
 act until the next one; [i] several times what a servo takes to follow (XM430: some 20 ms) */
+#define STARTS_S 0.005  /* s; an anchored joint begins to move when its goal is farther away than the slow speed leads in
+this time, 0.4 deg: above the corrections of a controller that holds a weight [i] */
 #define FADING_S 0.5    /* s; how long a measured change of velocity counts */
 #define LAG_S 0.15      /* s; how long a servo in velocity mode goes on as before, an XM430 with 0.06 kg m^2 by its
 integral gain [i] */
@@ -43,6 +45,8 @@ typedef struct { /* limits of one joint, infinite where there is none, and what 
     double fence[2];          /* up to where an effort may lead upward and downward: the limits, for a joint that was
     outside of them where it was, infinite: not known yet */
     double last, rise;        /* the measured velocity of the cycle before, and its largest change lately */
+    double anchored;          /* the goal that was set where the joint is: its slow time begins when the goal leaves it;
+    NaN: it has begun */
     double now_speed, inside, toward, desired; /* in this cycle: the highest speed, the goal, its speed, its end */
     int64_t slow_ns;          /* for how long it is slow still */
     int64_t counts[8];        /* cycles by bit of Clamp */
@@ -315,8 +319,6 @@ int32_t gate_apply(Gate *g, int64_t dt_ns)
             stay(g, j, i);
         g->clamped[i] &= NOT_FINITE; /* what the controllers' outputs were found to be */
         j->now_speed = j->slow_ns > 0 ? least(j->speed, j->slow_speed) : j->speed;
-        if (j->slow_ns > 0)
-            j->slow_ns -= dt_ns;
         if (is_led(j)) {
             lead(g, j, i, dt);
             j->desired = j->moves ? j->inside : g->goals[0][i];
@@ -342,6 +344,11 @@ int32_t gate_apply(Gate *g, int64_t dt_ns)
             g->goals[3][i] = brake(g, j, i, bounded(g, j, i, g->commands[3][i], j->pwm, OVER), j->pwm, dt);
         if (j->mode == EFFORT_POSITION)
             limit_effort(g, j, i);
+        double away = is_led(j) ? g->goals[0][i] - j->anchored : j->mode == VELOCITY ? g->goals[1][i] : INFINITY;
+        if (fabs(away) > j->slow_speed * STARTS_S)
+            j->anchored = NAN;
+        if (j->slow_ns > 0 && isnan(j->anchored))
+            j->slow_ns -= dt_ns;
         if (j->limp) {
             g->clamped[i] &= NOT_FINITE; /* what is commanded meanwhile is not followed */
             j->fence[0] = j->fence[1] = INFINITY; /* beyond a limit it is not drawn back to it */

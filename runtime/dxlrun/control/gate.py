@@ -58,7 +58,8 @@ class Gate:
     - Positions are clamped to the joint's limits. A goal that starts outside of them (the present position of
       a joint that hangs there) may stay or move toward them, never further out.
     - The step from the last goal is at most `limits.velocity * dt`, which is the servo's top speed where the
-      file gives none, and in the first second after `ease_in` at most SLOW_SPEED * dt.
+      file gives none, and at most SLOW_SPEED * dt in the first second after `ease_in`, and after the goal
+      moves for the first time since `anchor`.
     - With `limits.acceleration` the step changes by at most `acceleration * dt^2` from cycle to cycle, also
       when commands are withdrawn. It is never so long that the goal could not stop at the limit.
     - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed.
@@ -160,16 +161,24 @@ class Gate:
             self._joints[known][rows] = self._record.goals.position[rows]
 
     def enter_modes(self) -> None:
-        """Anchor the joints whose mode has changed; after a read."""
+        """Give the joints whose mode has changed goals that move nothing in the new one; after a read.
+
+        They follow their next commands slowly.
+        """
         changed = self._record.states.mode != self._joints["mode"]
         self._take_modes()
-        self.anchor(changed)
+        self._hold_still(changed)
 
     def anchor(self, rows: NDArray[np.bool_]) -> None:
-        """Give these joints goals that move nothing: the measured position, or 0, by their mode.
+        """Give joints goals that move nothing; the first second after they move again is slow.
 
-        They are at rest, and follow their next commands slowly for a second. `rows`: shape (joints,).
+        `rows`: shape (joints,).
         """
+        self._hold_still(rows)
+        self._joints["anchored"][rows] = np.nan_to_num(self._record.goals.position[rows])
+
+    def _hold_still(self, rows: NDArray[np.bool_]) -> None:
+        """Give these joints goals at rest: the measured position, or 0, by their mode."""
         states, goals = self._record.states, self._record.goals
         goals.values[:, rows] = np.nan
         led = np.isin(states.mode, (Mode.POSITION, Mode.EFFORT_POSITION))
@@ -243,6 +252,7 @@ def _laid_out(joints: Sequence[JointPlan]) -> NDArray[np.void]:
         "least_band": LEAST_BAND * share,
         "brakes_at": np.fmax(BRAKING * share, np.where(np.isfinite(acceleration), acceleration, 0.0)),
         "slow_ns": SLOW_START_NS,
+        "anchored": np.nan,
     }.items():
         laid[name] = values
     return laid

@@ -142,7 +142,7 @@ class Switching:
         again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
         withheld = [managed for managed in again if managed.withheld]
         for managed in again:
-            text = f"begins again where its joints are: {why}"
+            text = f"begins again where its joints are; {why}"
             self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
             self._deactivate(managed, time_ns, why)
         if self.fault is not None:

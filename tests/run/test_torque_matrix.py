@@ -1,0 +1,424 @@
+"""Every standard controller in every way to get torque: no joint moves until a client commands it.
+
+A robot has a joint for each way to command of each standard controller (`tests.kit.laws`). Clients command
+all of them; their servos lose torque, and each shaft is turned by 100 deg. When torque is back, the simulated
+shafts are watched, then clients command again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from tests.kit.laws import Case, cases, chain_of
+from tests.kit.line_faults import turn_by_hand
+
+from dxlrun.channels.answers import Refusal
+from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.cycle import Torque
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.plan.policy_plan import SLOW_SPEED
+from dxlrun.remote.preparation import Preparation
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+MS = 1_000_000
+TURN = math.radians(100)
+TICK = math.tau / 4096
+BEGUN_MS, LOST_MS, TURNED_MS = 300, 1000, 1150
+STEP_MS = 20  # Between two looks at the shafts
+WITHOUT_JOINTS = {
+    "battery_state_broadcaster", "device_command_controller", "fall_reflex", "imu_sensor_broadcaster",
+    "joint_state_broadcaster", "sensor_broadcaster",
+}  # fmt: skip
+MOTORS = Path(__file__).parents[2] / "robots/motors"
+LIMIT = {"plain": 170, "geared": 80}
+ROBOTS = ("plain", "geared", "protocol 1")
+PERIOD_MS = 20
+
+
+@dataclass(frozen=True)
+class Steered:
+    """One way to command: its joints, its controllers, and what clients send."""
+
+    case: Case
+    joints: tuple[str, ...]
+    leader: str
+    controllers: dict[str, dict[str, Any]]
+    top: str  # The controller that clients command
+    asks: tuple[tuple[str, dict[str, Any]], ...]
+    interfaces: tuple[str, ...]
+
+    @property
+    def other(self) -> str:
+        """Another mode for its joints, and the controller that has it."""
+        return "velocity" if "position" in self.interfaces else "position"
+
+
+@cache
+def steered() -> tuple[Steered, ...]:
+    """Return every standard controller that claims a joint, in each of its ways to command."""
+    found = []
+    for index, case in enumerate(cases(("x", "y"))):
+        if case.type in WITHOUT_JOINTS:
+            continue
+        names = (f"j{index}", f"k{index}") if case.type == "diff_drive_controller" else (f"j{index}",)
+        found.append(_steered(index, next(itertools.islice(cases(names), index, None)), names))
+    return tuple(found)
+
+
+def _steered(index: int, case: Case, joints: tuple[str, ...]) -> Steered:
+    name, asks = f"c{index}", tuple(case.asks[-1:])
+    controllers = {name: {"type": case.type, **json.loads(json.dumps(case.keys))}}
+    if case.type == "joint_limiter":
+        controllers[name]["limits"]["acceleration"] = "20 rad/s^2"
+    if case.type == "keyframe_player":
+        for motion in controllers[name]["motions"].values():
+            for step in motion["steps"]:
+                step["time"] = "2 s"  # as fast as a geared servo can
+    parameters = case.controller.Parameters.model_validate(case.keys)
+    interfaces = case.controller.interfaces(parameters, joints)
+    leader = f"l{joints[0]}" if case.type == "leader_follower" and not asks else ""
+    top = name
+    if case.into:
+        controllers[name]["into"] = f"{name}_lower"
+        gains = {"gains": {"p": 3.0, "d": 0.1}, "derivative_filter": "5 ms"}
+        below = {"type": "pid_controller", "command_interface": "effort", "joints": [*joints]}
+        controllers[f"{name}_lower"] = below | gains
+    if interfaces.reference and not asks:
+        what = "position" if "position" in interfaces.reference else interfaces.reference[0]
+        top, plural = f"{name}_upper", {"pwm": "pwm"}.get(what, f"{what}s")
+        above = {"type": f"joint_group_{what}_controller", "joints": [*joints], "into": name}
+        controllers[top], asks = above, ((plural, {plural: [0.9]}),)
+    return Steered(case, joints, leader, controllers, top, asks, interfaces.command)
+
+
+def test_every_standard_controller_is_in_the_matrix():
+    """A new type fails here until `tests.kit.laws` has a case for it."""
+    assert {one.case.type for one in steered()} | WITHOUT_JOINTS == set(load_plugins().controllers)
+    assert all(
+        not one.controller.interfaces(one.controller.Parameters.model_validate(one.keys), ("x", "y")).command
+        for one in cases(("x", "y"))
+        if one.type in WITHOUT_JOINTS
+    )
+
+
+@cache
+def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
+    """Return a robot file with a joint for each way to command, and those ways."""
+    # an MX-64 of Protocol 1.0 has no PWM mode, and measures no current
+    ways = tuple(
+        one for one in steered() if kind != "protocol 1" or one.interfaces not in (("pwm",), ("effort",))
+    )
+    ways = tuple(
+        {(one.case.type, one.interfaces, one.asks[:1] and one.case.into): one for one in ways}.values()
+    )
+    version, model, adapter = (1.0, "MX-64", 1) if kind == "protocol 1" else (2.0, "XM430-W350", 4)
+    limit = LIMIT.get(kind, 170)
+    place = (
+        f"reference: 180 deg, direction: 1, model: {model}, limits: {{position: [-{limit} deg, {limit} deg]}}"
+    )
+    place += ", simulation: {inertia: 0.005 kg m^2, gravity: 0 Nm}"
+    place += ", gear_ratio: 2" if kind == "geared" else ""
+    joints: dict[str, str] = {}
+    for number, one in enumerate(ways):
+        for joint in (*one.joints, *([one.leader] if one.leader else [])):
+            bus, limp = f"b{number % 3}", ", torque: off" if joint == one.leader else ""
+            own = 1 + sum(f"bus: {bus}," in text for text in joints.values())
+            joints[joint] = f"{{bus: {bus}, id: {own}, {place}, motor: {model}.motor.yaml{limp}}}"
+    line = f"port: sim, protocol: {version}, baud_rate: {adapter}_000_000, return_delay_time: 0 us"
+    controllers = {name: keys for one in ways for name, keys in one.controllers.items()}
+    for what in ("velocity", "position"):
+        others = [joint for one in ways if one.other == what for joint in one.joints]
+        controllers[what] = {"type": f"joint_group_{what}_controller", "joints": others, "active": False}
+    text = "\n".join((
+        "name: matrix",
+        "buses:",
+        *(f"  b{number}: {{{line}, adapter: {{kind: direct}}}}" for number in range(3)),
+        f"loop: {{rate: {1000 // PERIOD_MS}}}",
+        "joints:",
+        *(f"  {name}: {joint}" for name, joint in joints.items()),
+        "controllers:",
+        *(f"  {name}: {json.dumps(keys)}" for name, keys in controllers.items()),
+        f"policies: {{on_returned_servo: {policy}}}",
+        "model: {urdf: matrix.urdf}",
+    ))  # fmt: skip
+    return text, ways
+
+
+class Story:
+    """A robot on virtual time, its clients, and a hand that turns its shafts."""
+
+    def __init__(self, folder: Path, kind: str, policy: str = "hold", seconds: float = 8.0) -> None:
+        self.kind = kind
+        text, self.ways = robot_text(kind, policy)
+        (folder / "robot.yaml").write_text(text)
+        weights = [one.joints[0] for one in self.ways if one.case.type == "gravity_compensation"]
+        urdf = chain_of(weights).replace('mass value="0.1"', 'mass value="1e-9"')
+        (folder / "matrix.urdf").write_text(urdf)
+        for motor in MOTORS.glob("*.motor.yaml"):  # without a load, as the simulated joints
+            lines = motor.read_text().splitlines()
+            (folder / motor.name).write_text(
+                "\n".join(line for line in lines if not line.startswith("load:"))
+            )
+        self.path = folder / "run.mcap"
+        self.robot: VirtualRobot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=self.path)
+        plan = self.robot.plan
+        self.preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
+        self.plans = {one.name: one for one in plan.loop.controllers}
+        self.servos: dict[str, SimulatedServo] = {
+            servo.joint: bus.servo(servo.servo_id)
+            for bus, planned in zip(self.robot.buses, plan.buses, strict=True)
+            for servo in planned.servos
+        }
+        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
+        self.names = [joint for one in self.ways for joint in one.joints]
+        self.numbers = itertools.count(1)
+        self.put: dict[str, float] = {}
+        self.watched: list[list[float]] = []
+        self.commanded_ms = math.inf
+        self.fast: list[list[float]] = []
+
+    @property
+    def now_ms(self) -> float:
+        return self.robot.clock.now_ns() / MS
+
+    def at(self, ms: float, do: Callable[[], object]) -> None:
+        self.robot.buses[0].at(round(ms * MS), do)
+
+    def ask(self, kind: str, **data: object) -> int:
+        number = next(self.numbers)
+        encoded = msgspec.json.encode(data) if data else b""
+        self.robot.inbox.waiting.append(Command(number, LOOP, kind, encoded, "anna"))
+        return number
+
+    def command(self, other: bool = False) -> None:
+        """Let clients command every joint; of leaders, turn them by hand."""
+        for what, plural in (("velocity", "velocities"), ("position", "positions")) if other else ():
+            count = sum(len(one.joints) for one in self.ways if one.other == what)
+            self._send(what, plural, {plural: [0.9] * count})
+        for one in self.ways:
+            for kind, data in () if other else one.asks:
+                self._send(one.top, kind, data)
+            if one.leader:
+                turn_by_hand(self.servos[one.leader], math.pi - 0.9)
+
+    def _send(self, controller: str, kind: str, data: dict[str, Any]) -> None:
+        prepared = self.preparation.command(
+            self.plans[controller], kind, json.dumps(data).encode(), units=False
+        )
+        number = next(self.numbers)
+        self.robot.inbox.waiting.append(Command(number, controller, kind, prepared.data, "anna"))
+
+    def turn(self, names: list[str] | None = None) -> None:
+        """Turn shafts without torque by 100 deg, toward the middle of their range."""
+        for one in self.ways:
+            for joint in one.joints:
+                if joint in self.put or (names is not None and joint not in names):
+                    continue
+                servo = self.servos[joint]
+                assert not servo.shaft.torque_on or names is not None, joint
+                angle = servo.shaft.angle
+                self.put[joint] = angle - math.copysign(TURN, angle - math.pi)
+                turn_by_hand(servo, self.put[joint])
+                if one.leader:
+                    turn_by_hand(self.servos[one.leader], math.tau - self.put[joint])
+
+    def watch(self, until: Callable[[], bool], then: Callable[[], object]) -> None:
+        """Watch the shafts from now on; when it is time, let clients command again, for a second."""
+        if self.commanded_ms == math.inf and until():
+            self.commanded_ms = self.now_ms
+            then()
+        elif self.now_ms > self.commanded_ms + 800:
+            self.robot.stop.request()
+            return
+        angles = [self.servos[name].shaft.angle for name in self.names]
+        (self.fast if self.commanded_ms < self.now_ms else self.watched).append(angles)
+        self.at(self.now_ms + STEP_MS, lambda: self.watch(until, then))
+
+    def all_have_torque(self) -> bool:
+        torque = self.robot.record.states.torque
+        return all(torque[self.rows[name]] == Torque.ON for name in self.names)
+
+    def judge(self) -> None:
+        self.robot.run()
+        assert self.commanded_ms < math.inf, "torque did not come back"
+        refused = {
+            number: answer.text
+            for number, answer in self.robot.inbox.answers.items()
+            if isinstance(answer, Refusal)
+        }
+        assert not refused
+        put = np.array([self.put[name] for name in self.names])
+        off = np.abs(np.array(self.watched) - put).max(axis=0) / TICK
+        moved = {name: f"{ticks:.0f} ticks" for name, ticks in zip(self.names, off, strict=True) if ticks > 2}
+        assert not moved
+        assert len(self.watched) > 3
+        self._judge_commanded()
+
+    def _judge_commanded(self) -> None:
+        """Every joint follows its clients again, those that are led to positions or by velocities slowly."""
+        angles = np.array([self.watched[-1], *self.fast])
+        speed = np.abs(np.diff(angles, axis=0)).max(axis=0) / (STEP_MS * 1e-3)
+        ratio = 2 if self.kind == "geared" else 1
+        for one in self.ways:
+            for joint in one.joints:
+                place = self.names.index(joint)
+                assert np.ptp(angles[:, place]) > 5 * TICK, f"{joint} ({one.case.name}) does not follow"
+                if one.interfaces[0] in {"position", "velocity"} and not one.case.into:
+                    assert speed[place] < 1.2 * SLOW_SPEED * ratio, f"{joint} ({one.case.name}) is fast"
+
+
+WAYS: dict[str, Callable[[Story], None]] = {}
+
+
+def way(name: str, kinds: tuple[str, ...] = ROBOTS, policy: str = "hold"):
+    def enter(story):
+        WAYS[name] = (story, kinds, policy)
+        return story
+
+    return enter
+
+
+def faults(story: Story, text: str) -> None:
+    for bus in ("b0", "b1", "b2"):
+        FaultScript([parse_fault(f"{text} bus={bus}")]).attach(story.robot.buses)
+
+
+def turned(story: Story, ms: float = TURNED_MS, *, watch: bool = True) -> None:
+    """Turn the shafts, and watch them until all have torque; then clients command again."""
+    story.at(ms, story.turn)
+    if watch:
+        story.at(ms + 1, lambda: story.watch(story.all_have_torque, story.command))
+
+
+def activated(story: Story, ms: float) -> None:
+    """Turn the shafts and watch them; activate what was deactivated when all have torque, then command."""
+
+    def again() -> None:
+        tops = [name for one in story.ways for name in one.controllers]
+        story.ask("switch", activate=tops, deactivate=[])
+
+        def command() -> None:
+            mask = story.robot.record.active
+            if all(mask >> list(story.plans).index(name) & 1 for name in tops):
+                story.command()
+            else:
+                story.at(story.now_ms + STEP_MS, command)
+
+        story.at(story.now_ms + STEP_MS, command)
+
+    story.at(ms, story.turn)
+    story.at(ms + 1, lambda: story.watch(story.all_have_torque, again))
+
+
+@way("start")
+def _(story: Story) -> None:
+    for joint in story.names:
+        turn_by_hand(story.servos[joint], math.pi + 0.4)
+    story.turn()
+    story.at(1, lambda: story.watch(lambda: story.robot.record.cycle > 5, story.command))
+
+
+@way("return after a brown-out")
+def _(story: Story) -> None:
+    faults(story, "brownout at=1000ms for=300ms")
+    turned(story)
+
+
+@way("return with the port")
+def _(story: Story) -> None:
+    faults(story, "brownout at=1000ms for=300ms")
+    faults(story, "unplug at=1000ms for=400ms")
+    turned(story)
+
+
+@way("reboot that a client requests", ("plain", "geared"))
+def _(story: Story) -> None:
+    story.at(LOST_MS, lambda: story.ask("reboot", joints=story.names, release=True))
+    activated(story, TURNED_MS)
+
+
+@way("torque that a client requests")
+def _(story: Story) -> None:
+    story.at(LOST_MS, lambda: story.ask("torque", joints=story.names, on=False, release=True))
+    activated(story, TURNED_MS)
+    story.at(TURNED_MS + 100, lambda: story.ask("torque", joints=story.names, on=True))
+
+
+@way("torque that a client requests while controllers are active", policy="limp")
+def _(story: Story) -> None:
+    faults(story, "brownout at=1000ms for=300ms")
+    turned(story)
+
+    def request() -> None:
+        torque = story.robot.record.states.torque
+        if all(torque[story.rows[name]] == Torque.OFF for name in story.names):
+            story.ask("torque", joints=story.names, on=True)
+        else:
+            story.at(story.now_ms + STEP_MS, request)
+
+    story.at(TURNED_MS + 100, request)
+
+
+@way("return in a pause")
+def _(story: Story) -> None:
+    story.at(LOST_MS - 50, lambda: story.ask("pause"))
+    faults(story, "brownout at=1000ms for=300ms")
+    turned(story, watch=False)
+
+    def go_on() -> None:
+        story.ask("resume")
+        story.at(story.now_ms + 200, story.command)
+
+    story.at(TURNED_MS + 1, lambda: story.watch(story.all_have_torque, go_on))
+
+
+@way("another mode")
+def _(story: Story) -> None:
+    leave = [name for one in story.ways for name in one.controllers]
+    story.at(LOST_MS, lambda: story.ask("switch", activate=["velocity", "position"], deactivate=leave))
+
+    def turn(bus: SimulatedBus) -> None:
+        """Turn the shafts that have no torque after each packet: a change takes a millisecond or two."""
+        mine = [name for name in story.names if story.servos[name] in bus.servos]
+        story.turn([name for name in mine if not story.servos[name].shaft.torque_on])
+        if len(story.put) < len(story.names):
+            bus.after(1, lambda: turn(bus))
+
+    def watch() -> None:
+        if len(story.put) < len(story.names):
+            story.at(story.now_ms + STEP_MS, watch)
+        else:
+            story.watch(story.all_have_torque, lambda: story.command(other=True))
+
+    for bus in story.robot.buses:
+        story.at(LOST_MS, partial(turn, bus))
+    story.at(LOST_MS, watch)
+
+
+def pairs() -> Iterator[tuple[str, str]]:
+    for kind in ROBOTS:
+        yield from ((name, kind) for name, (_, kinds, _) in WAYS.items() if kind in kinds)
+
+
+@pytest.mark.parametrize(("name", "kind"), [*pairs()])
+def test_no_joint_moves_until_a_client_commands_it(tmp_path, name, kind):
+    happens, _, policy = WAYS[name]
+    story = Story(tmp_path, kind, policy)
+    if name != "start":
+        story.at(BEGUN_MS, story.command)
+    happens(story)
+    story.judge()
