@@ -162,3 +162,43 @@ def test_what_does_not_fit_is_refused_with_one_sentence(head, wrong):
     found, answer, taken = send(head, controller, interface, values, f"?units=true{query}")
     assert (found, sentence in answer["refused"]) == (status, True), answer
     assert taken is None
+
+
+# Goals
+
+
+def played_part(head):
+    data, _, numbers = head.taken[-1].data.partition(b"\n")
+    (part,) = json.loads(data)["parts"]
+    return part, np.frombuffer(numbers, "<f8").tolist()
+
+
+@pytest.mark.parametrize(
+    ("controller", "values", "seconds"),
+    [
+        ("positions", {"tilt": "0 rad"}, 2.0),  # 0.5 rad at 0.25 rad/s
+        ("posvel", {"pan": "0.5 rad"}, 0.5),  # at 0.5 rad/s
+        ("poseffort", {"pan": "0.5 rad"}, 0.125),
+    ],
+)
+def test_positions_of_a_group_controller_become_a_goal_when_they_are_waited_for(
+    head, controller, values, seconds
+):
+    head.record.states.position[:] = [0.25, -0.5]
+    head.finish_cycle()
+    _, answer, command = send(head, controller, "position", values, "?units=true&goal=true")
+    assert command.controller == ""
+    assert command.kind == "play", answer
+    part, numbers = played_part(head)
+    asked = [0.5, -0.5] if "pan" in values else [0.25, 0.0]
+    assert (part["controller"], part["positions"], numbers[:2]) == (controller, asked, asked)
+    assert part["end_ns"] * 1e-9 == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(("controller", "interface"), [("efforts", "effort"), ("trajectory", "position")])
+def test_other_commands_are_what_they_are_when_they_are_waited_for(head, controller, interface):
+    head.record.states.position[:] = [0.25, -0.5]
+    head.finish_cycle()
+    value = 0.2 if interface == "effort" else "0.5 rad"
+    _, _, command = send(head, controller, interface, {"pan": value}, "?units=true&goal=true")
+    assert command.controller == controller

@@ -24,7 +24,8 @@ loop: {{rate: 50}}
 joints:
   reel:
     {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true,
-     limits: {{velocity: 2 rad/s}}}}
+     limits: {{velocity: 2 rad/s}},
+      tolerance: {{time: 600 ms}}}}
   elbow:
     {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1,
      limits: {{position: [-90 deg, 90 deg], velocity: 1 rad/s}}}}
@@ -187,3 +188,67 @@ def test_the_tolerance_of_a_joint_decides(tmp_path, tolerance, status):
     run = steered(tmp_path, written(tmp_path, robot), 5.0, play=[written(tmp_path, HELD_OFF, "motion.yaml")])
     (goal,) = ended(run)
     assert goal["status"] == status, goal
+
+
+GROUP = f"""
+name: group{BUSES}
+loop: {{rate: 50}}
+joints:
+  pan:
+    {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
+     tolerance: {{time: 600 ms}}}}
+  tilt:
+    {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
+     tolerance: {{time: 600 ms}}}}
+controllers:
+  neck: {{type: joint_group_position_controller, joints: [pan, tilt]}}
+"""
+NOD = """
+name: nod
+motions:
+  - controller: neck
+    points:
+      - {time: 0.5 s, joints: {pan: {position: 0 deg}, tilt: {position: 0 deg}}}
+      - {time: 1 s, joints: {tilt: {position: 30 deg}}}
+      - {time: 1.5 s, joints: {pan: {position: 40 deg}}}
+"""
+
+
+def jam_tilt(robot: VirtualRobot) -> None:
+    bus = robot.buses[0]
+    bus.at(1_050_000_000, lambda: bus.servo(2).jam(True))
+
+
+def cut_tilt(robot: VirtualRobot) -> None:
+    bus = robot.buses[0]
+    bus.at(700_000_000, lambda: bus.servo(2).cut_power(900_000_000))
+
+
+@pytest.mark.parametrize(
+    ("before", "status"),
+    [(lambda robot: None, "reached"), (jam_tilt, "missed"), (cut_tilt, "aborted")],
+    ids=["free", "jammed", "limp"],
+)
+def test_the_positions_that_a_motion_gives_a_group_controller_are_a_goal(tmp_path, before, status):
+    run = steered(
+        tmp_path,
+        written(tmp_path, GROUP),
+        4.0,
+        before=before,
+        play=[written(tmp_path, NOD, "motion.yaml")],
+    )
+    (goal,) = ended(run)
+    assert goal["status"] == status, goal
+    assert goal["controller"] == "neck"
+    if status != "reached":
+        assert goal["joint"] == "tilt"
+        assert abs(shaft(run.robot, 2)) < math.radians(20)
+    else:
+        assert shaft(run.robot, 1) == pytest.approx(math.radians(40), abs=0.02)
+        assert shaft(run.robot, 2) == pytest.approx(math.radians(30), abs=0.02)
+
+
+def test_a_command_of_a_client_takes_the_place_of_a_planned_goal(tmp_path):
+    asks = [Ask(1.2, "neck", "positions", {"positions": [0.1, 0.1]})]
+    run = steered(tmp_path, written(tmp_path, GROUP), 4.0, asks, play=[written(tmp_path, NOD, "motion.yaml")])
+    assert [goal["status"] for goal in ended(run)] == ["preempted"]

@@ -20,7 +20,8 @@ from builtin_interfaces.msg import Duration, Time
 from control_msgs.msg import JointTolerance
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from dxlrun.errors import InputError
-from dxlrun_ros2.trajectories import tolerances, wanted
+from control_msgs.action import FollowJointTrajectory
+from dxlrun_ros2.trajectories import goal_fields, tolerances, wanted
 
 def at(seconds, **values):
     duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
@@ -93,17 +94,16 @@ def test_what_is_wrong_is_refused_with_its_reason() -> None:
         assert why in found
 
 
-def test_tolerances_name_the_joint_that_is_farthest_beyond() -> None:
-    within, position, velocity, unchecked, unknown = result_of("""
-given = [JointTolerance(name="pan", position=0.1), JointTolerance(name="tilt", position=0.2, velocity=0.5)]
-most = tolerances(given, JOINTS)
-errors = [([0.1, 0.2, 9], [0, 0.5, 0]), ([0.3, -0.5, 9], [9, 0, 0]), ([0, 0, 0], [0, -0.6, 0])]
-errors += [([np.nan] * 3, [0, 0, 0])]
-print(json.dumps([most.violated(JOINTS, np.array(one, float)) for one in errors]
-    + [why(lambda: tolerances(given, ("pan",)))]))""")
-    assert within == unchecked == ""
-    assert position == "tilt is off by 0.5 in position, 0.2 is allowed"
-    assert velocity == "tilt is off by 0.6 in velocity, 0.5 is allowed"
+def test_tolerances_of_an_action_are_those_of_the_robots_goal() -> None:
+    fields, none, unknown = result_of("""
+given = [JointTolerance(name="pan", position=0.1), JointTolerance(name="tilt", position=-1.0, velocity=0.5)]
+goal = FollowJointTrajectory.Goal(goal_tolerance=given)
+goal.goal_time_tolerance.nanosec = 500_000_000
+print(json.dumps([goal_fields(goal, JOINTS), goal_fields(FollowJointTrajectory.Goal(), JOINTS),
+    why(lambda: tolerances(given, ("pan",)))]))""")
+    tolerances = {"pan": {"position": 0.1}, "tilt": {"position": "inf", "velocity": 0.5}}
+    assert fields == {"goal_tolerance": tolerances, "goal_time_tolerance": 0.5}
+    assert none == {}
     assert unknown == "a tolerance names tilt, which is not moved"
 
 

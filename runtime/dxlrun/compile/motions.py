@@ -18,6 +18,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from pydantic import ValidationError
 
 from dxlrun.compile.controllers import CompiledController
@@ -37,7 +38,7 @@ from dxlrun.description.document import refusal
 from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
 from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError, Mark, suggestion
-from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
+from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
 
 TRAJECTORY = "trajectory"
@@ -57,8 +58,6 @@ LEAD_NS = 1_000_000_000
 MOST_TARGETS = 200_000
 """Of all formulas of a motion file: 20 joints for 100 s at 100 Hz. One takes some 300 bytes and 5 us."""
 MOST_CHARACTERS = 20_000_000  # Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s
-SETTLE_NS = 1_000_000_000
-"""From the last target to the end of the part, where the controller has no `goal_time`."""
 
 
 def compile_motion(
@@ -89,7 +88,11 @@ def compile_motion(
         check_samples(samples, part.start + lead_ns, plans, problems, peaks)
         if not commands:
             continue
-        end_ns = part.start + lead_ns + samples[-1].t_ns + _settle_ns(controller)
+        last_ns = part.start + lead_ns + samples[-1].t_ns
+        if kind not in controller.offer.controller.Goals:
+            goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
+            commands = (structs.replace(commands[0], goal=goal), *commands[1:])
+        end_ns = last_ns + _settle_ns(controller, plans)
         parts.append(
             MotionPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands)
         )
@@ -225,11 +228,24 @@ def _right_units(
     return good
 
 
-def _settle_ns(controller: CompiledController) -> int:
-    """Return how long a part lasts after its last target: until the goal must be reached, if given."""
+def _settle_ns(controller: CompiledController, joints: Mapping[str, JointPlan]) -> int:
+    """Return how long a part lasts after its last target: until its goal must be reached."""
     tolerances = getattr(controller.parameters, "tolerances", controller.parameters)
     goal_time = getattr(tolerances, "goal_time", None)
-    return goal_time if isinstance(goal_time, int) and goal_time > 0 else SETTLE_NS
+    if isinstance(goal_time, int) and goal_time > 0:
+        return goal_time
+    own = [joints[name].settle_ns for name in controller.plan.joints if name in joints]
+    return max(own, default=0) or SETTLE_NS
+
+
+def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:
+    """Return where joints are left, rad or m, None where they name no position; empty: they name none."""
+    held: dict[str, float] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            if target.position is not None:
+                held[joint] = target.position
+    return tuple(held.get(joint) for joint in joints) if held else ()
 
 
 def commands_of(

@@ -257,6 +257,14 @@ class ControllerPlan(msgspec.Struct, frozen=True):
         )
 
 
+class ScheduledGoal(msgspec.Struct, frozen=True):
+    """A goal that the runtime pursues with several scheduled commands of one controller."""
+
+    end_ns: int  # Since the loop's first deadline; from then on it is judged
+    positions: tuple[float | None, ...] = ()
+    """Goal of each joint of the controller, rad or m, None: it has none; empty: the goal has no positions"""
+
+
 class ScheduledCommand(msgspec.Struct, frozen=True):
     """A prepared command that the loop hands to a controller at a time."""
 
@@ -266,6 +274,7 @@ class ScheduledCommand(msgspec.Struct, frozen=True):
     data: bytes  # Little-endian float64
     origin: str  # Its source: `three_parts.yaml:7:5`
     request: str = ""  # The command that `data` was prepared from, as JSON
+    goal: ScheduledGoal | None = None  # Begins with this command, where that is not a goal itself
 
 
 class LoopPlan(msgspec.Struct, frozen=True):

@@ -295,9 +295,11 @@ class RemoteRobot:
         *,
         units: bool = False,
         seconds: float | None = None,
+        goal: bool = False,
     ) -> Executed:
         """Send a controller a typed command; returns when the loop has taken it. Raises Refused for values
-        beyond their joints' limits too. Where the command is a goal, the answer has it, to wait for its end.
+        beyond their joints' limits too. Where the command is a goal, the answer has it, to wait for its end;
+        with `goal` the positions of a group controller are one, too.
 
         Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
 
@@ -306,6 +308,7 @@ class RemoteRobot:
         device: `send("board", "device_commands", {"led": 1})`, which the controller gets that has them.
         """
         query = ({"units": "true"} if units else {}) | ({} if seconds is None else {"in": repr(seconds)})
+        query |= {"goal": "true"} if goal else {}
         return self._execute(requests.COMMAND, controller, kind, body=_json(command), query=query)
 
     def play(self, motion: Path | str, speed: float = 1.0) -> Executed:

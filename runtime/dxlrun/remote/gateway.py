@@ -51,7 +51,7 @@ from dxlrun.remote.goals import LOST
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.live.states import RobotStates, encoded
 from dxlrun.remote.live.topics import TopicStream, framed
-from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
+from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, goal_of, play
 from dxlrun.remote.named.joints import (
     effort_units,
     joint_row,
@@ -471,9 +471,15 @@ class GatewayApp:
             raise invalid(f"in is for joints by name; {kind} of {loaded.plan.name} has its own times")
         prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
-        done = await self._link.command(
-            loaded.plan.name, kind, prepared.data, asked.origin, request=prepared.request
-        )
+        goal = None
+        if query.get("goal") == "true" and kind not in self._preparation.goals(loaded.plan):
+            goal = goal_of(prepared, self._preparation.known(loaded.plan), self._newest())
+        if goal is not None:
+            done = await self._link.command(LOOP, "play", goal.data, asked.origin, request=goal.request)
+        else:
+            done = await self._link.command(
+                loaded.plan.name, kind, prepared.data, asked.origin, request=prepared.request
+            )
         return Executed(done.cycle, done.goals)
 
     @_answers(requests.SET_POINT)

@@ -15,10 +15,10 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.limits import PEAK_OVER_MEAN, check_samples
 from dxlrun.compile.motions import (
-    SETTLE_NS,
     TRAJECTORY,
     affordable,
     commands_of,
+    last_positions,
     playable,
     speed_peaks,
 )
@@ -29,7 +29,8 @@ from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.steering import Play
 from dxlrun.description.motion import MotionDescription
 from dxlrun.errors import InputError, Problem, suggestion
-from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
+from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand
+from dxlrun.remote.preparation import Known, Prepared
 
 SOFT_SPEED = 0.5
 """rad/s on the way to the first pose; or the joint's limit, if that is lower."""
@@ -74,6 +75,32 @@ class Played(msgspec.Struct, frozen=True, tag="played"):
     """Until all parts have ended."""
 
 
+def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | None:
+    """Return a command of positions as a goal of the loop; None where the command has no positions.
+
+    Its motion has ended when each joint may be there, at its highest speed or the commanded one.
+    """
+    content = msgspec.json.decode(prepared.request)
+    positions = content.get("positions") if isinstance(content, dict) else None
+    if not isinstance(positions, list) or len(positions) != len(known.joints):
+        return None
+    speeds = content.get("velocities") or [math.inf] * len(positions)
+    longest_s = 0.0
+    for joint, position, commanded in zip(known.joints, positions, speeds, strict=True):
+        row = record.layout.joints.index(joint.name)
+        way, speed = abs(position - float(record.states.position[row])), joint.highest_speed
+        if commanded:  # at 0 the servo goes as fast as it can
+            speed = min(speed, abs(commanded))
+        if math.isfinite(way) and math.isfinite(speed):
+            starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
+            longest_s = max(longest_s, way / speed + starting_s)
+    sizes = (len(prepared.data) // 8,)
+    end_ns, name = round(longest_s * 1e9), prepared.controller
+    part = PlayedPart(name, prepared.kind, (0,), sizes, end_ns, tuple(positions))
+    data = msgspec.json.encode(Play((part,))) + b"\n" + prepared.data
+    return Played(data, b"[" + prepared.request + b"]", (end_ns + SETTLE_NS) * 1e-9)
+
+
 @dataclass(frozen=True, slots=True)
 class _Part:
     """What one controller shall do, by the time of the motion, at its final speed."""
@@ -109,14 +136,15 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
             continue
         times = tuple(command.at_ns for command in commands)
         sizes = tuple(len(command.data) // 8 for command in commands)
-        end_ns = lead_ns + part.samples[-1].t_ns + SETTLE_NS
-        played.append(PlayedPart(part.controller.plan.name, part.kind, times, sizes, end_ns))
+        end_ns = lead_ns + part.samples[-1].t_ns
+        positions = last_positions(part.controller.plan.joints, part.samples)
+        played.append(PlayedPart(part.controller.plan.name, part.kind, times, sizes, end_ns, positions))
         arrays += (command.data for command in commands)
         requests += (command.request for command in commands)
     problems.refuse()
     data = msgspec.json.encode(Play(tuple(played))) + b"\n" + b"".join(arrays)
     request = f"[{','.join(requests)}]".encode()
-    return Played(data, request, max(part.end_ns for part in played) * 1e-9)
+    return Played(data, request, (max(part.end_ns for part in played) + SETTLE_NS) * 1e-9)
 
 
 def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:

@@ -20,18 +20,16 @@ from dxlrun_ros2 import CLIENT
 from dxlrun_ros2.manager import info_of
 from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.trajectories import (
-    Tolerances,
     Wanted,
+    goal_fields,
     point,
-    seconds_of,
-    tolerances,
     wanted,
 )
 
 Result = FollowJointTrajectory.Result
 FEEDBACK_S = 0.05
-GOAL_TIME_S = 1.0
-"""How long after its end a goal with tolerances may still come inside them, where it does not say."""
+STATE_S = 1.0
+"""How long after the end of a goal the state of its gripper is waited for."""
 CLIENT_S = 1.0
 """A goal none of whose clients is left for so long is cancelled."""
 _FAR_S = 10.0
@@ -141,8 +139,7 @@ class FollowTrajectory(Action):
         """Raise InputError for a goal that is not accepted."""
         if request.multi_dof_trajectory.points:
             raise InputError("it has no joints with several degrees of freedom")
-        for given in (request.path_tolerance, request.goal_tolerance):
-            tolerances(given, self.controller.joints)
+        goal_fields(request, self.controller.joints)
         if request.trajectory.points:
             self._wanted(request)
 
@@ -163,54 +160,44 @@ class FollowTrajectory(Action):
             return Result(error_string=f"stopped in place: {state.status}")
         try:
             plan = self._wanted(request)
+            fields = goal_fields(request, plan.joints)
         except InputError as error:  # since it was accepted, its last point has passed
             handle.abort()
             return self.failed(str(error), Result.OLD_HEADER_TIMESTAMP)
-        watch = Watch(self.run, plan, tolerances(request.path_tolerance, plan.joints))
+        watch = Watch(self.run, plan)
         self.run.seen.add(watch.see)
         try:
-            goal = _sent(robot, self.controller, "trajectory", plan.command())
+            goal = _sent(robot, self.controller, "trajectory", plan.command() | fields)
 
             def look(state: GoalState) -> str:
                 watch.begin(state)
                 if watch.newest is not None:
                     handle.publish_feedback(watch.feedback(watch.newest))
-                return watch.violated
+                return ""
 
             state, why = self.wait(handle, robot, goal, look)
             if why:
                 handle.abort()
-                return self.failed(
-                    why, Result.PATH_TOLERANCE_VIOLATED if watch.violated else Result.INVALID_GOAL
-                )
-            if state.reached and not (why := self._off(handle, watch)):
+                return self.failed(why)
+            if state.reached:
                 handle.succeed()
                 return Result(error_string=state.text)
             if handle.is_cancel_requested:
                 handle.canceled()
                 return Result(error_string=f"{state.status}, the joints are at rest")
             handle.abort()
-            return self.failed(why or state.text or state.status, self._code(state))
+            return self.failed(state.text or state.status, self._code(state))
         finally:
             self.run.seen.discard(watch.see)
 
     def _code(self, state: GoalState) -> int:
         """Return the code of control_msgs for a goal that did not end well."""
-        if state.reached or state.status == "missed":
+        if state.status == "missed":
             return int(Result.GOAL_TOLERANCE_VIOLATED)
         # what cannot be followed from its beginning on ends at once
         began = (state.seconds or 0.0) > _AT_ONCE * self.run.header.period_ns * 1e-9
         left = state.status == "aborted" and state.error is not None and began
         return int(Result.PATH_TOLERANCE_VIOLATED if left else Result.INVALID_GOAL)
-
-    def _off(self, handle: ServerGoalHandle, watch: Watch) -> str:
-        """Wait until the joints are inside the tolerances of a goal; return which is not in its time."""
-        request = handle.request
-        most = tolerances(request.goal_tolerance, watch.plan.joints)
-        until = time.monotonic() + (seconds_of(request.goal_time_tolerance) or GOAL_TIME_S)
-        while (why := watch.off(most)) and time.monotonic() < until and not handle.is_cancel_requested:
-            time.sleep(FEEDBACK_S)
-        return why
 
 
 def stopped(robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo) -> RemoteGoal:
@@ -241,15 +228,14 @@ def _sent(
 class Watch:
     """Desired and measured state of joints on a trajectory, in each cycle of a run."""
 
-    def __init__(self, run: PublishedRun, plan: Wanted, path: Tolerances) -> None:
-        self.plan, self._path = plan, path
+    def __init__(self, run: PublishedRun, plan: Wanted) -> None:
+        self.plan = plan
         self._rows = run.rows(plan.joints)
         self._spline = plan.spline(run.desired[self._rows])
         self._sample = SplineSample(len(plan.joints))
         self._begin_ns: int | None = None
         self._offset_ns = run.header.epoch_offset_ns
         self.newest: Seen | None = None
-        self.violated = ""
 
     def begin(self, state: GoalState) -> None:
         """Count the time from the acceptance of the goal."""
@@ -264,14 +250,6 @@ class Watch:
         self._spline.sample(seconds, self._sample)
         actual = np.array([record["position"][self._rows], record["velocity"][self._rows]])
         self.newest = t_ns + self._offset_ns, seconds, self._sample.rows[:2].copy(), actual
-        if not self.violated and seconds <= self._spline.duration_s:
-            self.violated = self._path.violated(self.plan.joints, self._sample.rows[:2] - actual)
-
-    def off(self, most: Tolerances) -> str:
-        """Return which joint is farther from the end of the trajectory than its tolerance."""
-        if self.newest is None:
-            return ""
-        return most.violated(self.plan.joints, self.plan.points[-1, :2] * [[1.0], [0.0]] - self.newest[3])
 
     def feedback(self, newest: Seen) -> FollowJointTrajectory.Feedback:
         """Return the feedback of a cycle."""
@@ -327,7 +305,7 @@ class Gripper(Action):
 
     def _stalled(self, robot: RemoteRobot, state: GoalState) -> bool:
         """Return whether the gripper stood still short of its goal, by its topic after the end."""
-        until = time.monotonic() + GOAL_TIME_S
+        until = time.monotonic() + STATE_S
         while time.monotonic() < until:
             found = robot.newest(f"/{self.controller.name}/state")
             if found is not None and found.time_ns * 1e-9 >= (state.ended or 0.0):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
+from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -104,36 +105,33 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
     return Wanted(named, times[ahead], points[ahead], chosen, start_in)
 
 
-@dataclass(frozen=True)
-class Tolerances:
-    """How far joints may be off: rad and rad/s, infinite: not checked; shape (joints,)."""
+def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[str, dict[str, float | str]]:
+    """Return the tolerances of a goal as a trajectory takes them: 0 is left out, below 0 is `inf`.
 
-    position: Floats
-    velocity: Floats
-
-    def violated(self, joints: Sequence[str], error: Floats) -> str:
-        """Return which joint is off by how much, of errors of shape (2, joints); empty: none is."""
-        for what, most, off in zip(
-            ("position", "velocity"), (self.position, self.velocity), error, strict=True
-        ):
-            beyond = np.abs(off) - most
-            row = int(np.nanargmax(np.where(np.isfinite(off), beyond, -np.inf)))
-            if beyond[row] > 0:
-                return f"{joints[row]} is off by {abs(off[row]):.4g} in {what}, {most[row]:.4g} is allowed"
-        return ""
-
-
-def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> Tolerances:
-    """Return the tolerances of a goal; 0 and below: not checked here. Raises InputError."""
+    Accelerations are not measured and not checked. Raises InputError.
+    """
     rows: Mapping[str, JointTolerance] = {one.name: one for one in given}
     if unknown := [name for name in rows if name not in joints]:
         raise InputError(f"a tolerance names {', '.join(unknown)}, which is not moved")
-    found = np.full((2, len(joints)), np.inf)
-    for row, name in enumerate(joints):
-        if name in rows:
-            values = np.array([rows[name].position, rows[name].velocity])
-            found[:, row] = np.where(values > 0, values, np.inf)
-    return Tolerances(*found)
+    found: dict[str, dict[str, float | str]] = {}
+    for name, one in rows.items():
+        written = {"position": float(one.position), "velocity": float(one.velocity)}
+        if not np.isfinite(list(written.values())).all():
+            raise InputError(f"the tolerance of {name} has a number that is not finite")
+        if values := {key: "inf" if value < 0 else value for key, value in written.items() if value}:
+            found[name] = values
+    return found
+
+
+def goal_fields(goal: FollowJointTrajectory.Goal, joints: Sequence[str]) -> dict[str, object]:
+    """Return the tolerances of a FollowJointTrajectory goal as fields of a trajectory. Raises InputError."""
+    fields: dict[str, object] = {
+        "path_tolerance": tolerances(goal.path_tolerance, joints),
+        "goal_tolerance": tolerances(goal.goal_tolerance, joints),
+    }
+    fields = {key: value for key, value in fields.items() if value}
+    seconds = seconds_of(goal.goal_time_tolerance)
+    return fields | ({"goal_time_tolerance": seconds} if seconds > 0 else {})
 
 
 def point(rows: Floats, seconds: float) -> JointTrajectoryPoint:

@@ -75,7 +75,7 @@ def send(
     with robot_of(chosen, "send") as robot:
         try:
             with begun_or_cancelled(robot, "send", waited=wait):
-                done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
+                done = robot.send(controller, kind, written.data, units=True, seconds=seconds, goal=wait)
         except Refused as refused:
             known = refused.fields.get("known")
             mistaken = refused.code == Code.UNKNOWN_COMMAND and refused.fields.get("kind") == kind

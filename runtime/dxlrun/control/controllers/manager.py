@@ -28,7 +28,7 @@ from dxlrun.control.controllers.switching import SetModes, Switching, fault_of
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Provided
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 
 P = ParamSpec("P")
 
@@ -83,6 +83,8 @@ class Manager:
         self._goals = Goals(record, events, plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """What is played by commands, by controller."""
+        self._pursued: dict[str, RunningGoal] = {}
+        """Goals that the runtime pursues with commands of the plan, by controller; they may have ended."""
 
     def configure(self) -> None:
         """Build and configure every controller; allocates, before real time.
@@ -153,8 +155,10 @@ class Manager:
 
     # Commands
 
-    def hand(self, command: Command, time_ns: int) -> int | Refusal:
+    def hand(self, command: Command, time_ns: int, pursued: RunningGoal | None = None) -> int | Refusal:
         """Hand a prepared command to its controller; return the number of the goal that it is, else 0.
+
+        `pursued`: the goal that the runtime pursues with this command; another one is preempted.
 
         With a lease it runs out unless another one follows (see `stale`). Of a stream, only the first one has
         an event.
@@ -171,7 +175,8 @@ class Manager:
                 return Refusal(Code.GOAL_STREAMED, {"controller": managed.plan.name, "kind": kind})
             return self._begin_goal(managed, kind, data, command.origin, time_ns)
         goal = managed.goal
-        if goal is not None and (goal.is_judged or managed.plan.name in self._motions):
+        led = goal is not None and (goal.is_judged or managed.plan.name in self._motions)
+        if goal is not None and led and goal is not pursued:
             goal.end(Outcome.PREEMPTED, "another command took its place")
         streaming = command.lease_ns and managed.until_ns
         try:
@@ -231,12 +236,23 @@ class Manager:
             name, kind, origin = command.controller, command.kind, command.origin
             self._taken.take(TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b""))
             self._next += 1
-            answer = self.hand(Command(place, name, kind, command.data, origin), time_ns)
+            pursued = self._pursue(command)
+            answer = self.hand(Command(place, name, kind, command.data, origin), time_ns, pursued)
             if isinstance(answer, Refusal):
                 text = f"{kind} from {origin} refused: {answer.text}"
                 self.switching.report_refusal(name, text, CommandOutcome(kind, origin, answer))
             else:
                 record.command_count += 1
+
+    def _pursue(self, command: ScheduledCommand) -> RunningGoal | None:
+        """Return the goal that the runtime pursues with a command of the plan, which may begin with it."""
+        name, planned = command.controller, command.goal
+        if planned is not None and isinstance(managed := self._commandable(name), Managed):
+            goal = self._pursued[name] = self._accept(managed, command.kind, command.origin)
+            managed.adopt(goal)
+            part = PlayedPart(name, command.kind, (), (), planned.end_ns, planned.positions)
+            self._motions[name] = PlayedMotion(goal, part, (), 0)
+        return self._pursued.get(name)
 
     def change_parameters(self, controller: str, values: LiveValues, time_ns: int) -> Refusal | None:
         """Replace live parameters of a controller, active or not, all of them together."""

@@ -114,7 +114,7 @@ CANCEL = Request("POST", "/goals/{number}/cancel", NoneType, Done)
 CANCEL_OF = Request("POST", "/controllers/{name}/cancel", NoneType, Done)
 PARAMETERS = Request("GET", "/controllers/{name}/parameters", NoneType, Parameters, role=Role.OBSERVE)
 CHANGE = Request("POST", "/controllers/{name}/parameters", NewValues, Changed)
-COMMAND = Request("POST", "/controllers/{name}/commands/{kind}", bytes, Done, query=("units", "in"))
+COMMAND = Request("POST", "/controllers/{name}/commands/{kind}", bytes, Done, query=("units", "in", "goal"))
 SET_POINT = Request(
     "POST", "/controllers/{name}/set-points/{kind}", bytes, Clamped, MOST_SET_POINTS, ("lease",)
 )
