@@ -13,8 +13,10 @@ from dxlrun.description.devices import Device, DeviceSimulation
 from dxlrun.description.form import Form
 from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
 from dxlrun.description.joints.mechanics import (
+    GoalTolerance,
     Limits,
     OneOfServos,
+    SharedTolerance,
     Transmission,
     TransmissionServo,
 )
@@ -43,7 +45,7 @@ TABLES = set(re.findall(r"^<!-- keys: (\w+) -->$", PAGE, re.MULTILINE))
 
 
 def test_the_examples_of_the_page_are_read() -> None:
-    robot, variant, groups, slide, shared, wrist, chain, motor, motion = EXAMPLES
+    robot, variant, groups, near, slide, shared, wrist, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
@@ -55,6 +57,7 @@ def test_the_examples_of_the_page_are_read() -> None:
     head = robot[: robot.index("joints:")]
     for example, joint in (
         (groups, "left_elbow"),
+        (near, "elbow"),
         (slide, "gripper"),
         (shared, "hip"),
         (wrist, "wrist_roll"),
@@ -72,6 +75,8 @@ PARTS = [
         BusSimulation,
         Joint,
         Limits,
+        GoalTolerance,
+        SharedTolerance,
         OneOfServos,
         Transmission,
         TransmissionServo,

@@ -24,8 +24,7 @@ loop: {{rate: 50}}
 joints:
   reel:
     {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true,
-     limits: {{velocity: 2 rad/s}},
-      tolerance: {{time: 600 ms}}}}
+     limits: {{velocity: 2 rad/s}}}}
   elbow:
     {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1,
      limits: {{position: [-90 deg, 90 deg], velocity: 1 rad/s}}}}
@@ -196,10 +195,10 @@ loop: {{rate: 50}}
 joints:
   pan:
     {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
-     tolerance: {{time: 600 ms}}}}
+     tolerance: {{time: 450 ms}}}}
   tilt:
     {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
-     tolerance: {{time: 600 ms}}}}
+     tolerance: {{time: 450 ms}}}}
 controllers:
   neck: {{type: joint_group_position_controller, joints: [pan, tilt]}}
 """
@@ -252,3 +251,60 @@ def test_a_command_of_a_client_takes_the_place_of_a_planned_goal(tmp_path):
     asks = [Ask(1.2, "neck", "positions", {"positions": [0.1, 0.1]})]
     run = steered(tmp_path, written(tmp_path, GROUP), 4.0, asks, play=[written(tmp_path, NOD, "motion.yaml")])
     assert [goal["status"] for goal in ended(run)] == ["preempted"]
+
+
+PAN = f"""
+name: c{BUSES}
+loop: {{rate: 50}}
+joints:
+  pan:
+    {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true,
+     limits: {{velocity: 6 rad/s}}}}
+controllers:
+  arm: {{type: joint_trajectory_controller, joints: [pan]}}
+"""
+
+
+def way(*degrees: float) -> dict[str, object]:
+    points = [{"time": 1.5 * n, "positions": [math.radians(each)]} for n, each in enumerate(degrees, 1)]
+    return {"points": points}
+
+
+@pytest.mark.parametrize(
+    ("robot", "end"),
+    [
+        (PAN, 178.0),
+        (PAN.replace("continuous: true", "continuous: true, wrap: true"), -182.0),
+        (PAN.replace("joints: [pan]", "joints: [pan], wrap: [pan]"), -182.0),
+    ],
+    ids=["turns", "joint", "controller"],
+)
+def test_a_wrapped_angle_is_reached_on_the_shorter_way(tmp_path, robot, end):
+    asks = [Ask(0.2, "arm", "trajectory", way(-90, -179)), Ask(4.5, "arm", "trajectory", way(178))]
+    run = steered(tmp_path, written(tmp_path, robot), 7.5, asks)
+    assert [goal["status"] for goal in ended(run)] == ["reached", "reached"]
+    assert math.degrees(shaft(run.robot, 1)) == pytest.approx(end, abs=1.0)
+    warned = [event.text for event in run.log.events if "turns by" in event.text]
+    assert bool(warned) is (end > 0)
+    if warned:
+        assert warned[0].startswith("joint pan turns by 357")
+
+
+def test_points_of_a_wrapped_joint_follow_each_other_on_the_shorter_way(tmp_path):
+    robot = PAN.replace("continuous: true", "continuous: true, wrap: true")
+    asks = [Ask(0.2, "arm", "trajectory", way(-90, -179, 178, 90))]
+    run = steered(tmp_path, written(tmp_path, robot), 8.0, asks)
+    assert [goal["status"] for goal in ended(run)] == ["reached"]
+    assert math.degrees(shaft(run.robot, 1)) == pytest.approx(90 - 360, abs=1.0)
+
+
+def test_a_motion_that_turns_a_continuous_joint_the_longer_way_is_warned_of(tmp_path):
+    from dxlrun.compile.robot import compile_robot
+    from dxlrun.description.motion import read_motion
+    from dxlrun.description.reading import read_robot
+
+    motion = read_motion(written(tmp_path, FAR, "motion.yaml"), {})
+    for wraps, warned in (("", 1), ("wrap: true, ", 0)):
+        robot = read_robot(written(tmp_path, FAR_GOAL.replace("id: 1, ", f"id: 1, {wraps}")), {})
+        found = [one.what for one in compile_robot(robot, [motion], None).warnings if "turns by" in one.what]
+        assert found == ["reel turns by 458.4 deg from one point to the next"] * warned

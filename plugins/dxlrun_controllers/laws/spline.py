@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun import Floats
 
@@ -198,6 +199,24 @@ def flat_size(data: Floats) -> int:
     return _HEAD + count + 6 * joints + (count - 1) * order * joints
 
 
+def whole_turns(data: Floats, now: Floats, wrap: NDArray[np.bool_]) -> Floats:
+    """Return a flat trajectory with the joints of `wrap` moved by whole turns.
+
+    Their first point is at most half a turn from `now`, rad, shape (joints,).
+    """
+    count, joints, order = map(int, data[:START_IN].tolist())
+    ends = _HEAD + count
+    first = data[ends : ends + joints]
+    moved = np.where(wrap, -2 * np.pi * np.rint((first - now) / (2 * np.pi)), 0.0)
+    if not np.any(moved) or not np.isfinite(moved).all():
+        return data
+    shifted, body = data.copy(), ends + 6 * joints
+    shifted[ends : ends + joints] += moved
+    shifted[ends + 3 * joints : ends + 4 * joints] += moved
+    shifted[body : flat_size(data)].reshape(count - 1, order, joints)[:, 0] += moved
+    return shifted
+
+
 class Trajectory:
     """A trajectory that is being played: a bridge from where the joints are to its first point, then pieces.
 
@@ -299,6 +318,12 @@ class Trajectory:
         """Return the highest speed of each joint on the bridge, rad/s."""
         speeds: Floats = np.abs(peak_velocities(self._bridge, self.bridge_s)[0])
         return speeds
+
+    def longest_steps(self, now: SplineSample) -> Floats:
+        """Return the longest way of each joint from one point to the next, from `now` on, rad."""
+        points = np.vstack([now.position, self._first[0], *self._pieces[:, 0], self._last[0]])
+        steps: Floats = np.abs(np.diff(points, axis=0)).max(axis=0)
+        return steps
 
     def first_way(self, now: SplineSample) -> Floats:
         """Return the way from `now` to the first point, rad."""

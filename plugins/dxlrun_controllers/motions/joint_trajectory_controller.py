@@ -18,6 +18,7 @@ from dxlrun import (
     Context,
     Controller,
     Duration,
+    Floats,
     Goal,
     GoalTolerances,
     Interfaces,
@@ -38,7 +39,14 @@ from dxlrun_controllers.joints import (
     take_where_heard,
 )
 from dxlrun_controllers.laws.pid import feed_velocities_forward
-from dxlrun_controllers.laws.spline import DECELERATION, START_IN, Limits, SplineSample, flat_size
+from dxlrun_controllers.laws.spline import (
+    DECELERATION,
+    START_IN,
+    Limits,
+    SplineSample,
+    flat_size,
+    whole_turns,
+)
 from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
 from dxlrun_controllers.laws.tracks import Track, Tracks
 from dxlrun_controllers.motions.trajectory_command import (
@@ -88,6 +96,9 @@ class TrajectoryParameters(JointsParameters):
     """Time constant of the filter on the error's rate."""
     deceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]] | None = None
     """With which joints come to rest after a cancel or an abort; the joint's own limit if that is lower."""
+    wrap: tuple[str, ...] = ()
+    """Continuous joints that take the shorter way, as one turn more is the same place; left out: those with
+    `wrap: true`"""
     speed: Annotated[float, LIVE, Field(ge=0, le=10)] = 1.0
     """Factor of the trajectories' time: 0.5 is half as fast, 0 waits."""
 
@@ -100,6 +111,11 @@ class TrajectoryParameters(JointsParameters):
             raise ValueError(f"{self.command_interface} needs gains: add gains: {{p: ..., d: ...}}")
         if self.gains is not None and not tracks:
             raise ValueError("gains count only for velocity and effort; take them out")
+        for joint in self.wrap:
+            if joint not in self.joints:
+                raise ValueError(
+                    f"wrap names {joint}, which is not one of its joints ({', '.join(self.joints)})"
+                )
         return self
 
 
@@ -136,9 +152,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         Raises ValueError for a wrong size, unknown joints, or times that do not grow.
         """
         if isinstance(command, ChunkCommand):
-            return flat_chunk(command, parameters.joints)
+            return flat_chunk(command, parameters.joints, parameters.wrap)
         if isinstance(command, TrajectoryCommand):
-            return flat_trajectory(command, parameters.joints)
+            return flat_trajectory(command, parameters.joints, parameters.wrap)
         return super().prepare(kind, command, parameters)
 
     @classmethod
@@ -185,6 +201,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._within = self._own
         """Tolerances of the goal that is pursued."""
         self._lower, self._upper = limits.lower, limits.upper
+        self._wrap = np.array([joint in parameters.wrap for joint in joints])
+        self._turns = np.isinf(limits.upper) & np.isinf(limits.lower) & ~self._wrap
+        """Continuous joints to which a turn more is another place."""
         own = row_of(parameters.deceleration, joints, np.nan)
         deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = self._speed_limit = finite_or(limits.velocity, np.inf)
@@ -248,7 +267,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         since_s, more = self._warped(time_ns) - clock_s, data[flat_size(data) :]
         count = len(self._moved)
         track, moved = self._tracks.free(), more[-count:] != 0
-        track.trajectory.load(data, self._path_of(moved), waited_s)
+        begin = self._path_of(moved)
+        track.trajectory.load(whole_turns(data, begin.position, self._wrap & moved), begin, waited_s)
+        self._warn_of_turns(track.trajectory.longest_steps(begin) * moved)
         self._timeout_ns = float(more[0]) * 1e9
         self._within = self._own.replaced_by(more[1:], count)
         self._take(track, moved)
@@ -257,6 +278,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         else:
             self._tracks.follow(track, moved, clock_s)
             self._base_ns, self._base_s = time_ns, since_s
+
+    def _warn_of_turns(self, steps: Floats) -> None:
+        """Warn of steps by which a continuous joint turns the longer way."""
+        for row in np.flatnonzero(self._turns & (steps > np.pi * (1 + 1e-9))).tolist():
+            self.context.warn(
+                f"joint {self.context.joints[row]} turns by {math.degrees(steps[row]):.4g} deg "
+                "from one point to the next; write wrap: true for it if it shall take the shorter way"
+            )
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Pass into a chunk of positions; not where all of it is past, or a joint has not answered yet."""
@@ -269,7 +298,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         late_s, blend_s = (sent_ns - self._anchor_ns) * 1e-9, max(head.blend, self.context.period_ns * 1e-9)
         track, moved = self._tracks.free(), data[-len(self._moved) :] != 0
         begin = self._path_of(moved)
-        if track.trajectory.join(data[len(head) :], begin, late_s, blend_s, self._limits):
+        points = whole_turns(data[len(head) :], begin.position, self._wrap & moved)
+        if track.trajectory.join(points, begin, late_s, blend_s, self._limits):
             self._end(Outcome.PREEMPTED, time_ns, "a chunk of positions took its place")
             self._tracks.follow(track, moved, self._warped(time_ns))
             self._take(track, moved)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
@@ -153,7 +153,7 @@ class ChunkHead(NamedTuple):
     blend: float
 
 
-def flat_chunk(command: ChunkCommand, joints: tuple[str, ...]) -> Floats:
+def flat_chunk(command: ChunkCommand, joints: tuple[str, ...], wrap: Collection[str] = ()) -> Floats:
     """Return a chunk as a flat array: its head, and its trajectory with times from `now` on.
 
     Raises ValueError as `flat_trajectory` does.
@@ -161,12 +161,15 @@ def flat_chunk(command: ChunkCommand, joints: tuple[str, ...]) -> Floats:
     points = tuple(point.model_copy(update={"time": point.time - command.now}) for point in command.points)
     whole = TrajectoryCommand.model_construct(points=points, start_in=0.0, joints=command.joints)
     head = ChunkHead(command.now, command.blend)
-    return np.concatenate([head, flat_trajectory(whole, joints, smooth=True)])
+    return np.concatenate([head, flat_trajectory(whole, joints, wrap, smooth=True)])
 
 
-def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...], *, smooth: bool = False) -> Floats:
+def flat_trajectory(
+    command: TrajectoryCommand, joints: tuple[str, ...], wrap: Collection[str] = (), *, smooth: bool = False
+) -> Floats:
     """Return the command as a flat array: splines of all joints, time-out (s), tolerances, joints moved.
 
+    From point to point the joints of `wrap` take the shorter way, so that a position may be whole turns off.
     `smooth`: velocities that not all points have are chosen. Raises ValueError for a wrong size, unknown
     joints, or times that do not grow.
     """
@@ -195,6 +198,9 @@ def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...], *, smoo
             points[index, derivative, columns] = values
             given += given == derivative
         orders.append((LINEAR, CUBIC, QUINTIC)[given - 1])
+    for column in columns:
+        if joints[column] in wrap:
+            points[:, 0, column] = np.unwrap(points[:, 0, column])
     if smooth and LINEAR in orders:
         points[:, 1] = smooth_velocities(times, points[:, 0])
         orders = [CUBIC] * len(times)

@@ -120,6 +120,11 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     )
     if offer is None or parameters is None:
         return None
+    written = file.robot.controllers[name].parameters
+    wrapping = {joint for joint, described in file.robot.joints.items() if described.wrap}
+    if (found := wrapped(written, offer.controller.Parameters, wrapping)) is not written:
+        parameters = offer.controller.Parameters.model_validate(found)
+        plan = replace(plan, parameters=json.dumps(found))
     interfaces = _interfaces(file, name, offer, parameters)
     if interfaces is None:
         return None
@@ -134,6 +139,26 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
         mark = file.key("controllers", name)
         file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
     return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
+
+
+def wrapped(
+    parameters: dict[str, object], model: type[ParametersModel], wrapping: Collection[str]
+) -> dict[str, object]:
+    """Return the parameters of a controller with `wrap`, where they leave it out and some joints wrap.
+
+    A controller that cannot wrap them, such as one of velocities, keeps its own.
+    """
+    joints = parameters.get("joints")
+    if "wrap" not in model.model_fields or "wrap" in parameters or not isinstance(joints, list | tuple):
+        return parameters
+    if not (own := [joint for joint in joints if joint in wrapping]):
+        return parameters
+    found = {**parameters, "wrap": own}
+    try:
+        model.model_validate(found)
+    except Exception:  # a plug-in's code; the parameters as written are checked by themselves
+        return parameters
+    return found
 
 
 def entry_plan(name: str, entry: ControllerEntry, every: int) -> ControllerPlan:

@@ -13,7 +13,8 @@ controller leads the joints to the first point.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -88,6 +89,8 @@ def compile_motion(
         check_samples(samples, part.start + lead_ns, plans, problems, peaks)
         if not commands:
             continue
+        if kind == TRAJECTORY:
+            warn_of_turns(samples, plans, getattr(controller.parameters, "wrap", ()), problems)
         last_ns = part.start + lead_ns + samples[-1].t_ns
         if kind not in controller.offer.controller.Goals:
             goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
@@ -236,6 +239,32 @@ def _settle_ns(controller: CompiledController, joints: Mapping[str, JointPlan]) 
         return goal_time
     own = [joints[name].settle_ns for name in controller.plan.joints if name in joints]
     return max(own, default=0) or SETTLE_NS
+
+
+def warn_of_turns(
+    samples: Sequence[Sample],
+    joints: Mapping[str, JointPlan],
+    wrap: Collection[str],
+    problems: Problems,
+) -> None:
+    """Warn of the longest step of each continuous joint by which it turns the longer way."""
+    longest: dict[str, tuple[float, Mark]] = {}
+    before: dict[str, float] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            if target.position is None:
+                continue
+            step = abs(target.position - before.get(joint, target.position))
+            if step > longest.get(joint, (math.pi * (1 + 1e-9), target.mark))[0]:
+                longest[joint] = step, target.mark
+            before[joint] = target.position
+    for joint, (step, mark) in longest.items():
+        if joint in joints and joints[joint].continuous and not joints[joint].linear and joint not in wrap:
+            problems.warning(
+                mark,
+                f"{joint} turns by {math.degrees(step):.4g} deg from one point to the next",
+                f"write wrap: true for {joint} if it shall take the shorter way",
+            )
 
 
 def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:

@@ -16,7 +16,13 @@ from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.compile.controllers import CompiledController, class_plan, entry_plan, where_to_get
+from dxlrun.compile.controllers import (
+    CompiledController,
+    class_plan,
+    entry_plan,
+    where_to_get,
+    wrapped,
+)
 from dxlrun.compile.graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
@@ -281,6 +287,9 @@ class Preparation:
         if offer is None:
             hint = where_to_get(written.type, tuple(self.plugins.controllers), self.plugins.broken)
             raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
+        wrapping = {joint.name for joint in self.joints.values() if joint.wrap}
+        parameters = wrapped(written.parameters, offer.controller.Parameters, wrapping)
+        written = written.model_copy(update={"parameters": parameters})
         interfaces, topics = self._interfaces(name, offer, written)
         alone = replace(entry_plan(name, written, every=1), active=False)  # the loop knows its own rate
         plan = class_plan(alone, offer, interfaces, topics)

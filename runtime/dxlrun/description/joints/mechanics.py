@@ -84,8 +84,9 @@ class GoalTolerance(Form):
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Return the schema of a mapping, or of one value alone."""
-        mapping = handler.resolve_ref_schema(handler(core_schema))
-        return {"anyOf": [mapping["properties"][cls.alone]["anyOf"][0], dict(mapping)]}
+        mapping = dict(handler.resolve_ref_schema(handler(core_schema)))
+        values = [one for one in mapping["properties"][cls.alone]["anyOf"] if one != {"type": "null"}]
+        return mapping | {"anyOf": [{"type": mapping.pop("type")}, *values]}
 
 
 class SharedTolerance(GoalTolerance):
