@@ -42,7 +42,14 @@ class Robot:
         pass
 
     def send(
-        self, controller: str, kind: str, command: Any, *, units: bool = False, seconds: float | None = None
+        self,
+        controller: str,
+        kind: str,
+        command: Any,
+        *,
+        units: bool = False,
+        seconds: float | None = None,
+        goal: bool = False,
     ) -> Executed:
         self.requests.append(("send", controller, kind, command, seconds))
         self.begin()

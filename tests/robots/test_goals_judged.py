@@ -308,3 +308,50 @@ def test_a_motion_that_turns_a_continuous_joint_the_longer_way_is_warned_of(tmp_
         robot = read_robot(written(tmp_path, FAR_GOAL.replace("id: 1, ", f"id: 1, {wraps}")), {})
         found = [one.what for one in compile_robot(robot, [motion], None).warnings if "turns by" in one.what]
         assert found == ["reel turns by 458.4 deg from one point to the next"] * warned
+
+
+def weighted(directory: Path, keys: str) -> Path:
+    """Return a robot with a joint whose motor is known."""
+    motor = Path(__file__).parents[2] / "robots/motors/XM430-W350.motor.yaml"
+    written(directory, motor.read_text(), "a.motor.yaml")
+    text = f"""
+name: weight{BUSES}
+loop: {{rate: 50}}
+joints:
+  arm: {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, motor: a.motor.yaml, {keys}}}
+controllers:
+  arm: {{type: joint_trajectory_controller, joints: [arm]}}
+"""
+    return written(directory, text)
+
+
+@pytest.mark.parametrize(
+    ("keys", "warned"),
+    [
+        ("simulation: {gravity: 2 Nm}", "by 5.38 deg"),
+        ("simulation: {gravity: 5 Nm}", "so far"),
+        ("simulation: {gravity: 1 Nm}", ""),
+        ("simulation: {gravity: 2 Nm}, tolerance: 8 deg", ""),
+        ("simulation: {gravity: 2 Nm}, registers: {position_p_gain: 1600}", ""),
+        ("simulation: {gravity: 2 Nm}, registers: {position_i_gain: 100}", ""),
+        ("simulation: {gravity: 2 Nm}, limits: {position: [-10 deg, 10 deg]}", ""),
+    ],
+)
+def test_a_weight_that_keeps_a_joint_beyond_its_tolerance_is_warned_of(tmp_path, keys, warned):
+    from dxlrun.compile.robot import compile_robot
+    from dxlrun.description.reading import read_robot
+
+    robot = weighted(tmp_path, keys)
+    found = [one.what for one in compile_robot(read_robot(robot, {}), [], None).warnings]
+    found = [one for one in found if "a weight keeps arm off its goals" in one]
+    assert bool(found) is bool(warned), found
+    assert warned in "".join(found)
+
+
+@pytest.mark.parametrize(("gravity", "status"), [("2.5 Nm", "missed"), ("1 Nm", "reached")])
+def test_a_weight_that_is_warned_of_keeps_a_goal_from_being_reached(tmp_path, gravity, status):
+    asks = [Ask(0.2, "arm", "trajectory", way(90))]
+    run = steered(tmp_path, weighted(tmp_path, f"simulation: {{gravity: {gravity}}}"), 4.0, asks)
+    (goal,) = ended(run)
+    off = math.degrees(math.pi / 2 - shaft(run.robot, 1))
+    assert (goal["status"], off > 5.0) == (status, status == "missed"), (goal, off)

@@ -21,6 +21,7 @@ from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
     CompiledJoint,
     check_limp_joints,
+    check_tolerances,
     check_twins,
     compile_joints,
     compile_mechanics,
@@ -189,6 +190,7 @@ def compile_robot(
         check_orientations(file, body.urdf, frames, sensors, controllers)
     check_source_names(file, sources, (one.plan for one in controllers.values()))
     check_limp_joints(file, (one.plan for one in controllers.values()))
+    check_tolerances(file, joints, (one.plan for one in controllers.values()))
     check_robot(file, joints, urdf, controllers)
     check_motions(file, joints, controllers)
     modes = compile_modes(file, joints, controllers)

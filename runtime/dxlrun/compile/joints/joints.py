@@ -48,6 +48,11 @@ MOST_STARTING_S = 10.0
 _SAME = math.radians(1.0)  # References nearer than this are taken as equal: a horn has teeth, a trim has not
 
 
+_BY_ERROR = (("position",), ("position", "velocity"))
+"""Claims of controllers whose servos get nothing but where to go."""
+_I_GAIN = "position_i_gain"
+
+
 class CompiledJoint(msgspec.Struct, frozen=True):
     """A joint whose servos are known."""
 
@@ -276,6 +281,51 @@ def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) ->
                 f"write active: false, and `dxlrun torque on {' '.join(limp)}` before it is activated, or "
                 "take torque: off out",
             )
+
+
+def check_tolerances(
+    file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Iterable[ControllerPlan]
+) -> None:
+    """Warn of joints that a weight keeps beyond their tolerance, where their motor's model says so.
+
+    A servo in position control holds a weight by its error alone, unless a controller adds what holds it or
+    its I gain is not 0.
+    """
+    plans = [plan for plan in controllers if plan.commands_servos]
+    by_error = {name for plan in plans if plan.command in _BY_ERROR for name in plan.joints}
+    for name, joint in joints.items():
+        plan, described = joint.plan, joint.described
+        if name not in by_error or described.linear or _I_GAIN in getattr(described, "registers", {}):
+            continue
+        error = _static_error(joint)
+        if error is not None and error > plan.goal_tolerance:
+            off = "so far" if math.isinf(error) else f"by {degrees(error)} deg"
+            file.warning(
+                file.key("joints", name),
+                f"a weight keeps {name} off its goals {off} where it pulls most, beyond its tolerance of "
+                f"{degrees(plan.goal_tolerance)} deg: its goals there are missed",
+                "raise its P gain, add a controller that carries the weight, or write a larger tolerance",
+            )
+
+
+def _static_error(joint: CompiledJoint) -> float | None:
+    """Return the error by which a servo holds its weight at the worst pose within the limits, rad; None: the
+    model of its motor, or the weight, is not known; infinite: it cannot hold it."""
+    plan, given = joint.plan, joint.described.simulation
+    motor = plan.motor
+    if motor is None or not motor.stiffness:
+        return None
+    gravity, hangs_at = motor.load.gravity, motor.load.gravity_angle
+    if given.gravity is not None:
+        gravity, hangs_at = float(given.gravity), given.gravity_angle or 0.0
+    # the weight pulls most where it sticks out horizontally, or at the limit that is nearest to that
+    first = math.ceil((plan.lower - hangs_at - math.pi / 2) / math.pi)
+    sticks_out = first * math.pi + math.pi / 2 + hangs_at <= plan.upper
+    ends = max(abs(math.sin(end - hangs_at)) for end in (plan.lower, plan.upper))
+    pull = gravity * (1.0 if sticks_out else ends)
+    held = max(0.0, pull - motor.friction - motor.load_friction * pull)
+    duty = held * motor.resistance / (motor.torque_constant * motor.voltage)
+    return math.inf if duty > 1.0 else duty / motor.stiffness
 
 
 def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo) -> float | None:
