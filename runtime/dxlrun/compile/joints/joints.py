@@ -295,7 +295,7 @@ def check_tolerances(
     by_error = {name for plan in plans if plan.command in _BY_ERROR for name in plan.joints}
     for name, joint in joints.items():
         plan, described = joint.plan, joint.described
-        if name not in by_error or described.linear or _I_GAIN in getattr(described, "registers", {}):
+        if name not in by_error or plan.linear or _I_GAIN in getattr(described, "registers", {}):
             continue
         error = _static_error(joint)
         if error is not None and error > plan.goal_tolerance:
