@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from pydantic import Field
-from tests.kit.loops import PERIOD_NS, Robot
+from tests.kit.loops import PERIOD_NS, Hardware, Robot
 
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.commands import data_of
@@ -458,6 +458,62 @@ def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(story):
     assert (taken.kind, taken.numbers.tolist()) == ("play", [1.0, 2.0, 3.0, 4.0])
     assert data_of("", taken.text, taken.numbers) == taken.data
     assert len(story.events.texts(EventCode.STEERED)[0]) < 400
+
+
+@pytest.mark.parametrize(
+    ("asked", "velocity", "status", "why"),
+    [
+        (0.25, 0.0, "reached", "all commands were given"),
+        (0.30, 0.0, "reached", "all commands were given"),
+        (0.45, 0.0, "missed", "joint j1 is 11.46 deg off; all commands were given"),
+        (0.25, 4.38, "missed", "joint j1 still moves at 250.96 deg/s; all commands were given"),
+    ],
+)
+def test_the_last_positions_of_a_played_motion_are_its_goal(story, asked, velocity, status, why):
+    """The joint stands at 0.25 rad."""
+
+    def stand():
+        story.record.states.velocity[1] = velocity
+
+    part = {"controller": "leg", "kind": "go", "at_ns": [0], "sizes": [1], "end_ns": 0, "positions": [asked]}
+    command = msgspec.json.encode({"parts": [part]}) + b"\n" + np.array([0.5]).tobytes()
+    story.run(70, {1: stand, 2: story.posts("", "play", command)})
+    (_, ended) = story.reports[-1]
+    assert (ended.status, ended.text) == (status, why)
+    cycle = story.timed[-1][0]
+    assert cycle == (2 if status == "reached" else 52), "it waits for a second"
+
+
+def test_a_goal_that_is_judged_is_cancelled_by_its_controller_and_the_runtime(story):
+    story.mover.update = lambda self, *_: self.goal and (self.goal.judge(np.array([0.7])), self._done())
+    story.mover._done = lambda self: setattr(self, "goal", None)
+    story.run(20, {2: story.moves(1), 8: story.cancels()})
+    assert story.timed == [(2, "accepted"), (8, "cancelled")]
+    assert story.reports[-1][1].text == "stopped at its end"
+    assert story.done("cancel") == [(1,)]
+
+
+def test_a_command_takes_the_place_of_a_goal_that_is_judged(story):
+    story.mover.update = lambda self, *_: self.goal and (self.goal.judge(np.array([0.7])), self._done())
+    story.mover._done = lambda self: setattr(self, "goal", None)
+    story.run(20, {2: story.moves(1), 8: story.posts("arm", "nudge")})
+    assert story.timed == [(2, "accepted"), (8, "preempted")]
+
+
+def test_reached_is_judged_by_what_the_controller_commands(story, monkeypatch):
+    """The controller says that it is done; its joint is where it was."""
+
+    def update(self, *_):
+        if self.goal is not None:
+            self.context.commands.position.fill(0.4)
+            self.goal.end(Outcome.REACHED)
+            self.goal = None
+
+    story.mover.update = update
+    monkeypatch.setattr(Hardware, "read", lambda self: None)
+    story.run(70, {2: story.moves(1)})
+    assert story.timed == [(2, "accepted"), (52, "missed")]
+    assert story.reports[-1][1].text == "after 1.000 s, joint j0 is 8.59 deg off"
 
 
 def test_a_played_motion_is_cancelled(story):

@@ -92,3 +92,29 @@ def test_a_joint_that_rests_needs_no_torque(tmp_path):
     run = steered(tmp_path, robot_file(tmp_path, 2.0), 2.5, asks(), before=reset)
     assert {status for status, _, _ in ended(run).values()} == {"reached"}
     assert run.robot.buses[0].servo(1).position - math.pi == pytest.approx(0.7, abs=0.01)
+
+
+def jam(robot: VirtualRobot, number: int) -> None:
+    """Block a joint on its last 5 to 10 deg, so that its servo stays on; the gripper sooner."""
+    bus = robot.buses[0]
+    at_ns = 300_000_000 if JOINTS[number - 1] == "thumb" else 1_000_000_000
+    bus.at(at_ns, lambda: bus.servo(number).jam(True))
+
+
+def test_jammed_joints_miss_their_goals_and_a_gripper_says_that_it_stalled(tmp_path):
+    def begin(robot: VirtualRobot) -> None:
+        for number in range(1, 6):
+            jam(robot, number)
+
+    robot = robot_file(tmp_path, 2.0)
+    robot.write_text(robot.read_text().replace("direction: 1}", "direction: 1, tolerance: {time: 200 ms}}"))
+    run = steered(tmp_path, robot, 3.0, asks(), before=begin)
+    controllers = ("trajectory", "strict", "player", "grip", "samples")
+    for number, (controller, joint) in enumerate(zip(controllers, JOINTS, strict=False), 1):
+        status, named, text = ended(run)[controller]
+        off = 0.7 - (run.robot.buses[0].servo(number).position - math.pi)
+        assert named == joint, (controller, status, text)
+        if controller == "grip":
+            assert (status, text.split(",")[0]) == ("reached", "stalled"), text
+        else:
+            assert (status, off > 0.08, " deg off" in text) == ("missed", True, True), (controller, text)
