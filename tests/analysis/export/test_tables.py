@@ -63,7 +63,9 @@ def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: 
     goals = tables["goals"]
     sent = [message["progress"] for message in log.messages("/goals")]
     assert goals["progress"].to_pylist() == sent
-    assert goals["header.stamp.sec"].to_pylist() == [1] * len(sent)
+    stamps = [message["header"]["stamp"]["sec"] for message in log.messages("/goals")]
+    assert goals["header.stamp.sec"].to_pylist() == stamps
+    assert set(stamps) == {0, 1}
     assert tables["events"]["text"].to_pylist() == [event.text for event in log.events]
 
 
