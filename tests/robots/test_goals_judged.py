@@ -138,8 +138,12 @@ def test_a_jammed_gripper_under_a_trajectory_is_missed(tmp_path):
     (goal,) = ended(run)
     off = math.radians(40) - shaft(run.robot, 2)
     assert off > math.radians(30)
-    assert (goal["status"], goal["joint"]) == ("missed", "grip")
-    assert goal["error"] == pytest.approx(off, abs=0.01)
+    assert goal["joint"] == "grip"
+    if goal["status"] == "aborted":  # its servo has shut itself down for overload before
+        assert "grip has no torque" in goal["text"]
+    else:
+        assert goal["status"] == "missed"
+        assert goal["error"] == pytest.approx(off, abs=0.01)
     assert shaft(run.robot, 1) == pytest.approx(math.radians(40), abs=0.05)
 
 
