@@ -13,7 +13,7 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
-from dxlrun.dynamixel.servo.registers import compare
+from dxlrun.dynamixel.servo.registers import compare, merged
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
 from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -55,12 +55,13 @@ class SetUp:
                 self.dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
                 tool = lines[plan.name]
                 tool.speak(plan.protocol, plan.baud_rate)
-                problems = tool.run(extend_timeouts(_read_back(plan, servos)))
-                if not problems:
+                found = tool.run(extend_timeouts(_read_back(plan, servos)))
+                self.dialogue.say(*(f"{joint}: {text}" for joint, text in found.describe_deviations()))
+                if not found.problems:
                     count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
                     self.dialogue.say(f"Bus {plan.name}: {count} as in the robot file.")
                     break
-                self.dialogue.say(*problems)
+                self.dialogue.say(*found.problems)
                 if not yes(self.dialogue, "Look again?"):
                     return False
         return True
@@ -131,7 +132,10 @@ def factory_rate(table: ControlTable) -> int:
 
 
 def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
-    """Give a servo rate, ID and what its EEPROM shall hold; return what was done. Raises ServoFault."""
+    """Give a servo rate, ID and what its EEPROM shall hold; return what was done. Raises ServoFault.
+
+    Settings with which no run would start, such as a Secondary ID, become the factory's.
+    """
     done: list[str] = []
     if one.holds_torque():
         done += one.torque(False)
@@ -142,7 +146,14 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
             raise ServoFault(f"{error}; correct the robot file") from None
     if one.servo_id != servo.servo_id:
         done.append(change_id(one, servo.servo_id))
-    done += one.write(stored(one.table, plan, servo))
+    desired = stored(one.table, plan, servo)
+    declared = {register.name for register in desired}
+    refusing = (item for item in one.table.items.values() if item.deviation and item.deviation.may_refuse)
+    names = [item.name for item in refusing if item.area == "EEPROM"]
+    for each in one.deviations(one.read(names, refused=True)):
+        if each.refused and each.item.name not in declared:
+            desired = merged(desired, one.register(each.item.name, each.factory))
+    done += one.write(desired)
     return done or ["was as the robot file has it"]
 
 
@@ -164,7 +175,7 @@ def _named(plan: BusPlan, name: str) -> ServoPlan:
     return next(servo for servo in plan.servos if servo.own_name == name)
 
 
-def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[list[str]]:
+def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findings]:
     """Compare servos with the robot file as a start does, and all that setup has written."""
     survey = Findings()
     for servo in servos:
@@ -183,4 +194,4 @@ def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[list[str]]
                 survey.problems.append(f"{one} did not answer when {title} was read")
             elif each.differs:
                 survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
-    return survey.problems
+    return survey

@@ -152,7 +152,7 @@ def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):
     assert "holds torque in position mode at tick 1304, where it stood" in servo(1, "torque", "on", *NEW).out
     refused = servo(1, "id", "5", "--yes", *NEW)
     assert refused.code == 1
-    assert "holds torque, so ID (7) in its EEPROM is not written; switch the torque off" in refused.err
+    assert "holds torque, so ID (7) in its EEPROM was not written: switch the torque off" in refused.err
     assert "holds torque: its torque goes off" in servo(1, "reboot", *NEW).err
     assert "holds no torque" in servo(1, "torque", "off", *NEW).out
     assert "blinked 1 times" in servo(1, "blink", "1", *NEW).out

@@ -6,7 +6,7 @@ from tests.kit.rigs import make_x
 from dxlrun.dynamixel.control_table import control_table, decoded
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
-from dxlrun.dynamixel.servo.registers import settle, write_register
+from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.plan.bus_plan import RegisterValue
 from dxlrun.plan.transaction import Outcome, Reply
 
@@ -36,9 +36,13 @@ def played(program, *answers):
     ("answers", "problem"),
     [
         ((b"", b"\x10"), ""),
-        ((b"", b"\x03"), "was given Operating Mode (11) = 16, but has 3"),
-        ((b"", b"\x7f"), "was given Operating Mode (11) = 16, but has 127"),
+        ((b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\0"), "was given Operating Mode (11) = 16, but has 3"),
         ((b"", Outcome.TIMEOUT), "did not answer when Operating Mode (11) was read back"),
+        (
+            (b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\1"),
+            "holds torque, so Operating Mode (11) = 16 in its EEPROM was not written: switch its torque off "
+            "first",
+        ),
     ],
 )
 def test_an_item_counts_as_written_when_it_is_read_back(answers, problem):
@@ -50,7 +54,17 @@ def test_an_item_counts_as_written_when_it_is_read_back(answers, problem):
 def test_a_refused_write_is_not_read_back():
     problem, sent = played(ONE.write("operating_mode", 16), Outcome.REFUSED)
     assert problem.startswith("refuses Operating Mode (11) = 16: access error")
-    assert {instruction for instruction, _ in sent} == {WRITE}
+    assert (READ, 11) not in sent
+
+
+def test_a_refused_goal_names_the_register_that_bounds_it():
+    hundred, more = (100).to_bytes(2, "little"), (900).to_bytes(2, "little")
+    problem, sent = played(ONE.write("goal_pwm", -885), Outcome.REFUSED, hundred)
+    assert problem.startswith("refuses Goal PWM (100) = -885: ")
+    assert problem.endswith("; its PWM Limit (36) is 100: write 885 or more there")
+    assert sent == [(WRITE, 100), (READ, 36)]
+    problem, _ = played(ONE.write("goal_pwm", 885), Outcome.REFUSED, more)
+    assert "PWM Limit" not in problem
 
 
 def test_items_are_read_side_by_side_and_none_counts_where_one_does_not_come():
@@ -64,8 +78,8 @@ def test_items_are_read_side_by_side_and_none_counts_where_one_does_not_come():
 
 def test_a_register_is_written_again_until_it_is_read_back():
     right, wrong = (900).to_bytes(2, "little"), (800).to_bytes(2, "little")
-    assert played(write_register(ONE, GAIN), b"", wrong, b"", right)[0] == ""
-    problem, sent = played(write_register(ONE, GAIN), b"", wrong, b"", wrong, b"", wrong)
+    assert played(ONE.write(GAIN.name, GAIN.value), b"", wrong, b"", right)[0] == ""
+    problem, sent = played(ONE.write(GAIN.name, GAIN.value), b"", wrong, b"", wrong, b"", wrong)
     assert problem == "was given Position P Gain (84) = 900, but has 800"
     assert sent == [(WRITE, 84), (READ, 84)] * 3
 

@@ -139,7 +139,7 @@ def test_two_servos_of_one_id_are_not_dealt_with():
 @pytest.mark.parametrize(
     ("model", "poked", "change", "said"),
     [
-        ("AX-12A", {"lock": 1}, lambda one: one_servo.change_id(one, 7), r"Lock \(47\) is 1"),
+        ("AX-12A", {"lock": 1}, lambda one: one_servo.change_id(one, 7), r"has Lock \(47\) = 1"),
         ("AX-12A", {}, one_servo.reboot, "knows no reboot"),
         ("AX-12A", {}, one_servo.back_up, "no backup of their own"),
         ("XM430-W350", {}, one_servo.take_back, "refuses the restoring: result fail"),

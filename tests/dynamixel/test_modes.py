@@ -230,7 +230,8 @@ def test_a_servo_that_refuses_keeps_its_mode_and_its_torque():
     assert rig.states.mode.tolist() == [Mode.POSITION, Mode.POSITION]
     assert rig.torque() == [True, True]
     (text,) = rig.events.texts(EventCode.MODE)
-    assert "CCW Angle Limit (8) = 0" in text
+    assert "has Lock (47) = 1, so CCW Angle Limit (8) = 0 in its EEPROM was not written" in text
+    assert "switch its power off and on" in text
     assert "it is in position mode" in text
 
 
@@ -415,7 +416,7 @@ def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
 def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
     left = [Mode.VELOCITY]
     with arm.away(1, 20, 80):
-        looks = protocol2.read(1, 0, 2)
+        looks = protocol2.read(1, 0, 64)
         arm.when(lambda data: data == looks, lambda: left and arm.set_modes(left.pop(), 0))
     assert arm.states.mode[0] == Mode.VELOCITY
     assert len([text for text in arm.events.texts(EventCode.MODE) if "is in velocity mode" in text]) == 1

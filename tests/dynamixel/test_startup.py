@@ -76,8 +76,8 @@ def test_servos_that_are_all_silent_are_one_sentence_within_two_seconds():
             0,
             "did not answer 3 reads of Model Number (0): check its cable and power",
         ),
-        (make_plan((1, 6), model="MX-106"), "drive_mode", 1, "so it turns the other way round"),
-        (make_plan((1, 6), model="EX-106+"), "drive_mode", 1, "so it turns the other way round"),
+        (make_plan((1, 6), model="MX-106"), "drive_mode", 1, "which turns it the other way round"),
+        (make_plan((1, 6), model="EX-106+"), "drive_mode", 1, "which turns it the other way round"),
         (
             make_x((1, 6)),
             "status_return_level",

@@ -30,7 +30,7 @@ from dxlrun.output.terminal import print_error, print_warning, show, show_json
 if TYPE_CHECKING:
     from dxlrun.compile.report import PolicyRow, Row
     from dxlrun.compile.robot import Compiled
-    from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
+    from dxlrun.dynamixel.tools.inspection import DeviationRow, Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
@@ -87,7 +87,7 @@ def check(
         if not graph:
             show(result.drawing)
     if found is not None:
-        show(_registers(found.registers), _compared(found))
+        show(_registers(found.registers), _deviations(found.deviations), _compared(found))
     for warning in result.warnings:
         print_warning(str(warning))
     if found is None:
@@ -325,7 +325,7 @@ def _buses(buses: Sequence[Row], rate: float) -> Table:
 def _compared(found: Found) -> str:
     """Return in one line that servos were read, and how many differences there are."""
     differing = sum(row.found not in (None, row.declared) for row in found.registers)
-    count = differing + len(found.remarks)
+    count = differing + len(found.deviations) + len(found.remarks)
     differences = counted(count, "difference", "differences") if count else "no differences"
     start = "; a run would not start" if found.problems else ""
     return f"{counted(found.compared, 'servo', 'servos')} compared with the file, {differences}{start}"
@@ -345,3 +345,13 @@ def _registers(registers: Sequence[RegisterRow]) -> Table:
         for row in registers
     ]
     return Table.of("Registers", columns, rows)
+
+
+def _deviations(deviations: Sequence[DeviationRow]) -> Table:
+    """Return the settings that are not the factory's, and that the file does not declare."""
+    columns: Columns[DeviationRow] = [
+        *_named("name", joint="joint", servo="servo", item="item", area="area"),
+        *_named("number", address="address", found="found", factory="factory"),
+        *_named("text", effect="effect"),
+    ]
+    return Table.listing("Settings that are not the factory's", columns, deviations)

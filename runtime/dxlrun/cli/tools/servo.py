@@ -19,7 +19,7 @@ from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+    from dxlrun.dynamixel.control_table import ControlItem, ControlTable, FoundDeviation
     from dxlrun.dynamixel.control_table.device_table import DeviceTable
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -154,16 +154,22 @@ def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) 
             "baud_rate": one.baud_rate,
         }
         result = {"servo": identity, "verb": verb, "done": asked.done, "declined": asked.declined}
-        show_json(result | {"registers": asked.registers})
+        deviations = {
+            each.item.name: {"factory": each.factory, "judgement": each.judgement, "effect": each.effect}
+            for each in asked.deviations
+        }
+        show_json(result | {"registers": asked.registers, "deviations": deviations})
         return
     if verb == "get":
-        show(_registers(asked.registers, one.table))
+        show(_registers(asked.registers, one.table, asked.deviations))
     show(*(f"{one.called}: {sentence}" for sentence in asked.done))
     if asked.declined:
         show("nothing was changed")
 
 
-def _registers(values: Mapping[str, int], table: ControlTable | DeviceTable) -> Table:
+def _registers(
+    values: Mapping[str, int], table: ControlTable | DeviceTable, deviations: Sequence[FoundDeviation]
+) -> Table:
     from dxlrun.dynamixel.control_table import ControlTable
     from dxlrun.dynamixel.servo.registers import meaning
     from dxlrun.output.table import Column, Table
@@ -178,9 +184,18 @@ def _registers(values: Mapping[str, int], table: ControlTable | DeviceTable) -> 
         Column("access", "name"),
         Column("value"),
         Column("is", "name"),
+        Column("a start", "text"),
     ]
+    judged = {
+        each.item.name: f"{each.judgement}s it, as it {each.effect} (factory: {each.factory})"
+        for each in deviations
+    }
     rows = [
-        (name, item.address, item.area, item.access, value, meaning(item, value, errors))
+        (
+            name,
+            *(item.address, item.area, item.access),
+            *(value, meaning(item, value, errors), judged.get(name, "")),
+        )
         for name, value in values.items()
         for item in (items[name],)
     ]
@@ -201,6 +216,8 @@ class Asked:
     """What was done, one sentence each."""
     registers: dict[str, int] = field(default_factory=dict)
     """What was read, by item."""
+    deviations: Sequence[FoundDeviation] = ()
+    """What of it is not the factory's and matters to a run."""
     declined: bool = False
 
     def confirmed(self, question: str) -> bool:
@@ -271,6 +288,7 @@ def _device_value(table: DeviceTable, name: str, text: str) -> int:
 
 
 def _get(one: OneServo | OneDevice, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.errors import suggestion
 
     names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))
@@ -281,6 +299,8 @@ def _get(one: OneServo | OneDevice, asked: Asked) -> None:
             "\n".join(f"an {one.table.model} has no {name}; {suggestion(name, known)}" for name in wrong)
         )
     asked.registers |= one.read(names, refused=not asked.words)
+    if isinstance(one, OneServo):
+        asked.deviations = one.deviations(asked.registers)
 
 
 def _set(one: OneServo, asked: Asked) -> None:

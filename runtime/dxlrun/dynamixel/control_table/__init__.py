@@ -23,5 +23,7 @@ from dxlrun.dynamixel.control_table.table import ControlItem as ControlItem
 from dxlrun.dynamixel.control_table.table import ControlTable as ControlTable
 from dxlrun.dynamixel.control_table.table import EffortUnit as EffortUnit
 from dxlrun.dynamixel.control_table.table import Encoding as Encoding
+from dxlrun.dynamixel.control_table.table import FoundDeviation as FoundDeviation
 from dxlrun.dynamixel.control_table.table import decoded as decoded
+from dxlrun.dynamixel.control_table.table import find_deviations as find_deviations
 from dxlrun.dynamixel.control_table.table import side_by_side as side_by_side

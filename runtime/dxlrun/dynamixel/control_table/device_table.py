@@ -85,7 +85,7 @@ class DeviceItem(ControlItem, frozen=True):
         return decoded(data, self.encoding) * self.scale + self.offset
 
 
-_KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware"}
+_KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
 
 
 class DeviceTable(Table[DeviceItem], frozen=True, kw_only=True):

@@ -13,6 +13,7 @@ from typing import TypeAlias, get_args, get_type_hints
 
 import msgspec
 
+from dxlrun.dynamixel.control_table.deviation import deviation_of
 from dxlrun.dynamixel.control_table.hardware_errors import STATUS_BYTE, HardwareErrors, error_item
 from dxlrun.dynamixel.control_table.table import (
     CAPABILITIES,
@@ -265,6 +266,8 @@ def _items(entries: Entry) -> Iterator[ControlItem]:
     """Yield items; one that has a `repeat` is the first of as many: `indirect_address_1` of 1 to 28."""
     for name, value in entries.items():
         entry = section(value)
+        if entry.get("access") == "RW":
+            entry = {"deviation": deviation_of(name), **entry}
         if "repeat" not in entry:
             yield read_item(name, entry, ControlItem)
             continue

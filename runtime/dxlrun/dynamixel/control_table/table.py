@@ -9,6 +9,7 @@ from typing import Generic, Literal, TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from dxlrun.dynamixel.control_table.deviation import Deviation, Judgement
 from dxlrun.dynamixel.control_table.hardware_errors import HardwareErrors, error_item
 
 Access = Literal["R", "RW"]
@@ -17,6 +18,8 @@ Encoding = Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
 """`float32`: IEEE 754's binary32, of devices alone; its integer on the wire is that of its four bytes."""
 EffortUnit = Literal["1", "A", "Nm"]
 
+_TITLES = {"id": "ID", "cw": "CW", "ccw": "CCW", "led": "LED", "pwm": "PWM", "shadow": "(Shadow)"}
+"""Words of item names that are not merely capitalized."""
 SIGN_BIT = 10
 """Direction bit of sign-magnitude items: 0 counter-clockwise, 1 clockwise (e-Manual, Present Speed (38))."""
 _HIGHEST_VOLTAGE = 4 / 3
@@ -44,6 +47,8 @@ class ControlItem(msgspec.Struct, frozen=True):
     scale: float  # SI units per tick
     page: str  # Section of the manual's page of this model
     firmware: int = 0  # First firmware version that has the item; 0: every one
+    deviation: Deviation | None = None
+    """Judgement of other values than the factory's; None where the item can only be read."""
 
     def encode(self, raw: int) -> bytes:
         """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
@@ -75,12 +80,20 @@ class ControlItem(msgspec.Struct, frozen=True):
         """Return the integer on the wire that the item's own bytes are, signed where the item is."""
         return int.from_bytes(data, "little", signed=self.signed)
 
+    def wire_bytes(self, value: int) -> bytes:
+        """Return the bytes of an integer on the wire, one below 0 in two's complement."""
+        return value.to_bytes(self.size, "little", signed=value < 0)
+
     @property
     def title(self) -> str:
         """The item as the e-Manual writes it: `Torque Enable (24)`."""
-        small = {"id": "ID", "cw": "CW", "ccw": "CCW"}
-        words = (small.get(word, word.capitalize()) for word in self.name.split("_"))
+        words = (_TITLES.get(word, word.capitalize()) for word in self.name.split("_"))
         return f"{' '.join(words)} ({self.address})"
+
+    @property
+    def limited_by(self) -> str:
+        """Name of the item that bounds this one; empty: none does."""
+        return "" if self.deviation is None else self.deviation.limited_by
 
     @property
     def signed(self) -> bool:
@@ -222,3 +235,45 @@ def decoded(items: Iterable[ControlItem], start: int, data: bytes | memoryview) 
         if 0 <= at <= len(data) - item.size:
             found[item.name] = item.decode(data[at : at + item.size])
     return found
+
+
+class FoundDeviation(msgspec.Struct, frozen=True):
+    """A value of an item that is not the factory's, and matters."""
+
+    item: ControlItem
+    found: int
+    factory: int
+    judgement: Judgement
+    effect: str  # What the value does: a verb with its object
+
+    @property
+    def refused(self) -> bool:
+        """True when the servo gets no torque with this value."""
+        return self.judgement == "refuse"
+
+    @property
+    def text(self) -> str:
+        """Both values, for a message: `PWM Limit (36) = 100 instead of 885`."""
+        return f"{self.item.title} = {self.found} instead of {self.factory}"
+
+
+def find_deviations(items: Iterable[ControlItem], values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
+    """Return which values of a servo are not the factory's and matter, in the order of addresses.
+
+    Items without a value are not judged; neither are those without a factory value, and those that are
+    compared with the plan of a run instead.
+    """
+    found: list[FoundDeviation] = []
+    for item in items:
+        rule, value = item.deviation, values.get(item.name)
+        if item.access == "R" or rule is None or rule.planned or value is None:
+            continue
+        factory = item.initial
+        if factory is None:
+            factory = values.get(item.limited_by)
+            if factory is None or (value and abs(value) >= factory):
+                continue  # the item that bounds it may have been lowered since power-up
+        judgement = rule.judge(value, factory)
+        if judgement != "harmless":
+            found.append(FoundDeviation(item, value, factory, judgement, rule.effect_of(value)))
+    return tuple(found)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, decoded, side_by_side
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import limit_patience, retry, setup_line
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
+
+NEAR = 16  # Bytes between two items for which another read would take longer than to read them
+LONGEST_READ = 64  # Bytes; a longer reply would not fit between two cycles
 
 
 class Access(NamedTuple):
@@ -71,17 +74,89 @@ class Access(NamedTuple):
             found |= decoded(block, start, reply.parameters)
         return found
 
+    def read_near(self, names: Iterable[str]) -> Program[tuple[dict[str, int], Reply]]:
+        """Read items with few reads: what is between two that are near each other is read with them.
+
+        A servo that refuses such a read is read without what is between. Returns the items, and the reply to
+        the last read: where that is not answered, the items are not complete.
+        """
+        found, reply = dict[str, int](), Reply(Outcome.OK, 0, b"", 0, 0, False)
+        for near in _near(self.items[name] for name in names):
+            reply = yield from self._read_into(found, near)
+            if reply.outcome is Outcome.REFUSED:
+                for block in side_by_side(near):
+                    reply = yield from self._read_into(found, block)
+                    if not reply.answered:
+                        break
+            if not reply.answered:
+                break
+        return found, reply
+
+    def _read_into(self, found: dict[str, int], block: Sequence[ControlItem]) -> Program[Reply]:
+        start, end = block[0].address, block[-1].address + block[-1].size
+        reply = yield from self.read_bytes(start, end - start)
+        if reply.answered:
+            found |= decoded(block, start, reply.parameters)
+        return reply
+
     def write(self, name: str, value: int) -> Program[str]:
-        """Write an item and read it back; return what went wrong, behind the servo's name, or nothing."""
-        item = self.items[name]
-        reply = yield from self.write_bytes(item.address, item.encode(value))
-        if reply.outcome is Outcome.REFUSED:
-            return f"refuses {item.title} = {value}{self.reason(reply)}"
-        back = yield from self.read_bytes(item.address, item.size)
-        if not back.answered:
-            return f"did not answer when {item.title} was read back"
-        found = item.decode(back.parameters)
-        return "" if found == value else f"was given {item.title} = {value}, but has {found}"
+        """Write an item, the integer on the wire, and read it back.
+
+        The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by
+        Status Return Level, and EEPROM wears. Returns what went wrong, after the servo's name, or nothing.
+        """
+        item, problem = self.items[name], ""
+        for _ in range(ATTEMPTS):
+            written = yield self.writing(item.address, item.wire_bytes(value))
+            if written.outcome is Outcome.REFUSED:
+                problem = f"refuses {item.title} = {value}{self.reason(written)}"
+                break
+            back = yield from self.read_bytes(item.address, item.size)
+            if not back.answered:
+                problem = f"did not answer when {item.title} was read back"
+                continue
+            found = item.integer(back.parameters[: item.size])
+            if found == value:
+                return ""
+            problem = f"was given {item.title} = {value}, but has {found}"
+        return (yield from self._explain(item, value, problem))
+
+    def _explain(self, item: ControlItem, value: int, problem: str) -> Program[str]:
+        """Return why a value was not taken: the closed EEPROM, or the item that bounds it; else `problem`."""
+        if item.area == "EEPROM":
+            closed = yield from self.closed_eeprom(f"{item.title} = {value}", unread=problem)
+            return closed or problem
+        bound = yield from self.read_bound(item.name)
+        if bound is None or abs(value) <= bound:
+            return problem
+        title = self.items[item.limited_by].title
+        return f"{problem}; its {title} is {bound}: write {abs(value)} or more there"
+
+    def read_bound(self, name: str) -> Program[int | None]:
+        """Read the item that bounds another one, such as PWM Limit of Goal PWM; None: none is known."""
+        return (yield from self.read_one(self.items[name].limited_by))
+
+    def closed_eeprom(self, names: str, *, release: str = "", unread: str = "") -> Program[str]:
+        """Return why nothing can be written into the EEPROM now, and the remedy; nothing where it can.
+
+        Lock (47) closes the EEPROM of Protocol 1.0 until the power is switched off (e-Manual AX-12A, Lock
+        (47)), torque that of Protocol 2.0 (e-Manual XM430-W350, Control Table of EEPROM Area).
+
+        Args:
+            names: What is to be written.
+            release: Remedy where the servo holds torque.
+            unread: Sentence for a servo that does not answer; by default a sentence about its torque.
+        """
+        if (yield from self.read_one("lock")):
+            lock = self.items["lock"].title
+            return f"has {lock} = 1, so {names} in its EEPROM was not written: switch its power off and on"
+        torque = yield from self.read_torque()
+        if not torque.answered:
+            return unread or f"did not answer when its torque was read, so {names} was not written"
+        if torque.parameters[0]:
+            release = release or "switch its torque off first"
+            return f"holds torque, so {names} in its EEPROM was not written: {release}"
+        return ""
 
     def read_torque(self) -> Program[Reply]:
         """Read torque enable."""
@@ -111,3 +186,17 @@ def reach(plan: BusPlan, servo: ServoPlan) -> Access:
 def first_reach(plan: BusPlan, servo: ServoPlan) -> Access:
     """Return the access to a servo before its return delay is known."""
     return Access(plan, servo, setup_line(plan))
+
+
+def _near(items: Iterable[ControlItem]) -> list[list[ControlItem]]:
+    """Group items by address, so that one read gets a group with what is between."""
+    groups: list[list[ControlItem]] = []
+    for item in sorted(items, key=lambda one: one.address):
+        if groups:
+            first, last = groups[-1][0], groups[-1][-1]
+            gap = item.address - last.address - last.size
+            if gap <= NEAR and item.address + item.size - first.address <= LONGEST_READ:
+                groups[-1].append(item)
+                continue
+        groups.append([item])
+    return groups

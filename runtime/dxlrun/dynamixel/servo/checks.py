@@ -1,21 +1,28 @@
 """Checks: what must hold for a servo before it may get torque, at the start and when it returns.
 
-`CHECKS` is the table: control item, predicate, sentence. `inspect` reads the items of one servo and walks the
-table; `survey` looks at a whole bus: presence, registers, states. All of it only reads.
+`CHECKS` is the table of what is compared with the plan: control item, predicate, sentence. Every other
+setting that is not the factory's is judged by its control table (`deviations.toml`). `inspect` reads one
+servo and does both; `survey` looks at a whole bus: presence, registers, states. All of it only reads.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, HardwareErrors, decoded
+from dxlrun.dynamixel.control_table import (
+    ControlItem,
+    FoundDeviation,
+    HardwareErrors,
+    control_table,
+    find_deviations,
+)
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
@@ -34,55 +41,7 @@ LISTEN_NS = 2_000_000
 STATUS_ERROR = "status_error"
 """Stands in for a control item: the error byte of Protocol 1.0; in 2.0 an item has the hardware errors."""
 
-_BLOCKS: Mapping[float, tuple[tuple[str, str], ...]] = MappingProxyType(
-    {
-        1.0: (
-            ("model_number", "firmware_version"),
-            ("return_delay_time", "ccw_angle_limit"),
-            ("status_return_level", "status_return_level"),
-            ("torque_enable", "torque_limit"),
-            ("multi_turn_offset", "multi_turn_offset"),
-            ("resolution_divider", "resolution_divider"),
-            ("drive_mode", "drive_mode"),
-        ),
-        2.0: tuple(
-            (name, name)
-            for name in (
-                "model_number",
-                "firmware_version",
-                "return_delay_time",
-                "drive_mode",
-                "operating_mode",
-                "control_mode",
-                "homing_offset",
-                "min_position_limit",
-                "max_position_limit",
-                "cw_angle_limit",
-                "ccw_angle_limit",
-                "startup_configuration",
-                "profile_acceleration",
-                "torque_enable",
-                "status_return_level",
-                "hardware_error_status",
-                "error_code",
-                "bus_watchdog",
-            )
-        ),
-    }
-)
-"""What is read of a servo, by protocol: from the first item to the last in one read, where the model has
-them. Models of Protocol 2.0 differ in what stands side by side, so there each item is read by itself."""
-_DRIVE_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        0x01: "turns the other way round",
-        0x02: "follows another servo",
-        0x04: "takes profiles for times",
-        0x08: "switches torque on by every goal",
-    }
-)
-"""e-Manual XM430-W350, XM540, Drive Mode (10)"""
-
-
+_IDENTITY_AND_MODE = {"model_number", "firmware_version", "operating_mode", "control_mode"}
 _MOST_NAMED = 4  # Servos that a sentence about several names
 _SIMULATED = "sim"
 
@@ -111,15 +70,6 @@ class Check(NamedTuple):
     sentence: Callable[[Inspected, int], str]
     """What is wrong and how to fix it, behind the servo's name."""
     refuses: bool = True  # The servo gets no torque; False: the difference is reported
-
-
-def _neutral(item: str, value: int, why: Callable[[Inspected, int], str]) -> Check:
-    """Return the check of a register that must have the one value that the plan counts on."""
-    return Check(
-        item,
-        lambda _, raw: raw != value,
-        lambda found, raw: f"has {found.title(item)} = {raw}, {why(found, raw)}: write {value} there",
-    )
 
 
 def _limits(low: str, high: str, names: str) -> Check:
@@ -166,12 +116,6 @@ def _return_delay_sentence(found: Inspected, raw: int) -> str:
     )
 
 
-def _drive_mode_reason(found: Inspected, raw: int) -> str:
-    if found.plan.protocol == 1.0:
-        return "so it turns the other way round or follows another servo"
-    return f"so it {' and '.join(words for bit, words in _DRIVE_BITS.items() if raw & bit) or 'is unknown'}"
-
-
 def _watchdog_sentence(found: Inspected, raw: int) -> str:
     item = found.items["bus_watchdog"]
     what = f"it would stop after {raw * 20} ms without an instruction"
@@ -201,34 +145,8 @@ CHECKS: tuple[Check, ...] = (
         _return_delay_sentence,
         refuses=False,
     ),
-    Check(
-        "status_return_level",
-        lambda _, level: level != RETURN_ALL,
-        lambda found, level: (
-            f"has {found.title('status_return_level')} = {level}, so it acknowledges no write: write "
-            f"{RETURN_ALL} there"
-        ),
-    ),
-    _neutral("drive_mode", 0, _drive_mode_reason),
-    _neutral("homing_offset", 0, lambda *_: "which shifts every position"),
-    _neutral("multi_turn_offset", 0, lambda *_: "which shifts every position"),
-    _neutral("resolution_divider", 1, lambda *_: "which changes what a tick is"),
     _limits("min_position_limit", "max_position_limit", "position limits"),
     _limits("cw_angle_limit", "ccw_angle_limit", "angle limits"),
-    Check(
-        "startup_configuration",
-        lambda _, raw: bool(raw & 0x01),
-        lambda found, raw: (
-            f"has {found.title('startup_configuration')} = {raw}, so it switches torque on by itself at "
-            "power-up: clear bit 0"
-        ),
-    ),
-    Check(
-        "startup_configuration",
-        lambda _, raw: bool(raw & 0x02),
-        lambda *_: "Startup Configuration bit 1 is set: RAM comes from the backup at power-up",
-        refuses=False,
-    ),
     *(
         Check(
             item,
@@ -252,15 +170,6 @@ CHECKS: tuple[Check, ...] = (
         _watchdog_sentence,
         refuses=False,
     ),
-    Check(  # a ramp that another program left in RAM: a run does not write it
-        "profile_acceleration",
-        lambda found, raw: raw not in (0, found.items["profile_acceleration"].initial),
-        lambda found, raw: (
-            f"{found.title('profile_acceleration')} is {raw}: it reaches its goals late; write 0 there, or "
-            "switch it off and on"
-        ),
-        refuses=False,
-    ),
     Check(
         "torque_enable",
         lambda found, enabled: enabled != 0 and not found.take_over,
@@ -271,7 +180,7 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "torque_limit",
-        lambda _, raw: raw == 0,
+        lambda found, raw: raw == 0 and found.plan.protocol == 1.0,
         lambda found, _: (
             f"has {found.title('torque_limit')} = 0: it shut itself down after overload or overheating; find "
             "the cause, then switch its power off and on"
@@ -306,29 +215,26 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
 
 
 def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
-    """Read what must fit the plan, and walk the table.
+    """Read the registers that matter, walk the table, and judge what another program left there.
 
     Returns the mode in which the servo is, which is brought into its first one before it gets torque; None
     when it cannot be read.
     """
-    plan, servo, items = one.plan, one.servo, one.items
+    plan, servo = one.plan, one.servo
+    wanted = _inspected(servo.model, plan.protocol)
+    read, reply = yield from one.read_near(wanted)
+    if not reply.answered:
+        title = next(one.items[name].title for name in wanted if name not in read)
+        found.problems.append(f"{one} {_unreadable(one, title, reply)}")
+        return None
+    items = one.table.with_firmware(read["firmware_version"]).items
     declared = {each.name: each.value for each in servo.registers}
-    values: dict[str, int] = {}
-    for first, last in _BLOCKS[plan.protocol]:
-        if first not in items or items[first].firmware > values.get("firmware_version", 1 << 16):
-            continue
-        start, end = items[first].address, items[last].address + items[last].size
-        reply = yield from one.read_bytes(start, end - start)
-        if not reply.answered:
-            found.problems.append(f"{one} {_unreadable(one, items[first].title, reply)}")
-            return None
-        read = decoded(items.values(), start, reply.parameters)
-        values |= {name: declared.get(name, raw) for name, raw in read.items()}
-        if plan.protocol == 1.0 and first == "torque_enable":
-            values[STATUS_ERROR] = reply.error
+    values = {name: declared.get(name, raw) for name, raw in read.items() if name in items}
+    if plan.protocol == 1.0:
+        values[STATUS_ERROR] = reply.error
     text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
     found.note(EventCode.SETUP, Severity.INFO, servo.joint, text)
-    inspected = Inspected(plan, servo, items, values, one.table.errors, take_over)
+    inspected = Inspected(plan, servo, one.items, values, one.table.errors, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
             sentence = check.sentence(inspected, values[check.item])
@@ -337,7 +243,52 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
             else:
                 found.note(EventCode.REGISTER_DIFFERS, Severity.WARNING, servo.joint, sentence)
     # torque control mode of Protocol 1.0 is RAM, and only of some models: it is not read here
-    return mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
+    mode = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
+    for each in deviations(one, values, mode, declared):
+        if each.refused:
+            found.problems.append(f"{one} {_refusal(one, each)}")
+        else:
+            found.deviations.append((servo.joint, f"ID {servo.servo_id} on bus {plan.name}", each))
+    return mode
+
+
+def deviations(
+    one: Access, values: Mapping[str, int], mode: Mode, declared: Collection[str] = ()
+) -> tuple[FoundDeviation, ...]:
+    """Return which values of a servo are not the factory's and matter.
+
+    Neither `declared` items nor the goals of its mode, or of that in which it starts, are judged: these are
+    written before torque.
+    """
+    known = one.servo.modes
+    goals = [goal for each in known if each.mode in (mode, one.servo.start_mode) for goal in each.goals]
+    return find_deviations(
+        (
+            item
+            for item in one.items.values()
+            if item.name not in declared
+            and not any(goal.address <= item.address < goal.address + goal.length for goal in goals)
+        ),
+        values,
+    )
+
+
+@functools.cache
+def _inspected(model: str, protocol: float) -> tuple[str, ...]:
+    """Return the items of a model that a start looks at."""
+    items = control_table(model, protocol).items
+    names = {check.item for check in CHECKS} | _IDENTITY_AND_MODE
+    for item in items.values():
+        if item.access == "RW" and item.deviation is not None and item.deviation.judgement != "harmless":
+            names |= {item.name, item.limited_by}
+    return tuple(name for name in items if name in names)
+
+
+def _refusal(one: Access, found: FoundDeviation) -> str:
+    item = found.item
+    command = f"dxlrun servo {one.plan.port} {one.servo.servo_id} set {item.name} {found.factory}"
+    how = "" if one.plan.port == _SIMULATED else f" (`{command}`)"
+    return f"has {item.title} = {found.found}, which {found.effect}: write {found.factory} there{how}"
 
 
 def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:

@@ -277,11 +277,12 @@ def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled
     declared = {register.name for register in one.servo.registers}
     for name, value in kept.items():
         # what had its initial value begins with the one of the new mode, which may be another
-        if (
-            now[name] != value
-            and (value != one.items[name].initial or name in declared)
-            and (problem := (yield from one.write(name, value)))
-        ):
+        if now[name] == value or (value == one.items[name].initial and name not in declared):
+            continue
+        # a lower limit, written after the last power-up, would refuse it
+        bound = yield from one.read_bound(name)
+        kept_value = value if bound is None else max(-bound, min(value, bound))
+        if now[name] != kept_value and (problem := (yield from one.write(name, kept_value))):
             return problem
     return ""
 

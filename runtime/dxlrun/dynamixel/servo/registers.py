@@ -14,10 +14,11 @@ import msgspec
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.control_table import ControlItem, HardwareErrors
 from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.retry import ATTEMPTS
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue
-from dxlrun.plan.transaction import Outcome, Program
+from dxlrun.plan.transaction import Program
+
+_RELEASE = "switch its torque off and start again, without --take-over"
 
 
 class RegisterDifference(msgspec.Struct, frozen=True):
@@ -44,7 +45,7 @@ def compare(one: Access, registers: Sequence[RegisterValue]) -> Program[tuple[Re
 def settle(one: Access, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
     """Write the registers that a servo has otherwise, and read them back; return what it had, by item.
 
-    Nothing is written when one cannot be read, and no EEPROM while the servo holds torque.
+    Nothing is written when one cannot be read, or when the EEPROM is closed to one of them.
     """
     differences = yield from compare(one, registers)
     before = {each.register.name: each.found for each in differences if each.found is not None}
@@ -53,11 +54,11 @@ def settle(one: Access, registers: Sequence[RegisterValue], found: Findings) -> 
         return before
     differing = [each.register for each in differences if each.differs]
     stored = [register for register in differing if register.eeprom]
-    if stored and (problem := (yield from _torqued(one, stored))):
+    if stored and (problem := (yield from one.closed_eeprom(_names(one, stored), release=_RELEASE))):
         found.problems.append(f"{one} {problem}")
         return before
     for register in differing:
-        if problem := (yield from write_register(one, register)):
+        if problem := (yield from one.write(register.name, register.value)):
             found.problems.append(f"{one} {problem}")
         else:
             item = one.items[register.name]
@@ -75,26 +76,6 @@ def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
     """Return registers with one of them changed, or one more behind the others."""
     return tuple({**{one.name: one for one in registers}, newer.name: newer}.values())
-
-
-def write_register(one: Access, register: RegisterValue) -> Program[str]:
-    """Write one register and read it back; return what went wrong, or nothing.
-
-    The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by Status
-    Return Level, and EEPROM wears.
-    """
-    item, problem = one.items[register.name], ""
-    for _ in range(ATTEMPTS):
-        written = yield one.writing(register.address, register.data)
-        if written.outcome is Outcome.REFUSED:
-            return f"refuses {item.title} = {register.value}{one.reason(written)}"
-        found = yield from _integer(one, register)
-        if found == register.value:
-            return ""
-        problem = f"was given {item.title} = {register.value}, but has {found}"
-        if found is None:
-            problem = f"did not answer when {item.title} was read back"
-    return problem
 
 
 def tripped(item: ControlItem, raw: int) -> bool:
@@ -132,19 +113,6 @@ def _quantity(item: ControlItem, value: int) -> str:
     if item.unit.startswith("rad"):
         return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
     return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
-
-
-def _torqued(one: Access, stored: Sequence[RegisterValue]) -> Program[str]:
-    reply = yield from one.read_torque()
-    names = _names(one, stored)
-    if not reply.answered:
-        return f"did not answer when its torque was read, so {names} was not written"
-    if reply.parameters[0]:
-        return (
-            f"holds torque, so {names} in its EEPROM was not written: switch its torque off and start again, "
-            "without --take-over"
-        )
-    return ""
 
 
 def _integer(one: Access, register: RegisterValue) -> Program[int | None]:

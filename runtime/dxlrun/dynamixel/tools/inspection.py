@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketSink
 from dxlrun.clock import Clock, MonotonicClock
-from dxlrun.dynamixel.control_table import control_table, models_by_number
+from dxlrun.dynamixel.control_table import FoundDeviation, control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
@@ -52,11 +52,25 @@ class RegisterRow(msgspec.Struct, frozen=True):
     action: str  # What a run would do: `nothing`, `write`, or empty where it would not start
 
 
+class DeviationRow(msgspec.Struct, frozen=True):
+    """One setting of a servo that is not the factory's and that a start reports."""
+
+    joint: str
+    servo: str  # `ID 4 on bus main`
+    item: str
+    address: int
+    area: str  # `EEPROM` or `RAM`
+    found: int  # The integer on the wire, as `factory`
+    factory: int
+    effect: str  # What the value does: a verb with its object
+
+
 class Found(msgspec.Struct):
     """What was read of the servos, in the order of the plans."""
 
     compared: int = 0  # How many servos were read and compared with the file
     registers: list[RegisterRow] = []
+    deviations: list[DeviationRow] = []
     problems: list[str] = []  # Why a run would not start, one sentence each
     remarks: list[str] = []  # What else differs from what the robot file assumes
 
@@ -104,6 +118,7 @@ def look(
     for one in found:
         together.compared += one.compared
         together.registers += one.registers
+        together.deviations += one.deviations
         together.problems += one.problems
         together.remarks += one.remarks
     if together.problems:
@@ -148,6 +163,7 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
     remarks = [f"{joint}: {text}" for joint, text in surveyed.texts(EventCode.REGISTER_DIFFERS)]
     answered = {joint for joint, _ in surveyed.texts(EventCode.SETUP)}
     found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
+    found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:
         differences = [RegisterDifference(register, None) for register in servo.registers]
         if servo.joint in answered:
@@ -165,6 +181,11 @@ def _tighter_limits(one: Access, joint: JointPlan | None) -> Program[list[str]]:
     joint = replace(joint, servo_limits=limits)
     tighter = [own for own in limits if joint.exceeds_file_limit(own.interface)]
     return [f"{joint.name}: {joint.describe_servo_limit(own)}" for own in tighter]
+
+
+def _deviation(joint: str, servo: str, one: FoundDeviation) -> DeviationRow:
+    item = one.item
+    return DeviationRow(joint, servo, item.name, item.address, item.area, one.found, one.factory, one.effect)
 
 
 def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:

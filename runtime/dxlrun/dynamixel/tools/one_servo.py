@@ -12,13 +12,21 @@ import math
 from collections.abc import Mapping, Sequence
 
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
+from dxlrun.dynamixel.control_table import (
+    ControlItem,
+    ControlTable,
+    FoundDeviation,
+    control_table,
+    side_by_side,
+)
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
+from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.checks import deviations
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -84,6 +92,10 @@ class OneServo:
             found |= self.run(self._read_block(block, refused=refused))
         return {name: found[name] for name in names if name in found}
 
+    def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
+        """Return which of some values are not the factory's and matter to a run."""
+        return deviations(self._reach, values, mode_in(self._servo, values))
+
     def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
         found = self.run(compare(self._reach, desired))
@@ -93,17 +105,11 @@ class OneServo:
         return found
 
     def writable(self, desired: Sequence[RegisterValue]) -> None:
-        """Make sure that registers can be written: no torque, and not the lock of Protocol 1.0."""
+        """Make sure that registers can be written; raises ServoFault where the EEPROM is closed."""
         stored = [self.table.items[one.name].title for one in desired if one.eeprom]
-        if not stored:
-            return
-        if self.holds_torque():
-            raise self.fail(
-                f"holds torque, so {stored[0]} in its EEPROM is not written; switch the torque off first: "
-                f"{self.command} torque off"
-            )
-        if self.table.protocol == 1.0 and "lock" in self.table.items and self.read(["lock"])["lock"]:
-            raise self.fail("its Lock (47) is 1, which keeps the EEPROM as it is until its power is cut")
+        release = f"switch the torque off first: {self.command} torque off"
+        if stored and (problem := self.run(self._reach.closed_eeprom(stored[0], release=release))):
+            raise self.fail(problem)
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in order, and read each back; return what was written.
