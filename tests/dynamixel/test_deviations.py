@@ -3,13 +3,22 @@
 Generated from all control tables; the servo is a simulated one, and the inspection that of a start.
 """
 
+import re
+from pathlib import Path
+
 import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
-from dxlrun.dynamixel.control_table.deviation import deviation_of
+from dxlrun.dynamixel.control_table import (
+    ControlItem,
+    ControlTable,
+    all_tables,
+    find_deviations,
+    read_control_table,
+)
+from dxlrun.dynamixel.control_table.deviation import UNDESCRIBED, deviation_of, deviations_by_name
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan, position_layout
@@ -90,7 +99,6 @@ def another_value(item: ControlItem, start: int) -> int:
     if item.name in LIMITS:
         return start + LIMITS[item.name] * 9
     rule = deviation_of(item.name)
-    assert rule is not None
     taken = {item.initial, start, *rule.equivalent, *rule.refused}
     steps = (-1, 1, -2, 2, item.minimum - start, item.maximum - start)
     values = [start + step for step in steps if item.minimum <= start + step <= item.maximum]
@@ -103,10 +111,23 @@ def test_every_item_that_can_be_written_has_a_judgement_with_a_reason(table):
         if item.access == "R":
             assert item.deviation is None, item.name
         else:
-            assert deviation_of(item.name), f"{item.name} is not in deviations.toml"
+            assert deviation_of(item.name) is not UNDESCRIBED, f"{item.name} is not in deviations.toml"
             assert item.deviation is not None
             assert item.deviation.effect, item.name
             assert item.limited_by in {"", *table.items} or item.initial is not None, item.name
+
+
+def test_every_judgement_is_of_an_item_that_a_table_has():
+    names = {re.sub(r"_\d+$", "", name) for table in TABLES for name in table.items}
+    assert deviations_by_name().keys() <= names
+
+
+def test_an_item_of_a_plugin_without_a_judgement_is_reported():
+    text = Path("runtime/dxlrun/dynamixel/control_table/tables/protocol1/AX-12A.toml").read_text()
+    items = read_control_table(text.replace("\npunch = ", "\nshove = ")).items
+    (found,) = find_deviations(items.values(), {"shove": 33})
+    assert (found.item.name, found.judgement, found.factory) == ("shove", "report", 32)
+    assert find_deviations(items.values(), {"shove": 32}) == ()
 
 
 @every_table

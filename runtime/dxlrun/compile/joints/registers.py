@@ -52,17 +52,6 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 """Items that dxlrun writes itself or relies on: why, and what to do instead."""
-_FIXED: Mapping[str, tuple[int, str]] = MappingProxyType(
-    {
-        "drive_mode": (0, "dxlrun has `direction` for that, and sends speeds, not times"),
-        "homing_offset": (0, "every position would be shifted; `reference` is there for that"),
-        "multi_turn_offset": (0, "every position would be shifted; `reference` is there for that"),
-        "resolution_divider": (1, "a tick would be something else"),
-        "status_return_level": (2, "no write would be acknowledged"),
-    }
-)
-"""Values that the start-up requires: an item may be declared as its own, and no other."""
-_TORQUE_AT_BOOT = 0x01  # Startup Configuration, bit 0 (e-Manual XM430-W350, Startup Configuration (60))
 _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")
@@ -128,8 +117,10 @@ def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterV
             f"{item.title} is in the EEPROM, which no servo writes while it holds torque",
             "declare it under `registers` in the robot file, which the next start writes",
         )
-    if name in _FIXED:
-        raise UnfitRegister(f"{item.title} is not to be changed: {_FIXED[name][1]}", "leave it as it is")
+    if item.deviation is not None and item.deviation.may_refuse:
+        raise UnfitRegister(
+            f"{item.title} is not to be changed: another value {item.deviation.effect}", "leave it as it is"
+        )
     return found
 
 
@@ -238,12 +229,10 @@ def _shown(value: int | str, raw: int) -> str:
 
 
 def _check_meaning(item: ControlItem, raw: int) -> None:
-    """Refuse values that a servo accepts but no robot may run with."""
-    fixed, why = _FIXED.get(item.name, (raw, ""))
-    if raw != fixed:
-        raise UnfitRegister(f"{item.title} cannot be {raw}: {why}", f"write {fixed}, or take it out")
-    if item.name == "startup_configuration" and raw & _TORQUE_AT_BOOT:
-        raise UnfitRegister(
-            f"{item.title} = {raw} switches torque on by itself at power-up",
-            f"write {raw & ~_TORQUE_AT_BOOT}",
-        )
+    """Refuse values that a servo accepts but with which no run starts."""
+    rule, factory = item.deviation, item.initial
+    if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
+        return
+    raise UnfitRegister(
+        f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or take it out"
+    )

@@ -54,12 +54,17 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return effect.replace("{value}", str(value)).replace("{bits}", bits)
 
 
-def deviation_of(name: str) -> Deviation | None:
-    """Return the judgement that items of a name have in all models; None for a name without one."""
-    return _deviations().get(_NUMBER.sub("", name))
+UNDESCRIBED = Deviation("report", "has an effect that its control table does not describe")
+"""Judgement of an item of a plug-in's model, where neither its own file nor `deviations.toml` has one."""
+
+
+def deviation_of(name: str) -> Deviation:
+    """Return the judgement that items of a name have in all models."""
+    return deviations_by_name().get(_NUMBER.sub("", name), UNDESCRIBED)
 
 
 @functools.cache
-def _deviations() -> Mapping[str, Deviation]:
+def deviations_by_name() -> Mapping[str, Deviation]:
+    """Return the judgements of `deviations.toml`, by the name of an item without its number."""
     text = (Path(__file__).parent / "tables" / "deviations.toml").read_text("utf-8")
     return msgspec.convert(tomllib.loads(text), dict[str, Deviation])

@@ -74,21 +74,12 @@ def output_left_at_a_tenth(story: Story) -> None:
     lags(story, "left_shoulder", 0.12, 1.6)
 
 
-@case(
-    "servo",
-    "x_fast x_three",
-    subject=("right_shoulder",),
-    cause=FOLLOWS + r"|another|same|shadow|secondary|duplicate|two servos|wrong (goal|joint)|instead",
-    innocents=others("right_shoulder", "right_elbow"),
-)
+@case("servo", "x_fast x_three", subject=("right_shoulder",), cause=r"shadow|secondary", good=False)
 def shadow_of_the_elbow(story: Story) -> None:
-    """The Secondary ID of a shoulder is that of the elbow: of each packet it takes the elbow's goal."""
+    """The Secondary ID of a shoulder is that of the elbow, so it would take its goals: refused."""
     elbow = story.id("right_elbow")
-    story.motion = story.swing(
-        right_shoulder="0.5 * sin(1.7 * t)", right_elbow="0.45 * sin(2.9 * t + 0.9) - 0.35"
-    )
     set_before(story, "right_shoulder", secondary_id=elbow, secondary_shadow_id=elbow)
-    lags(story, "right_shoulder", 0.3)
+    start_refused(story)
 
 
 @case("servo", "mx_two x_three", subject=("left_elbow",), cause=LOST + r"|status return", good=False)
