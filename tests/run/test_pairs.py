@@ -151,8 +151,11 @@ def in_control(servos: Servos, wait_for: Callable[..., Any]) -> None:
     assert set(servos.torque().values()) == {1}
 
 
-def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> None:
-    """Wait until the processes are gone, or end them by `dxlrun stop`; judge that it finds them."""
+def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> str:
+    """Wait until the processes are gone, or end them by `dxlrun stop`, which must find them.
+
+    Return what the run wrote to standard error.
+    """
     with suppress(subprocess.TimeoutExpired):
         run.process.wait(SETTLED_S)  # reaped: a dead child of this process is none that is left
     until = time.monotonic() + SETTLED_S
@@ -166,8 +169,10 @@ def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> None:
         print(f"left: {', '.join(sorted(left))}; dxlrun stop: {done.stdout.strip()} {done.stderr.strip()}")
         assert done.returncode == 0, done.stderr
         assert name in done.stdout
-    run.finish()
+    _, _, err = run.finish()
     wait_for(run.gone, "the end of every process")
+    assert "Traceback" not in err
+    return str(err)
 
 
 @pytest.mark.campaign
@@ -190,5 +195,7 @@ def test_one_survivor_takes_torque_off(  # noqa: PLR0917  fixtures
     if hit_ns:
         after_ms = (servos.limp_since_ns() - hit_ns) / 1e6
         print(f"TORQUE OFF after {after_ms:.0f} ms: {first}, {second} {pause_s * 1e3:.0f} ms later")
-    end_what_is_left(run, wait_for)
+    err = end_what_is_left(run, wait_for)
     assert not any(servos.torque().values())
+    if (first, second) == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it
+        assert "was stopped, as by Ctrl-Z, and could not end the run any more" in " ".join(err.split())
