@@ -159,13 +159,13 @@ def test_a_controller_that_raises_ends_the_run(odd, all_limp, wire_equals_log):
 
 def test_a_loop_that_was_stopped_accuses_no_servo(start, tmp_path):
     slow = tmp_path / "slow.yaml"
-    slow.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 10"))
+    slow.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 20"))
     run = start("--duration", "3", robot=slow)
     run.wait_until_moving()
     loop = run.child("dxlrun.run.loop_process")
     for _ in range(2):
         os.kill(loop, signal.SIGSTOP)
-        time.sleep(0.1)  # the guardian waits for 0.25 s
+        time.sleep(0.12)  # the guardian waits for 0.25 s
         os.kill(loop, signal.SIGCONT)
         time.sleep(0.1)
     run.finish()
