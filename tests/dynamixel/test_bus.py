@@ -269,18 +269,22 @@ def begin(line):
     return lines, lines.buses[0]
 
 
-def ask(lines):
-    """Read the state of servo 7."""
+def ask(lines, **kind):
+    """Read the state of servo 7, by a job of a kind: of a cycle, of idle time, or one that has time."""
 
     def program():
         return (yield READ).parameters
 
-    (parameters,) = lines.run([program()])
-    return parameters
+    job = ProgramJob(program())
+    lines.buses[0].load(job, **kind)
+    lines.clear(lines.buses)
+    lines.pump()
+    return job.result
 
 
+@pytest.mark.parametrize("kind", [{"cyclic": True}, {}, {"waits": True}], ids=["cycle", "idle", "waits"])
 @pytest.mark.parametrize("renewed", [False, True], ids=["on the same line", "on a line that came back"])
-def test_rest_of_a_reply_to_a_dropped_request_does_not_answer_the_next(renewed):
+def test_rest_of_a_reply_to_a_dropped_request_does_not_answer_the_next(renewed, kind):
     stale = protocol1.status_packet(7, 0, b"------")
     line = ScriptedLine([(600_000, stale[:7])], [(600_000, stale[7:]), (800_000, GOOD)])
     lines, bus = begin(line)
@@ -291,7 +295,7 @@ def test_rest_of_a_reply_to_a_dropped_request_does_not_answer_the_next(renewed):
     if renewed:
         bus.fail(PortError("it is gone"))
         bus.renew(line)
-    assert ask(lines) == b"abcdef"
+    assert ask(lines, **kind) == b"abcdef"
 
 
 def listen_to(transaction):
