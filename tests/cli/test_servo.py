@@ -251,3 +251,16 @@ def test_the_packets_of_a_verb_are_a_log_when_it_is_named(one, tmp_path):
     assert writes(entries)
     assert read.complete
     assert " servo " in read.metadata["tool"]["command"]
+
+
+def test_get_shows_what_a_start_would_refuse_or_report(one):
+    servo, _ = one()
+    servo(1, "set", "secondary_shadow_id", 2, "--yes", *NEW)
+    servo(1, "set", "pwm_limit", 400, "--yes", *NEW)
+    said = servo(1, "get", "secondary_shadow_id", "pwm_limit", "velocity_limit", *NEW).out
+    assert [word in said for word in ("refuses it, as it makes", "reports it, as it limits")] == [True, True]
+    judged = json.loads(servo(1, "get", "--json", *NEW).out)["deviations"]
+    assert {name: found["judgement"] for name, found in judged.items()} == {
+        "secondary_shadow_id": "refuse",
+        "pwm_limit": "report",
+    }

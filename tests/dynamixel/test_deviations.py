@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import (
     ControlItem,
     ControlTable,
@@ -24,6 +25,7 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan, position_layout
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
+from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue
 
 TABLES = all_tables()
@@ -273,3 +275,30 @@ def test_a_servo_is_inspected_with_at_most_a_read_for_each_area():
         lines = Lines([plan], rig.ports, rig.clock, rig.packets)
         lines.run([inspect(first_reach(plan, plan.servos[0]), Findings(), take_over=False)])
         assert len(rig.into_bus()) == reads
+
+
+def test_goal_pwm_stays_within_a_pwm_limit_that_another_program_left():
+    rig = make_rig(make_x((4,), continuous=True, start_mode=Mode.VELOCITY))
+    rig.servo(4).poke("pwm_limit", 100)
+    rig.hardware.start()
+    assert rig.registers("goal_pwm") == [100]
+    ((_, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert "PWM Limit (36) = 100 instead of 885" in text
+
+
+def test_a_locked_servo_that_has_to_change_its_mode_names_lock_and_the_remedy():
+    rig = make_rig()
+    for name, value in (("cw_angle_limit", 0), ("ccw_angle_limit", 0), ("lock", 1)):
+        rig.servo(6).poke(name, value)
+    with pytest.raises(StartUpError) as refusal:
+        rig.hardware.start()
+    (problem,) = refusal.value.sentences
+    assert problem.startswith("main_6_joint (ID 6 on bus main) has Lock (47) = 1, so CCW Angle Limit (8) = 1")
+    assert problem.endswith(" in its EEPROM was not written: switch its power off and on")
+
+
+def test_a_goal_of_the_mode_in_which_a_servo_starts_is_no_setting():
+    rig = make_rig(make_x((4,), start_mode=Mode.PWM))
+    rig.servo(4).poke("goal_pwm", 5)
+    rig.hardware.start()
+    assert rig.events.of(EventCode.REGISTER_DIFFERS) == []

@@ -134,3 +134,16 @@ def test_a_servo_that_is_missing_is_in_the_log_too(check, tmp_path):
 def test_a_log_without_online_is_refused(tmp_path, capsys):
     assert main(["check", "robot.yaml", "--log", str(tmp_path / "x.mcap")]) == 2
     assert "--log keeps what --online sends and receives; give --online too" in capsys.readouterr().err
+
+
+def test_settings_that_another_program_left_are_a_table_with_what_they_do(check):
+    before = ("1", "set", "pwm_limit", "400", "--yes")
+    code, out, err, _ = check("position_p_gain: 800", "wrist_led:=0", "--debug", before=before)
+    table = [line.split() for line in out[out.index("Settings that are not") :].splitlines()]
+    assert any(row[:1] == ["elbow"] and "pwm_limit" in row for row in table), out
+    assert "limits the PWM" in out
+    assert "1 difference\n" in out
+    assert (code, err) == (0, "")
+    _, out, _, _ = check("position_p_gain: 800", "wrist_led:=0", "--json", before=before)
+    (found,) = json.loads(out[out.index("{") :])["online"]["deviations"]
+    assert (found["item"], found["found"], found["factory"]) == ("pwm_limit", 400, 885)

@@ -332,3 +332,21 @@ def test_a_port_of_an_argument_is_told(bench: Bench, desk: Desk) -> None:
     script = bench.do(*steps, joints=("elbow",), search=True)
     assert f"as argument of the robot file: {desk.directory}/a-id7" in script.text
     assert bench.path.read_text() == ROBOT
+
+
+def test_a_servo_of_another_robot_gets_the_settings_of_the_factory_that_no_run_starts_without(
+    bench: Bench,
+) -> None:
+    wrist = bench.line.bus.servos[1]
+    for name, value in (("secondary_shadow_id", 2), ("homing_offset", 9), ("pwm_limit", 500)):
+        wrist.poke(name, value)
+    script = bench.do(
+        ("Connect the servo for wrist", bench.connect(1)),
+        ("Connect all", bench.connect(1)),
+        joints=("wrist",),
+    )
+    assert bench.code == 0, script.text
+    names = ("secondary_shadow_id", "homing_offset", "pwm_limit")
+    assert [wrist.registers[name] for name in names] == [255, 0, 500]
+    assert "wrist: Secondary (Shadow) ID (12) was 2 and is 255" in script.text
+    assert "wrist: ID 1 on bus main differs from the factory's settings: PWM Limit (36) = 500" in script.text
