@@ -83,8 +83,7 @@ def test_a_base_is_driven_and_holds_when_the_program_is_interrupted_and_when_it_
         drives(screen, "\x1b[D", lambda: speeds()[0] < -0.5 and speeds()[1] > 0.5)  # turns left
         screen.kill()
     with connect() as robot:
-        until(lambda: is_held(robot))
-        assert speeds() == (0.0, 0.0)
+        until(lambda: is_held(robot) and speeds() == (0.0, 0.0))
         robot.stop()
     goals = [value for _, value in changes(read_ledger(ledger), plan_of(ROBOT), GOAL_VELOCITY)[1]]
     assert max(goals) > 20

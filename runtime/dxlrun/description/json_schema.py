@@ -257,12 +257,16 @@ class _Shaper:
         return {key: value for key, value in shaped.items() if key not in ("default", "examples")}
 
     def _alternatives(self, shaped: Schema) -> Schema:
-        """Return what may stand at one place: the values of the model, an argument, or a grouped number."""
+        """Return the alternatives of one value: those of the model, an argument, or a grouped number.
+
+        Keys next to the alternatives, such as the properties of a mapping that may be one value, are kept.
+        """
         about = {key: shaped.pop(key) for key in _ABOUT if key in shaped}
+        given = shaped.pop("anyOf", None)
         arms: list[Schema] = []
-        for arm in shaped.pop("anyOf", [None]):
-            inner = self.node(arm) if arm is not None else shaped
+        for inner in [shaped] if given is None else map(self.node, given):
             arms += inner["anyOf"] if set(inner) == {"anyOf"} else [inner]
+        kept = {} if given is None else shaped
         kinds = {arm.get("type") for arm in arms}
         if any(arm.get("type") in ("integer", "number") and "enum" not in arm for arm in arms):
             arms.append(self._use("grouped", _GROUPED))
@@ -274,7 +278,7 @@ class _Shaper:
             if arm not in single:
                 single.append(arm)
         about = _readable(about, kinds, "".join(_patterns({"anyOf": arms})))
-        return about | (single[0] if len(single) == 1 else {"anyOf": single})
+        return about | kept | (single[0] if len(single) == 1 else {"anyOf": single})
 
     def _use(self, name: str, definition: Schema) -> Schema:
         self.used[name] = definition
