@@ -51,6 +51,7 @@ _GROUPED: Schema = {
     "description": "A whole number with its digits in groups.",
 }
 _SCALARS = ("string", "integer", "number", "boolean")
+_OF_MAPPINGS = ("properties", "additionalProperties", "required")
 _ABOUT = ("description", "default", "examples")
 
 
@@ -259,14 +260,14 @@ class _Shaper:
     def _alternatives(self, shaped: Schema) -> Schema:
         """Return the alternatives of one value: those of the model, an argument, or a grouped number.
 
-        Keys next to the alternatives, such as the properties of a mapping that may be one value, are kept.
+        The properties of a mapping that may also be one value are kept next to the alternatives.
         """
         about = {key: shaped.pop(key) for key in _ABOUT if key in shaped}
         given = shaped.pop("anyOf", None)
         arms: list[Schema] = []
         for inner in [shaped] if given is None else map(self.node, given):
             arms += inner["anyOf"] if set(inner) == {"anyOf"} else [inner]
-        kept = {} if given is None else shaped
+        kept = {} if given is None else {key: shaped[key] for key in _OF_MAPPINGS if key in shaped}
         kinds = {arm.get("type") for arm in arms}
         if any(arm.get("type") in ("integer", "number") and "enum" not in arm for arm in arms):
             arms.append(self._use("grouped", _GROUPED))
