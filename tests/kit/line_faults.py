@@ -81,3 +81,15 @@ def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
     servo.shaft.mechanics.place(servo.shaft.index, angle)
     servo.shaft._forget()
     servo.shaft.plan(servo.shaft.items.aims)
+
+
+def lose_replies(bus: SimulatedBus, servo_id: int, begin_ns: int, end_ns: int) -> None:
+    """Lose every reply of a servo that would begin in a time; the servo still executes its instructions."""
+    send = bus._send_reply
+
+    def send_or_lose(replying: int, reply: Transmission) -> bool:
+        if replying == servo_id and begin_ns <= reply.first_ns < end_ns:
+            truncate_next(bus, servo_id, 0)
+        return send(replying, reply)
+
+    bus._send_reply = send_or_lose  # type: ignore[method-assign]
