@@ -195,6 +195,53 @@ def test_nothing_moves_at_the_start_and_servos_that_disagree_a_little_are_brough
     assert arrays.servo_goals.position[1:3] == pytest.approx([0.22, 0.22])
 
 
+def test_servos_that_are_anchored_where_they_disagree_do_not_move_before_they_are_brought_together(
+    arrays: JointArrays, plan: Callable[..., Plan]
+) -> None:
+    arrays.servo_goals.position[:] = 0.0
+    arrays.begin()
+    arrays.fade(1.0)
+    hip = plan().mechanics.servo_rows(HIP)
+    found = arrays.servo_states.position
+    found[:] = [0.1, 0.20, 0.24, 0.01, 0.7, 0.3]
+    arrays.read()
+    arrays.goals.position[:] = arrays.states.position
+    for index in range(len(plan().mechanics.couplings)):
+        arrays.anchor(index)
+    arrays.write()
+    assert arrays.servo_goals.position == pytest.approx(found, abs=1e-12)
+    for share, apart in ((0.25, 0.03), (0.25, 0.02), (0.6, 0.0)):
+        arrays.fade(share)
+        arrays.write()
+        first, second = arrays.servo_goals.position[list(hip)]
+        assert (second - first, first + second) == pytest.approx((apart, 0.44))
+    assert arrays.servo_goals.position[[4, 5]] == pytest.approx([0.7, 0.3])
+
+
+def test_only_the_coupling_that_is_anchored_takes_a_new_offset(
+    arrays: JointArrays, plan: Callable[..., Plan]
+) -> None:
+    arrays.begin()
+    arrays.servo_states.position[:] = [0.0, 0.20, 0.24, 0.0, 0.0, 0.0]
+    arrays.read()
+    couplings = plan().mechanics.couplings
+    other = next(index for index, one in enumerate(couplings) if HIP not in one.joints)
+    arrays.goals.position[:] = arrays.states.position
+    arrays.anchor(other)
+    arrays.write()
+    assert arrays.servo_goals.position[1:3] == pytest.approx([0.22, 0.22])
+
+
+def test_servo_that_was_never_read_is_anchored_without_an_offset(arrays: JointArrays) -> None:
+    arrays.servo_states.position[1:3] = math.nan
+    arrays.read()
+    for index in range(2):
+        arrays.anchor(index)
+    arrays.goals.position[:] = 0.1
+    arrays.write()
+    assert arrays.servo_goals.position[1:3] == pytest.approx([0.1, 0.1])
+
+
 def test_wrist_that_was_limp_at_the_start_gets_the_goal_of_its_joints(arrays: JointArrays) -> None:
     arrays.servo_goals.position[:] = [0.1, 0.2, 0.2, 0.0, math.nan, math.nan]
     arrays.begin()

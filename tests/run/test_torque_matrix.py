@@ -2,7 +2,11 @@
 
 A robot has a joint for each way to command of each standard controller (`tests.kit.laws`). Clients command
 all of them; their servos lose torque, and each shaft is turned by 100 deg. When torque is back, the simulated
-shafts are watched, then clients command again.
+shafts are watched, then clients command again. Robots of pairs of servos and of differentials have a joint,
+or two, for each mode.
+
+Left out because they can tell nothing new: a gear, a pair or a differential with a return in a pause, with a
+line or after a requested reboot, as these lead to the same return, and Protocol 1.0 with a pause.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
@@ -21,18 +26,21 @@ import numpy as np
 import pytest
 from tests.kit.laws import Case, cases, chain_of
 from tests.kit.line_faults import turn_by_hand
+from tests.kit.stories import replayed
 
 from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.remote.preparation import Preparation
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
 
 MS = 1_000_000
 TURN = math.radians(100)
@@ -44,8 +52,10 @@ WITHOUT_JOINTS = {
     "joint_state_broadcaster", "sensor_broadcaster",
 }  # fmt: skip
 MOTORS = Path(__file__).parents[2] / "robots/motors"
-LIMIT = {"plain": 170, "geared": 80}
-ROBOTS = ("plain", "geared", "protocol 1")
+LIMIT = {"plain": 170, "geared": 80, "differential": 85}
+COUPLED = ("pairs", "differential")
+"""Robots of joints with several servos: two on one axis, or a differential for two joints."""
+ROBOTS = ("plain", "geared", "protocol 1", *COUPLED)
 PERIOD_MS = 20
 
 
@@ -68,13 +78,17 @@ class Steered:
 
 
 @cache
-def steered() -> tuple[Steered, ...]:
-    """Return every standard controller that claims a joint, in each of its ways to command."""
+def steered(each: int = 1) -> tuple[Steered, ...]:
+    """Return every standard controller that claims a joint, in each of its ways to command.
+
+    `each`: how many joints each has at least.
+    """
     found = []
     for index, case in enumerate(cases(("x", "y"))):
         if case.type in WITHOUT_JOINTS:
             continue
-        names = (f"j{index}", f"k{index}") if case.type == "diff_drive_controller" else (f"j{index}",)
+        count = 2 if case.type == "diff_drive_controller" else each
+        names = (f"j{index}", f"k{index}")[:count]
         found.append(_steered(index, next(itertools.islice(cases(names), index, None)), names))
     return tuple(found)
 
@@ -118,10 +132,13 @@ def test_every_standard_controller_is_in_the_matrix():
 @cache
 def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
     """Return a robot file with a joint for each way to command, and those ways."""
-    # an MX-64 of Protocol 1.0 has no PWM mode, and measures no current
-    ways = tuple(
-        one for one in steered() if kind != "protocol 1" or one.interfaces not in (("pwm",), ("effort",))
-    )
+    # an MX-64 of Protocol 1.0 has no PWM mode, and measures no current; a differential has no joint of a PWM
+    without = {"protocol 1": [("pwm",), ("effort",)], "differential": [("pwm",)]}.get(kind, [])
+    ways = tuple(one for one in steered(2 if kind == "differential" else 1) if one.interfaces not in without)
+    if kind in COUPLED:  # one for each mode, and one whose goal is followed
+        types = ("joint_group_", "joint_trajectory_controller")
+        ways = tuple(one for one in ways if one.case.type.startswith(types) and not one.case.into)
+        ways = tuple({one.interfaces: one for one in (*ways, ways[0])}.values())
     ways = tuple(
         {(one.case.type, one.interfaces, one.asks[:1] and one.case.into): one for one in ways}.values()
     )
@@ -132,12 +149,27 @@ def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
     )
     place += ", simulation: {inertia: 0.005 kg m^2, gravity: 0 Nm}"
     place += ", gear_ratio: 2" if kind == "geared" else ""
+    turn = f"model: {model}, reference: 180 deg"
     joints: dict[str, str] = {}
+    wrists: dict[str, str] = {}
+    ids = [itertools.count(1) for _ in range(3)]
     for number, one in enumerate(ways):
+        bus, own = f"b{number % 3}", ids[number % 3]
+        if kind == "differential":
+            sides = (
+                f"{side}: {{bus: {bus}, id: {next(own)}, {turn}, direction: {way}}}"
+                for side, way in (("left", 1), ("right", -1))
+            )
+            named, servos = ", ".join(one.joints), ", ".join(sides)
+            wrists[f"w{number}"] = f"{{type: differential, joints: [{named}], servos: {{{servos}}}}}"
+            joints |= dict.fromkeys(one.joints, f"{{{place[place.index('limits') :]}}}")
+            continue
         for joint in (*one.joints, *([one.leader] if one.leader else [])):
-            bus, limp = f"b{number % 3}", ", torque: off" if joint == one.leader else ""
-            own = 1 + sum(f"bus: {bus}," in text for text in joints.values())
-            joints[joint] = f"{{bus: {bus}, id: {own}, {place}, motor: {model}.motor.yaml{limp}}}"
+            limp = ", torque: off" if joint == one.leader else ""
+            moved = f"id: {next(own)}, motor: {model}.motor.yaml{limp}"
+            if kind == "pairs":
+                moved = f"servos: [{{id: {next(own)}}}, {{id: {next(own)}, direction: -1}}]"
+            joints[joint] = f"{{bus: {bus}, {place}, {moved}}}"
     line = f"port: sim, protocol: {version}, baud_rate: {adapter}_000_000, return_delay_time: 0 us"
     controllers = {name: keys for one in ways for name, keys in one.controllers.items()}
     for what in ("velocity", "position"):
@@ -150,6 +182,8 @@ def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
         f"loop: {{rate: {1000 // PERIOD_MS}}}",
         "joints:",
         *(f"  {name}: {joint}" for name, joint in joints.items()),
+        *(["transmissions:"] if wrists else []),
+        *(f"  {name}: {wrist}" for name, wrist in wrists.items()),
         "controllers:",
         *(f"  {name}: {json.dumps(keys)}" for name, keys in controllers.items()),
         f"policies: {{on_returned_servo: {policy}}}",
@@ -178,18 +212,29 @@ class Story:
         plan = self.robot.plan
         self.preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
         self.plans = {one.name: one for one in plan.loop.controllers}
-        self.servos: dict[str, SimulatedServo] = {
-            servo.joint: bus.servo(servo.servo_id)
+        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
+        placed = {
+            servo.row: (f"{servo.joint}, {planned.label(servo)}", bus.servo(servo.servo_id))
             for bus, planned in zip(self.robot.buses, plan.buses, strict=True)
             for servo in planned.servos
         }
-        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
-        self.names = [joint for one in self.ways for joint in one.joints]
+        self.servos: dict[str, SimulatedServo] = dict(placed.values())
+        self.shafts: dict[str, tuple[str, ...]] = {
+            joint: tuple(
+                placed[servo][0] for servo in (plan.mechanics.servo_rows(row) if plan.mechanics else (row,))
+            )
+            for joint, row in self.rows.items()
+        }
+        """Names of the shafts of each joint's servos."""
+        self.joints = [joint for one in self.ways for joint in one.joints]
+        self.names = list(dict.fromkeys(name for joint in self.joints for name in self.shafts[joint]))
         self.numbers = itertools.count(1)
         self.put: dict[str, float] = {}
         self.watched: list[list[float]] = []
         self.commanded_ms = math.inf
         self.fast: list[list[float]] = []
+        self.again: set[str] = set()
+        """Controllers that began again where their joints were."""
 
     @property
     def now_ms(self) -> float:
@@ -213,7 +258,7 @@ class Story:
             for kind, data in () if other else one.asks:
                 self._send(one.top, kind, data)
             if one.leader:
-                turn_by_hand(self.servos[one.leader], math.pi - 0.9)
+                self.turn_leader(one, math.pi - 0.9)
 
     def _send(self, controller: str, kind: str, data: dict[str, Any]) -> None:
         prepared = self.preparation.command(
@@ -222,19 +267,29 @@ class Story:
         number = next(self.numbers)
         self.robot.inbox.waiting.append(Command(number, controller, kind, prepared.data, "anna"))
 
+    def turn_leader(self, one: Steered, angle: float) -> None:
+        (name,) = self.shafts[one.leader]
+        turn_by_hand(self.servos[name], angle)
+
     def turn(self, names: list[str] | None = None) -> None:
         """Turn shafts without torque by 100 deg, toward the middle of their range."""
         for one in self.ways:
-            for joint in one.joints:
-                if joint in self.put or (names is not None and joint not in names):
+            for name in dict.fromkeys(name for joint in one.joints for name in self.shafts[joint]):
+                if name in self.put or (names is not None and name not in names):
                     continue
-                servo = self.servos[joint]
-                assert not servo.shaft.torque_on or names is not None, joint
-                angle = servo.shaft.angle
-                self.put[joint] = angle - math.copysign(TURN, angle - math.pi)
-                turn_by_hand(servo, self.put[joint])
+                assert not self.servos[name].shaft.torque_on or names is not None, name
+                angle = self.servos[name].shaft.angle
+                self.put_at(name, angle - math.copysign(TURN, angle - math.pi))
                 if one.leader:
-                    turn_by_hand(self.servos[one.leader], math.tau - self.put[joint])
+                    self.turn_leader(one, math.tau - self.put[name])
+
+    def put_at(self, name: str, angle: float) -> None:
+        """Turn a shaft to an angle, rad, with the others that are on its axis."""
+        turn_by_hand(self.servos[name], angle)
+        axis = next(names for names in self.shafts.values() if name in names)
+        for other in axis if self.kind == "pairs" else (name,):
+            self.put[other] = self.servos[other].shaft.angle
+            turn_by_hand(self.servos[other], self.put[other])
 
     def watch(self, until: Callable[[], bool], then: Callable[[], object]) -> None:
         """Watch the shafts from now on; when it is time, let clients command again, for a second."""
@@ -250,7 +305,7 @@ class Story:
 
     def all_have_torque(self) -> bool:
         torque = self.robot.record.states.torque
-        return all(torque[self.rows[name]] == Torque.ON for name in self.names)
+        return all(torque[self.rows[joint]] == Torque.ON for joint in self.joints)
 
     def judge(self) -> None:
         self.robot.run()
@@ -267,18 +322,38 @@ class Story:
         assert not moved
         assert len(self.watched) > 3
         self._judge_commanded()
+        self._judge_log(read_log(self.path))
 
     def _judge_commanded(self) -> None:
         """Every joint follows its clients again, those that are led to positions or by velocities slowly."""
         angles = np.array([self.watched[-1], *self.fast])
         speed = np.abs(np.diff(angles, axis=0)).max(axis=0) / (STEP_MS * 1e-3)
-        ratio = 2 if self.kind == "geared" else 1
+        ratio = 2 if self.kind in {"geared", "differential"} else 1
         for one in self.ways:
             for joint in one.joints:
-                place = self.names.index(joint)
-                assert np.ptp(angles[:, place]) > 5 * TICK, f"{joint} ({one.case.name}) does not follow"
+                places = [self.names.index(name) for name in self.shafts[joint]]
+                moved = np.ptp(angles[:, places], axis=0).max()
+                assert moved > 5 * TICK, f"{joint} ({one.case.name}) does not follow"
                 if one.interfaces[0] in {"position", "velocity"} and not one.case.into:
-                    assert speed[place] < 1.2 * SLOW_SPEED * ratio, f"{joint} ({one.case.name}) is fast"
+                    fast = speed[places].max() >= 1.2 * SLOW_SPEED * ratio
+                    assert not fast, f"{joint} ({one.case.name}) is fast"
+
+    def _judge_log(self, log: Log) -> None:
+        """Goals of before end as aborted and name a joint; controllers that begin again name their own."""
+        before_ns = min(LOST_MS, self.commanded_ms) * MS
+        joints = {name: self.plans[name].joints for name in self.plans}
+        ends = {event.text.split()[1]: event for event in log.events if event.code == EventCode.GOAL_ENDED}
+        for event in log.events:
+            if event.code == EventCode.GOAL_ACCEPTED and event.t_ns < before_ns:
+                end = ends[event.text.split()[1].rstrip(":")]
+                named = [*joints[event.source], f"{event.source} was deactivated"]
+                why = end.text.partition(" aborted: ")[2]
+                assert end.t_ns < LOST_MS * MS or any(name in why for name in named), end.text
+            if event.code == EventCode.POLICY and event.text.startswith("begins again"):
+                named = re.findall(r"\b[jk]\d+", event.text.partition("torque was given again: ")[2])
+                assert named
+                assert set(named) <= set(joints[event.source]), event.text
+                self.again.add(event.source)
 
 
 WAYS: dict[str, Callable[[Story], None]] = {}
@@ -326,8 +401,10 @@ def activated(story: Story, ms: float) -> None:
 
 @way("start")
 def _(story: Story) -> None:
-    for joint in story.names:
-        turn_by_hand(story.servos[joint], math.pi + 0.4)
+    for name in story.names:
+        if name not in story.put:
+            story.put_at(name, math.pi + 0.4)
+    story.put.clear()
     story.turn()
     story.at(1, lambda: story.watch(lambda: story.robot.record.cycle > 5, story.command))
 
@@ -338,42 +415,46 @@ def _(story: Story) -> None:
     turned(story)
 
 
-@way("return with the port")
+@way("return with the port", ("plain", "protocol 1"))
 def _(story: Story) -> None:
     faults(story, "brownout at=1000ms for=300ms")
     faults(story, "unplug at=1000ms for=400ms")
     turned(story)
 
 
-@way("reboot that a client requests", ("plain", "geared"))
+@way("reboot that a client requests", ("plain",))
 def _(story: Story) -> None:
-    story.at(LOST_MS, lambda: story.ask("reboot", joints=story.names, release=True))
+    story.at(LOST_MS, lambda: story.ask("reboot", joints=story.joints, release=True))
     activated(story, TURNED_MS)
 
 
-@way("torque that a client requests")
+@way("torque that a client requests", ("plain", "protocol 1", *COUPLED))
 def _(story: Story) -> None:
-    story.at(LOST_MS, lambda: story.ask("torque", joints=story.names, on=False, release=True))
+    story.at(LOST_MS, lambda: story.ask("torque", joints=story.joints, on=False, release=True))
     activated(story, TURNED_MS)
-    story.at(TURNED_MS + 100, lambda: story.ask("torque", joints=story.names, on=True))
+    story.at(TURNED_MS + 100, lambda: story.ask("torque", joints=story.joints, on=True))
 
 
-@way("torque that a client requests while controllers are active", policy="limp")
+@way(
+    "torque that a client requests while controllers are active",
+    ("plain", "geared", "protocol 1"),
+    policy="limp",
+)
 def _(story: Story) -> None:
     faults(story, "brownout at=1000ms for=300ms")
     turned(story)
 
     def request() -> None:
         torque = story.robot.record.states.torque
-        if all(torque[story.rows[name]] == Torque.OFF for name in story.names):
-            story.ask("torque", joints=story.names, on=True)
+        if all(torque[story.rows[joint]] == Torque.OFF for joint in story.joints):
+            story.ask("torque", joints=story.joints, on=True)
         else:
             story.at(story.now_ms + STEP_MS, request)
 
     story.at(TURNED_MS + 100, request)
 
 
-@way("return in a pause")
+@way("return in a pause", ("plain",))
 def _(story: Story) -> None:
     story.at(LOST_MS - 50, lambda: story.ask("pause"))
     faults(story, "brownout at=1000ms for=300ms")
@@ -398,15 +479,41 @@ def _(story: Story) -> None:
         if len(story.put) < len(story.names):
             bus.after(1, lambda: turn(bus))
 
-    def watch() -> None:
-        if len(story.put) < len(story.names):
-            story.at(story.now_ms + STEP_MS, watch)
-        else:
-            story.watch(story.all_have_torque, lambda: story.command(other=True))
+    def ready() -> bool:
+        modes = story.robot.record.states.mode
+        wanted = {joint: one.other for one in story.ways for joint in one.joints}
+        changed = all(modes[story.rows[joint]] == Mode[mode.upper()] for joint, mode in wanted.items())
+        return changed and story.all_have_torque()
 
+    def watch() -> None:
+        story.watch(ready, lambda: story.command(other=True))
+
+    def stand() -> None:
+        story.put |= {name: story.servos[name].shaft.angle for name in story.names}
+        until_ms = story.now_ms + 200
+        story.watch(lambda: story.now_ms > until_ms, lambda: story.command(other=True))
+
+    def watch_when(is_time: Callable[[], bool], then: Callable[[], None], after_ms: float) -> None:
+        if is_time():
+            story.at(story.now_ms + after_ms, then)
+        else:
+            story.at(story.now_ms + STEP_MS, lambda: watch_when(is_time, then, after_ms))
+
+    if story.kind == "pairs":  # one servo holds the joint while the mode of the other one changes
+        story.at(LOST_MS, lambda: watch_when(ready, stand, after_ms=200))  # until all have stopped
+        return
     for bus in story.robot.buses:
         story.at(LOST_MS, partial(turn, bus))
-    story.at(LOST_MS, watch)
+    story.at(LOST_MS, lambda: watch_when(lambda: len(story.put) == len(story.names), watch, after_ms=1))
+
+
+RESTARTED = (
+    "return after a brown-out",
+    "return with the port",
+    "return in a pause",
+    "torque that a client requests while controllers are active",
+)
+"""Ways in which controllers stay active."""
 
 
 def pairs() -> Iterator[tuple[str, str]]:
@@ -422,3 +529,7 @@ def test_no_joint_moves_until_a_client_commands_it(tmp_path, name, kind):
         story.at(BEGUN_MS, story.command)
     happens(story)
     story.judge()
+    stayed = {one for each in story.ways for one in each.controllers} if name in RESTARTED else set()
+    assert story.again - {"position", "velocity"} == stayed
+    if kind == next(iter(WAYS[name][1])):
+        replayed(story.path)

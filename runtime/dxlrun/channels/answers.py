@@ -7,7 +7,7 @@ two later. The gateway passes an answer on as JSON, the Python client makes obje
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum, unique
 from typing import TypeAlias
 
@@ -192,7 +192,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
     def text(self) -> str:
         """The reason in one sentence."""
         shown = {
-            name: _listed(value) if isinstance(value, tuple) else value for name, value in self.fields.items()
+            name: list_names(value) if isinstance(value, tuple) else value for name, value in self.fields.items()
         }
         sentence = self.code.text.format_map(shown)
         hint = "" if "{hint}" in self.code.text else shown.get("hint", "")
@@ -212,7 +212,7 @@ class CommandOutcome(msgspec.Struct, frozen=True):
     """Of the command among those from outside that its cycle took, from 1; 0: none of them, or not known."""
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def list_names(names: Sequence[str]) -> str:
     """Return names in a sentence: all of a few, else the first ones and how many more there are."""
     beyond = len(names) - MOST_NAMED
     if beyond < 2:  # a name is no longer than "1 more"

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.answers import MOST_NAMED
 from dxlrun.channels.cycle import CycleRecord, Floats, Torque
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
@@ -69,6 +68,6 @@ class Anchoring:
 
     def _anchor(self, rows: NDArray[np.bool_], why: str, time_ns: int) -> None:
         names = [self._names[row] for row in np.flatnonzero(rows).tolist()]
-        more = f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else ""
         self._gate.anchor(rows)
-        self._switching.restart(names, f"{why}: {', '.join(names[:MOST_NAMED])}{more}", time_ns)
+        self._paused_at[rows] = self._record.states.position[rows]
+        self._switching.restart(names, why, time_ns)

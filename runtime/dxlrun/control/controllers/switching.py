@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting
+from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting, list_names
 from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.events import RUN_ENDED, EventCode, EventSink, Severity
 from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
@@ -136,15 +136,18 @@ class Switching:
     def restart(self, joints: Collection[str], why: str, time_ns: int) -> None:
         """Activate again every active controller that commands one of these joints, with those above it.
 
-        Each begins where its joints and their goals are now. Its goal is aborted with the reason `why`. The
-        commands of one whose stream ended stay withheld.
+        Each begins where its joints and their goals are now. Its goal is aborted; the reason is `why` with the
+        names of its joints. The commands of one whose stream ended stay withheld.
         """
         again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
         withheld = [managed for managed in again if managed.withheld]
         for managed in again:
-            text = f"begins again where its joints are; {why}"
+            # one above others may name no joint of its own
+            own = [joint for joint in managed.plan.joints if joint in joints] or list(joints)
+            reason = f"{why}: {list_names(own)}"
+            text = f"begins again where its joints are; {reason}"
             self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
-            self._deactivate(managed, time_ns, why)
+            self._deactivate(managed, time_ns, reason)
         if self.fault is not None:
             return
         named = {managed.plan.name: managed for managed in again}
