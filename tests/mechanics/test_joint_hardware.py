@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 from msgspec.structs import replace
@@ -27,6 +27,7 @@ class Servos:
         self.switched: list[tuple[int, bool]] = []
         self.done: list[Callable[..., None]] = []
         self.rows: list[int] = []  # servos whose registers were requested
+        self.followed: list[int] = []  # servos that are to get goals
 
     def read(self) -> None:
         pass
@@ -45,6 +46,9 @@ class Servos:
 
     def write(self) -> None:
         pass
+
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        self.followed += rows
 
 
 class Joints:
@@ -187,3 +191,18 @@ def test_no_joint_with_a_limp_servo_gets_torque_outside_its_limits(
     assert joints.servos.switched == []
     (answer,) = joints.answers
     assert "outside its limits -60.0 deg..60.0 deg" in answer
+
+
+def test_servos_that_are_given_torque_apart_keep_their_places_and_then_agree(joints: Joints) -> None:
+    arrays = joints.arrays
+    arrays.servo_states.position[HIP_SERVOS] = 0.20, 0.24
+    joints.hardware.read()
+    arrays.goals.position[:] = arrays.states.position
+    joints.hardware.follow_goals([HIP])
+    assert joints.servos.followed == HIP_SERVOS
+    goals = arrays.servo_goals.position
+    joints.hardware.write()
+    assert goals[HIP_SERVOS] == pytest.approx([0.20, 0.24], abs=0.001)
+    for _ in range(50):  # 20 ms each
+        joints.hardware.write()
+    assert goals[HIP_SERVOS] == pytest.approx([0.22, 0.22])
