@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
+from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import ReplayDifference, ReplayReport, Setting, replay_log
 
@@ -25,6 +28,15 @@ def ask(kind: str, data: object = None) -> Command:
 def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
     """Return a command for a controller, as it was prepared."""
     return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
+
+
+def prepared(robot: VirtualRobot, controller: str, kind: str, **data: object) -> Command:
+    """Return a command for a controller, prepared from what a client sends, as by the gateway."""
+    loop = robot.plan.loop
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
+    plan = next(one for one in loop.controllers if one.name == controller)
+    found = preparation.command(plan, kind, json.dumps(data).encode(), units=False)
+    return Command(0, controller, kind, found.data, "anna")
 
 
 def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:

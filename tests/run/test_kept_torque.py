@@ -5,7 +5,6 @@ Judged by the simulated shafts. A trajectory of 3 s to `REACH` runs when the fau
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.line_faults import lose_replies
-from tests.kit.stories import Clients, replayed
+from tests.kit.stories import Clients, prepared, replayed
 
-from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import Floats
 from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.policy_plan import SLOW_SPEED
-from dxlrun.remote.preparation import Preparation
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -68,21 +64,12 @@ class Run:
         point = {"positions": [REACH], "time": SECONDS}
         asked = {
             COMMANDED_MS // PERIOD_MS: [
-                self.prepared("arm", "trajectory", points=[point]),
-                self.prepared("wheel", "velocities", velocities=[SPEED]),
+                prepared(self.robot, "arm", "trajectory", points=[point]),
+                prepared(self.robot, "wheel", "velocities", velocities=[SPEED]),
             ]
         }
         self.clients = Clients(self.robot, asked)
         self._sample()
-
-    def prepared(self, controller: str, kind: str, **data: object) -> Command:
-        """Return a client's command, as the gateway hands it on."""
-        plan = self.robot.plan
-        preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
-        plans = {one.name: one for one in plan.loop.controllers}
-        encoded = json.dumps(data).encode()
-        found = preparation.command(plans[controller], kind, encoded, units=False)
-        return Command(0, controller, kind, found.data, "anna")
 
     def fault(self, text: str) -> None:
         FaultScript([parse_fault(text)]).attach(self.robot.buses)
@@ -144,7 +131,7 @@ def test_joints_wait_for_a_command_after_their_line_came_back(tmp_path, protocol
     run, again_ms = Run(tmp_path, protocol), 4000
     run.fault(f"unplug at={FAULT_MS}ms for=600ms")
     point = {"positions": [0.0], "time": 1.0}
-    run.clients.asked[again_ms // PERIOD_MS] = [run.prepared("arm", "trajectory", points=[point])]
+    run.clients.asked[again_ms // PERIOD_MS] = [prepared(run.robot, "arm", "trajectory", points=[point])]
     log = run.log()
     back = [event for event in log.events if event.code == EventCode.SERVO_BACK]
     assert {event.source for event in back} == {"arm", "other", "wheel"}

@@ -192,7 +192,8 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
     def text(self) -> str:
         """The reason in one sentence."""
         shown = {
-            name: list_names(value) if isinstance(value, tuple) else value for name, value in self.fields.items()
+            name: list_names(value) if isinstance(value, tuple) else value
+            for name, value in self.fields.items()
         }
         sentence = self.code.text.format_map(shown)
         hint = "" if "{hint}" in self.code.text else shown.get("hint", "")

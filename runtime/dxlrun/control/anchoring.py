@@ -14,6 +14,7 @@ from dxlrun.channels.cycle import CycleRecord, Floats, Torque
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.control.gate import Gate
+from dxlrun.control.halt import STILL, STILL_LINEAR
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 
@@ -42,7 +43,11 @@ class Anchoring:
         self._switching = switching
         self._gate = gate
         self._record = record
+        self._still = np.array([STILL_LINEAR if joint.linear else STILL for joint in joints])
         self._paused_at: Floats = record.states.position.copy()
+        """Where each joint stood first in the pause."""
+        self._coasts = np.zeros(len(self._names), dtype=np.bool_)
+        """Joints that have not stood yet in the pause."""
 
     def anchor_given(self, time_ns: int) -> None:
         """Anchor the joints that were given torque, and let their servos get goals; after a read.
@@ -57,7 +62,18 @@ class Anchoring:
 
     def begin_pause(self) -> None:
         """Remember where the joints are when the controllers stop."""
+        self._coasts.fill(True)
+        self.watch_pause()
         np.copyto(self._paused_at, self._record.states.position)
+
+    def watch_pause(self) -> None:
+        """Follow the joints that have not stood yet; in each cycle of a pause.
+
+        A wheel coasts after its goal became 0: nobody has moved it. One without a measured speed stands.
+        """
+        states = self._record.states
+        self._coasts &= np.abs(states.velocity) > self._still
+        np.copyto(self._paused_at, states.position, where=self._coasts)
 
     def end_pause(self, time_ns: int) -> None:
         """Anchor the joints that do not hold a position and were moved in the pause."""

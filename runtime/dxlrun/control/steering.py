@@ -120,6 +120,8 @@ class Steering:
         record, manager = self.record, self.manager
         if self.halt.waiting:
             self.halt.watch()
+        if self.paused:
+            self.anchoring.watch_pause()
         for place, command in enumerate(commands, 1):
             self.taken.take(
                 TakenCommand(

@@ -136,8 +136,8 @@ class Switching:
     def restart(self, joints: Collection[str], why: str, time_ns: int) -> None:
         """Activate again every active controller that commands one of these joints, with those above it.
 
-        Each begins where its joints and their goals are now. Its goal is aborted; the reason is `why` with the
-        names of its joints. The commands of one whose stream ended stay withheld.
+        Each begins where its joints and their goals are now. Its goal is aborted for the reason `why` with
+        the names of its joints. The commands of one whose stream ended stay withheld.
         """
         again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
         withheld = [managed for managed in again if managed.withheld]
