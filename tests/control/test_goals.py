@@ -15,7 +15,7 @@ from tests.kit.loops import PERIOD_NS, Hardware, Robot
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.commands import data_of
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
-from dxlrun.channels.events import EventCode, GoalReport
+from dxlrun.channels.events import RUN_ENDED, EventCode, GoalReport
 from dxlrun.contract.controller import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel
 from dxlrun.control.controllers.goals import KEPT, Goals, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
@@ -513,6 +513,40 @@ def test_reached_is_judged_by_what_the_controller_commands(story, monkeypatch):
     monkeypatch.setattr(Hardware, "read", lambda self: None)
     story.run(70, {2: story.moves(1)})
     assert story.timed == [(2, "accepted"), (52, "missed")]
+    assert story.reports[-1][1].text == "after 1.000 s, joint j0 is 8.59 deg off"
+
+
+def judged_off(story, monkeypatch):
+    """Let the arm hand over each goal 0.15 rad away from its joint, which never moves: it has 1 s to settle."""
+
+    def update(self, *_):
+        if self.goal is not None:
+            self.goal.judge(np.array([0.4]))
+            self.goal = None
+
+    story.mover.update = update
+    monkeypatch.setattr(Hardware, "read", lambda self: None)
+
+
+def test_a_stop_in_the_settling_time_aborts_the_goal_and_does_not_fail_it(story, monkeypatch):
+    judged_off(story, monkeypatch)
+    story.run(30, {2: story.moves(1)})
+    (_, ended) = story.reports[-1]
+    assert (ended.status, ended.text, ended.failed) == ("aborted", RUN_ENDED, False)
+
+
+def test_a_plan_ends_only_when_its_goals_have_settled(story, monkeypatch):
+    judged_off(story, monkeypatch)
+    story.send(2 * PERIOD_NS, "arm", "move", 1.0)
+    story.run(end_ns=30 * PERIOD_NS)
+    assert story.result.reason == "ended"
+    assert story.timed == [(2, "accepted"), (52, "missed")]
+
+
+def test_a_pause_takes_nothing_of_the_settling_time(story, monkeypatch):
+    judged_off(story, monkeypatch)
+    story.run(120, {2: story.moves(1), 20: story.asks("pause"), 50: story.asks("resume")})
+    assert story.timed == [(2, "accepted"), (82, "missed")]
     assert story.reports[-1][1].text == "after 1.000 s, joint j0 is 8.59 deg off"
 
 

@@ -164,7 +164,11 @@ class Stage:
         self.controller.on_parameters(self.time_ns)
 
     def _at(self, at_s: float | None) -> None:
-        self.time_ns = self.time_ns if at_s is None else round(at_s * 1e9)
+        self.time_ns = self.judge.time_ns = self.time_ns if at_s is None else round(at_s * 1e9)
+
+    def _judge(self) -> None:
+        self.judge.time_ns = self.time_ns
+        self.judge.judge_running()
 
     # By time
 
@@ -191,11 +195,11 @@ class Stage:
     def update(self, at_s: float, *, follow: bool = True) -> np.ndarray:
         """Update; return the positions that are commanded, where the servos are then if they follow."""
         self._at(at_s)
-        self.judge.judge_running()
+        self._judge()
         self.controller.update(self.time_ns, 20_000_000)
         if follow:
             self.states.position[:] = self.commands.position
-            self.judge.judge_running()
+            self._judge()
         self.sent.values[:2] = self.commands.values[:2]
         return self.commands.position.copy()
 
@@ -214,7 +218,7 @@ class Stage:
         """Update `periods` after the last time; then what was commanded is sent."""
         period_ns = round(periods * self.period_s * 1e9)
         self.time_ns += period_ns
-        self.judge.judge_running()
+        self._judge()
         self.controller.update(self.time_ns, min(period_ns, 5 * self.context.period_ns))
         np.copyto(self.sent.values, self.commands.values)
 

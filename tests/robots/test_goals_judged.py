@@ -109,7 +109,7 @@ def test_a_played_goal_that_the_velocity_limit_holds_back_is_missed(play):
     ran, analyzed = play(FAR_GOAL, FAR)
     assert ran.code == 1
     assert "failed: " in ran.out
-    assert "reel missed the goal of its trajectory: after 3.980 s, joint reel is " in ran.out
+    assert "reel missed the goal of its trajectory: after 4.000 s, joint reel is " in ran.out
     for said in (ran.out, analyzed.out):
         assert "joint reel is 12" in said, "it is 4.15 rad off at the end, and has one second more"
     assert analyzed.code == 1

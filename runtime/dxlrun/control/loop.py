@@ -210,7 +210,8 @@ class Loop:
         """Run cycles; return why they ended, and a sentence for a fault."""
         end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.switching.fault is None:
-            if end_ns is not None and schedule.grid_ns >= end_ns:
+            # A motion that ends late must not cut the settling time of its goal.
+            if end_ns is not None and schedule.grid_ns >= end_ns and not self.manager.settles:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""

@@ -118,9 +118,9 @@ class _Judgement(NamedTuple):
     targets: tuple[_Target, ...]
     text: str
     settled_ns: int
-    """Last time at which a joint may still come within its tolerance; ns of the run's clock."""
+    """Last time at which a joint may still come within its tolerance, ns of the controllers' time."""
     certain_ns: int
-    """Last time at which a missing reply, or a torque in doubt, may become certain."""
+    """Last time at which a missing reply, or a torque in doubt, may become certain, ns of the same time."""
 
 
 class RunningGoal:
@@ -139,8 +139,8 @@ class RunningGoal:
         """As reported last."""
         self.judgement: _Judgement | None = None
         """None until the motion has ended."""
-        self.accepted_ns = goals.now_ns
-        """ns of the run's clock."""
+        self.accepted_ns = goals.time_ns
+        """ns of the controllers' time."""
         self._goals = goals
         self._reported_ns = -FEEDBACK_NS
 
@@ -204,6 +204,8 @@ class Goals:
     ) -> None:
         """`joints` are the robot's. `commanded` returns by a controller's name the joints that it commands,
         and the positions that it commands now; None: it commands none."""
+        self.time_ns = 0
+        """Controllers' time of this cycle, ns. A pause is not part of it, so no settling time passes in one."""
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
@@ -260,7 +262,7 @@ class Goals:
         text: str,
     ) -> None:
         """Judge a goal whose motion has ended, from this cycle on; see `controller.Goal.judge`."""
-        names, now_ns = self._commanded(goal.controller)[0], self.now_ns
+        names, now_ns = self._commanded(goal.controller)[0], self.time_ns
         settle_ns = None if tolerances is None else tolerances.settle_ns
         targets, longest_ns = [], 0
         for index, name in enumerate(names):
@@ -286,14 +288,13 @@ class Goals:
         goal.judgement = _Judgement(tuple(targets), text, settled_ns, max(settled_ns, certain_ns))
         self._judge(goal, goal.judgement)
 
-    def _judge(self, goal: RunningGoal, judgement: _Judgement, *, last: bool = False) -> None:
-        """End a goal as its joints' states decide; one that may still be reached goes on, unless this is the
-        `last` cycle."""
-        states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.now_ns
+    def _judge(self, goal: RunningGoal, judgement: _Judgement) -> None:
+        """End a goal as its joints' states decide; a goal that may still be reached continues."""
+        states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.time_ns
         rows = [target.row for target in targets]
         unable = states.unable(rows)
         doubtful = None if unable is not None else states.doubtful(rows)
-        if doubtful is not None and now_ns < judgement.certain_ns and not last:
+        if doubtful is not None and now_ns < judgement.certain_ns:
             return
         found = unable or doubtful
         outcome, joint, error = Outcome.REACHED, "", math.nan
@@ -302,7 +303,7 @@ class Goals:
             outcome, reason = Outcome.ABORTED, f"joint {joint} {found[1]}"
         else:
             joint, error, reason = self._find_worst(targets)
-            if reason and now_ns < judgement.settled_ns and not last:
+            if reason and now_ns < judgement.settled_ns:
                 return
             outcome = Outcome.MISSED if reason else Outcome.REACHED
         if text:
@@ -342,8 +343,8 @@ class Goals:
         error: float,
         joints: Sequence[str] | None,
     ) -> None:
-        """End a goal for its controller; one that is missed is aborted where one of its joints goes nowhere,
-        and that joint is named."""
+        """End a goal for its controller. A missed goal becomes aborted if a joint is lost or limp; the report
+        names that joint."""
         names = self._commanded(goal.controller)[0] if joints is None else joints
         if outcome is Outcome.MISSED and names:
             rows = [self._joints[name][0] for name in names]
@@ -368,11 +369,16 @@ class Goals:
         severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
         self._report(goal, EventCode.GOAL_ENDED, severity, outcome.value, sentence)
 
-    def judge_running(self, *, last: bool = False) -> None:
-        """Judge the goals whose motions have ended; in the `last` cycle of a run none may wait any longer."""
+    def judge_running(self) -> None:
+        """Judge the goals whose motions have ended."""
         for goal in tuple(self.running.values()):
             if goal.judgement is not None:
-                self._judge(goal, goal.judgement, last=last)
+                self._judge(goal, goal.judgement)
+
+    @property
+    def are_settling(self) -> bool:
+        """True while the motion of a goal has ended and its joints may still settle."""
+        return any(goal.is_judged for goal in self.running.values())
 
     def _report(
         self, goal: RunningGoal, code: EventCode, severity: Severity, status: str, sentence: str

@@ -110,6 +110,7 @@ class Manager:
         neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
         held by the gate; the others are updated all the same.
         """
+        self._goals.time_ns = time_ns
         if self.switching.groups:
             self.switching.admit(time_ns)
         if self._next < len(self._plan.commands):
@@ -147,13 +148,19 @@ class Manager:
     def deactivate(self, time_ns: int) -> None:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`.
 
-        Goals whose motions have ended are judged now: their settling time is cut by the end of the run.
+        Goals that are neither reached nor missed by now end as aborted, because the run ended.
         """
-        self._goals.judge_running(last=True)
+        self._goals.time_ns = time_ns
+        self._goals.judge_running()
         self.switching.deactivate_all(time_ns)
         self._keeping.finish()
 
     # Commands
+
+    @property
+    def settles(self) -> bool:
+        """True while the motion of a goal has ended and its joints may still settle."""
+        return self._goals.are_settling
 
     def hand(self, command: Command, time_ns: int, pursued: RunningGoal | None = None) -> int | Refusal:
         """Hand a prepared command to its controller; return the number of the goal that it is, else 0.
@@ -163,6 +170,7 @@ class Manager:
         With a lease it runs out unless another one follows (see `stale`). Of a stream, only the first one has
         an event.
         """
+        self._goals.time_ns = time_ns
         if len(command.data) % 8:
             problem = f"{len(command.data)} bytes are no array of numbers"
             return Refusal(Code.INVALID, {"problem": problem})
@@ -340,6 +348,7 @@ class Manager:
 
         `numbers` has the commands of all parts in a row, little-endian float64.
         """
+        self._goals.time_ns = time_ns
         sizes = [size for part in parts for size in part.sizes]
         fits = all(size >= 0 for size in sizes) and 8 * sum(sizes) == len(numbers)
         if not fits or any(len(part.at_ns) != len(part.sizes) for part in parts):
