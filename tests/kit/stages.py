@@ -77,6 +77,7 @@ class Stage:
     into: tuple[str, ...] = ()
     motors: tuple[MotorModel | None, ...] = ()
     servos: tuple[ServoModel | None, ...] = ()
+    linear: bool = False
     urdf: str | None = None
     kept: bytes = b""
     others: tuple[str, ...] = ()
@@ -117,6 +118,7 @@ class Stage:
             into=self.into,
             motors=self.motors,
             servos=self.servos,
+            linear=(self.linear,) * count,
             urdf=self.urdf,
             provided=np.full(len(self.interfaces.provides), np.nan),
             device_commands=np.full(len(self.interfaces.device_commands), np.nan),

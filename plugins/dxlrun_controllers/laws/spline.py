@@ -319,9 +319,10 @@ class Trajectory:
         speeds: Floats = np.abs(peak_velocities(self._bridge, self.bridge_s)[0])
         return speeds
 
-    def longest_steps(self, now: SplineSample) -> Floats:
-        """Return the longest way of each joint from one point to the next, from `now` on, rad."""
-        points = np.vstack([now.position, self._first[0], *self._pieces[:, 0], self._last[0]])
+    def longest_steps(self, now: SplineSample, rows: NDArray[np.intp]) -> Floats:
+        """Return the longest way of each joint of `rows` from one point to the next, from `now` on, rad."""
+        starts = self._pieces[:, 0, rows]
+        points = np.concatenate([[now.position[rows], self._first[0, rows]], starts, [self._last[0, rows]]])
         steps: Floats = np.abs(np.diff(points, axis=0)).max(axis=0)
         return steps
 

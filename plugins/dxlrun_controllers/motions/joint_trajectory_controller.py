@@ -26,6 +26,7 @@ from dxlrun import (
     ParametersModel,
     SpeedPeak,
     Tolerance,
+    distance_text,
 )
 from dxlrun_controllers.joints import (
     CLOSING_SPEED,
@@ -44,6 +45,7 @@ from dxlrun_controllers.laws.spline import (
     START_IN,
     Limits,
     SplineSample,
+    Trajectory,
     flat_size,
     whole_turns,
 )
@@ -255,6 +257,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return
         self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
         self._phase = _Phase.MOVING
+        self._timeout_ns = float(data[flat_size(data)]) * 1e9
         if self._tracks.playing and (data[-len(self._moved) :] == SPLICED).any():
             self._spliced, self._splice_s = data, self._warped(time_ns) + float(data[START_IN])
         else:
@@ -269,8 +272,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         track, moved = self._tracks.free(), more[-count:] != 0
         begin = self._path_of(moved)
         track.trajectory.load(whole_turns(data, begin.position, self._wrap & moved), begin, waited_s)
-        self._warn_of_turns(track.trajectory.longest_steps(begin) * moved)
-        self._timeout_ns = float(more[0]) * 1e9
+        self._warn_of_turns(track.trajectory, begin, np.flatnonzero(self._turns & moved))
         self._within = self._own.replaced_by(more[1:], count)
         self._take(track, moved)
         if self._refused_for_haste():
@@ -279,13 +281,16 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._tracks.follow(track, moved, clock_s)
             self._base_ns, self._base_s = time_ns, since_s
 
-    def _warn_of_turns(self, steps: Floats) -> None:
-        """Warn of steps by which a continuous joint turns the longer way."""
-        for row in np.flatnonzero(self._turns & (steps > np.pi * (1 + 1e-9))).tolist():
-            self.context.warn(
-                f"joint {self.context.joints[row]} turns by {math.degrees(steps[row]):.4g} deg "
-                "from one point to the next; write wrap: true for it if it shall take the shorter way"
-            )
+    def _warn_of_turns(self, trajectory: Trajectory, begin: SplineSample, rows: NDArray[np.intp]) -> None:
+        """Warn of steps by which a continuous joint, one of `rows`, turns the longer way."""
+        if not rows.size:  # the steps of thousands of points take milliseconds of the cycle
+            return
+        for row, step in zip(rows.tolist(), trajectory.longest_steps(begin, rows).tolist(), strict=True):
+            if step > np.pi * (1 + 1e-9):
+                self.context.warn(
+                    f"joint {self.context.joints[row]} turns by {math.degrees(step):.4g} deg "
+                    "from one point to the next; write wrap: true for it if it shall take the shorter way"
+                )
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Pass into a chunk of positions; not where all of it is past, or a joint has not answered yet."""
@@ -387,7 +392,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if goal is None:
             return
         if row < 0:
-            self._measure(silent=0.0)
+            self._measure()
             row = int(self._error.argmax())
         after = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s{', ' * bool(text)}{text}"
         goal.end(outcome, after, self.context.joints[row], float(self._error[row]), self._moved_joints())
@@ -426,14 +431,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         elif self._goal is None:
             return
         elif self._within.checks_path and (row := self._find_off_path()) >= 0:
-            self._end(Outcome.ABORTED, time_ns, f"{self._off(row)}, stopping", row)
+            self._end(Outcome.ABORTED, time_ns, f"{self._off_path_text(row)}, stopping", row)
             self._stop_from(time_ns)
         elif time_ns - self._start_ns > self._timeout_ns:
             self._time_out(time_ns)
             self._stop_from(time_ns)
         elif time_ns >= self._feedback_ns and self._spliced is None:
             self._feedback_ns = time_ns + FEEDBACK_NS
-            self._measure(silent=0.0)
+            self._measure()
             self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
     def _sample(self, time_ns: int) -> float:
@@ -462,7 +467,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._base_ns, self._rate = time_ns, reached
         return self._base_s
 
-    def _hand_over(self, time_ns: int) -> None:
+    def _hand_over(self, time_ns: int, text: str = "") -> None:
         """Let the goal be judged by its last point, as it was asked."""
         goal, self._goal = self._goal, None
         if goal is None:
@@ -472,14 +477,17 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._within.position,
             self._within.velocity,
             None if math.isnan(self._within.settle_s) else round(self._within.settle_s * 1e9),
-            round(left_ns) if math.isfinite(left_ns) else None,
+            round(max(0.0, left_ns)) if math.isfinite(left_ns) else None,
         )
-        goal.judge(self._trajectory.end, joints=self._moved_joints(), tolerances=tolerances)
+        goal.judge(self._trajectory.end, joints=self._moved_joints(), tolerances=tolerances, text=text)
 
     def _time_out(self, time_ns: int) -> None:
-        self._measure(silent=np.inf)
-        row = int(self._error.argmax())
-        self._end(Outcome.MISSED, time_ns, f"its time-out: {self._off(row)}", row)
+        text = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s, its time-out"
+        if self._spliced is not None and self._goal is not None:
+            # What is played is still the trajectory before: its end says nothing about this goal.
+            self._goal.end(Outcome.MISSED, f"{text}, before its start")
+            self._goal = None
+        self._hand_over(time_ns, text)
 
     def _stop_from(self, time_ns: int) -> None:
         """Let all joints come to rest from their desired velocity."""
@@ -517,23 +525,25 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     # How far off
 
-    def _measure(self, silent: float) -> None:
-        """Set how far each joint of the goal is off, rad; `silent` for one without a reply."""
+    def _measure(self) -> None:
+        """Set the distance of each joint of the goal from its desired position, rad or m; 0 without a reply."""
         states = self.context.states
-        self._error = np.where(states.valid, np.abs(states.position - self._desired.position), silent)
+        self._error = np.where(states.valid, np.abs(states.position - self._desired.position), 0.0)
         np.copyto(self._error, 0.0, where=self._unmoved)
 
     def _find_off_path(self) -> int:
         """Return the row of the joint that is farthest off its path, beyond a tolerance; -1: none is."""
-        self._measure(silent=0.0)
+        self._measure()
         states, within = self.context.states, self._within
         slip = np.abs(states.velocity - self._desired.velocity)
         beyond = self._error > within.path
         beyond |= (slip > within.path_velocity) & states.valid & self._moved
         return int(np.where(beyond, self._error, -1.0).argmax()) if beyond.any() else -1
 
-    def _off(self, row: int) -> str:
-        joint = self.context.joints[row]
-        if np.isinf(self._error[row]):
-            return f"joint {joint} does not answer"
-        return f"joint {joint} is {self._error[row]:.4f} rad off"
+    def _off_path_text(self, row: int) -> str:
+        joint, linear = self.context.joints[row], self.context.linear[row]
+        if self._error[row] > self._within.path[row]:
+            return f"joint {joint} is {distance_text(float(self._error[row]), linear)} off its path"
+        speeds = (self.context.states.velocity, self._desired.velocity, self._within.path_velocity)
+        actual, desired, allowed = (f"{distance_text(float(of[row]), linear)}/s" for of in speeds)
+        return f"joint {joint} moves at {actual} instead of {desired}, {allowed} allowed"

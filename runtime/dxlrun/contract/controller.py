@@ -283,6 +283,8 @@ class Context(msgspec.Struct, frozen=True):
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
     servos: tuple[ServoModel | None, ...] = ()
     """Its joints' servos, by the manual; None: several servos move the joint."""
+    linear: tuple[bool, ...] = ()
+    """True for each joint whose positions are lengths, m."""
     urdf: str | None = None
     """Text of the URDF that the robot file names; None: it names none."""
     provided: Floats = msgspec.field(default_factory=_none)

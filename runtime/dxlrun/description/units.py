@@ -269,6 +269,16 @@ def duration(text: object, *, bare: str = "") -> int:
     return value
 
 
+def distance_text(distance: float, linear: bool) -> str:
+    """Return a distance in the unit in which users write it.
+
+    Args:
+        distance: rad, or m of a linear joint.
+        linear: True for a length.
+    """
+    return f"{distance * 1e3:.2f} mm" if linear else f"{math.degrees(distance):.2f} deg"
+
+
 def quantity(text: str, unit: str) -> float:
     """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
 

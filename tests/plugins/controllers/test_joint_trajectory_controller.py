@@ -1,5 +1,7 @@
 """The trajectory controller: by time, without jumps, with tolerances."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -131,7 +133,7 @@ def test_off_the_path_it_aborts_and_holds():
     robot = moving(TWO | {"tolerances": {"path": "0.1 rad"}}, to=(1.3, -0.2))
     path = seen(robot, (0.05, 0.09, 0.15, 0.5, 2.0), follow=False)
     np.testing.assert_allclose(path[-1], [0.45 + 1.0 / 2 / DECELERATION, -0.2])
-    told = "after 0.150 s, joint a is 0.1500 rad off, stopping"
+    told = "after 0.150 s, joint a is 8.59 deg off its path, stopping"
     assert robot.goal.ended == [(Outcome.ABORTED, told, "a", pytest.approx(0.15))]
 
 
@@ -536,7 +538,8 @@ def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_sto
     position = seen(robot, (0.4, 0.5, 0.52, 2.0))[-1]
     outcome, told, joint, _ = robot.goal.ended[0]
     assert (outcome, joint) == (Outcome.MISSED, "a")
-    assert told.startswith("after 0.520 s, its time-out: joint a is ")
+    assert told.startswith("joint a is ")
+    assert told.endswith(" deg off; after 0.520 s, its time-out")
     assert position == pytest.approx(0.3 if not speed else 0.82 + 1 / 2 / DECELERATION)
 
 
@@ -546,6 +549,53 @@ def test_the_time_out_ends_a_goal_that_is_waited_for_too():
     seen(robot, (1.0, 1.9, 2.1, 9.0), follow=False)
     told = "after 2.100 s, joint a is 57.30 deg off"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
+
+
+def test_beginning_a_long_trajectory_copies_none_of_its_points():
+    robot = started(limits={"lower": -2.0, "upper": 2.0})
+    data = robot.prepare("trajectory", points=[*one(0.3, time=0.01)] + [
+        point for index in range(3_000) for point in one(0.3, time=0.02 + index * 0.01)
+    ])  # fmt: skip
+    robot.prepare = lambda kind, **_: data
+    tracemalloc.start()
+    robot.send(0.0, "trajectory")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < data.nbytes / 3
+
+
+def test_a_timed_out_goal_is_judged_by_its_last_point():
+    robot = started(ONE | {"speed": 0.0})
+    robot.send(0.0, "trajectory", timeout=0.5, points=one(1.3))
+    seen(robot, (0.4, 0.52))
+    told = "joint a is 57.30 deg off; after 0.520 s, its time-out"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
+
+
+def test_a_goal_that_times_out_before_its_splice_names_no_joint():
+    robot = moving()
+    robot.send(0.2, "trajectory", splice=True, start_in=0.6, timeout=0.3, points=one(0.3))
+    seen(robot, (0.3, 0.5, 0.52))
+    told = "after 0.320 s, its time-out, before its start"
+    assert [end[:3] for end in robot.goal.ended] == [(Outcome.MISSED, told, "")]
+
+
+def test_a_speed_off_the_path_is_named_with_the_desired_and_the_allowed_one():
+    robot = started()
+    robot.send(0.0, "trajectory", path_tolerance={"a": {"velocity": 0.5}}, points=one(1.3))
+    robot.states.velocity[:] = 0.2
+    robot.update(0.1)
+    told = "after 0.100 s, joint a moves at 11.46 deg/s instead of 57.30 deg/s, 28.65 deg/s allowed, stopping"
+    assert [end[1] for end in robot.goal.ended] == [told]
+
+
+def test_a_linear_joint_off_its_path_is_named_in_millimetres():
+    robot = Stage(JointTrajectoryController, ONE | {"tolerances": {"path": "10 mm"}}, linear=True).activate()
+    robot.send(0.0, "trajectory", points=one(1.3))
+    robot.update(0.02, follow=False)
+    assert [end[1] for end in robot.goal.ended] == [
+        "after 0.020 s, joint a is 20.00 mm off its path, stopping"
+    ]
 
 
 def test_a_joint_that_never_answered_aborts_the_goal_at_once():

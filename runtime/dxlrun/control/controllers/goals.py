@@ -19,6 +19,7 @@ from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
+from dxlrun.description.units import distance_text
 from dxlrun.messages import Header
 from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
 
@@ -324,10 +325,10 @@ class Goals:
             speed = abs(states.velocity.item(target.row))
             rank, off, reason = 0, 0.0 if math.isnan(error) else error, ""
             if error > target.tolerance:
-                rank, reason = 2, f"joint {target.joint} is {_amount(error, target.linear)} off"
+                rank, reason = 2, f"joint {target.joint} is {distance_text(error, target.linear)} off"
             elif speed > target.rest_speed:
                 rank, off = 1, speed
-                reason = f"joint {target.joint} still moves at {_amount(speed, target.linear)}/s"
+                reason = f"joint {target.joint} still moves at {distance_text(speed, target.linear)}/s"
             if (rank, off) > worst[:2]:
                 name = "" if math.isnan(error) and not reason else target.joint
                 worst = rank, off, name, error, reason
@@ -360,7 +361,7 @@ class Goals:
         goal.error, goal.joint, goal.text = error, _writable(joint), _writable(text)
         if not goal.text and goal.joint and math.isfinite(error):
             linear = goal.joint in self._joints and self._joints[goal.joint][1].linear
-            goal.text = f"joint {goal.joint} is {_amount(error, linear)} off"
+            goal.text = f"joint {goal.joint} is {distance_text(error, linear)} off"
         if outcome is Outcome.REACHED:
             goal.progress = 1.0
         del self.running[goal.number]
@@ -398,11 +399,6 @@ class Goals:
         message.origin, message.status, message.progress = goal.origin, status, goal.progress
         message.error, message.joint, message.text = goal.error, goal.joint, goal.text
         self._publisher.publish(message)
-
-
-def _amount(value: float, linear: bool) -> str:
-    """Return a distance, rad or m, in the unit in which users write it."""
-    return f"{value * 1e3:.2f} mm" if linear else f"{math.degrees(value):.2f} deg"
 
 
 def _writable(text: object) -> str:
