@@ -517,7 +517,7 @@ def test_reached_is_judged_by_what_the_controller_commands(story, monkeypatch):
 
 
 def judged_off(story, monkeypatch):
-    """Let the arm hand over each goal 0.15 rad away from its joint, which never moves: it has 1 s to settle."""
+    """Let the arm hand over goals 0.15 rad away from its joint, which never moves: it has 1 s to settle."""
 
     def update(self, *_):
         if self.goal is not None:

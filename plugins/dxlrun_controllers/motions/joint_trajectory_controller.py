@@ -526,7 +526,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # How far off
 
     def _measure(self) -> None:
-        """Set the distance of each joint of the goal from its desired position, rad or m; 0 without a reply."""
+        """Set the distance of the goal's joints from their desired positions, rad or m; 0 without a reply."""
         states = self.context.states
         self._error = np.where(states.valid, np.abs(states.position - self._desired.position), 0.0)
         np.copyto(self._error, 0.0, where=self._unmoved)

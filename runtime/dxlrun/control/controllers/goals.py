@@ -206,7 +206,7 @@ class Goals:
         """`joints` are the robot's. `commanded` returns by a controller's name the joints that it commands,
         and the positions that it commands now; None: it commands none."""
         self.time_ns = 0
-        """Controllers' time of this cycle, ns. A pause is not part of it, so no settling time passes in one."""
+        """Controllers' time of this cycle, ns; no settling time passes in a pause, which is not part of it."""
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
