@@ -18,7 +18,6 @@ from dxlrun import (
     Context,
     Controller,
     Duration,
-    Floats,
     Goal,
     GoalTolerances,
     Interfaces,

@@ -206,7 +206,7 @@ class Goals:
         """`joints` are the robot's. `commanded` returns by a controller's name the joints that it commands,
         and the positions that it commands now; None: it commands none."""
         self.time_ns = 0
-        """Controllers' time of this cycle, ns; no settling time passes in a pause, which is not part of it."""
+        """Controllers' time of this cycle, ns. Without pauses, so none shortens a settling time."""
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
