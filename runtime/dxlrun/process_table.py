@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 PROC = Path("/proc")
-_PLAN_MEMORY = "/memfd:dxlrun-plan "
 _ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # the beginning of a plan as JSON
 _DEAD = "ZXx"
 _STOPPED = "Tt"
@@ -75,17 +74,10 @@ class FoundRun(NamedTuple):
         """Return its process of this role; None when it is gone."""
         return next((one for one in self.processes if one.role == role), None)
 
-    @property
-    def problem(self) -> str:
-        """Why the run cannot be steered, as a clause; empty when it can."""
-        steering = (SUPERVISOR, "guardian", "loop", "gateway")
-        gone = [role for role in steering if self.process(role) is None]
-        stopped = [str(one) for one in self.processes if one.stat.is_stopped and one.role in steering]
-        parts = [f"it has no {' and no '.join(gone)}"] if gone else []
-        parts += (
-            [f"its {' and '.join(stopped)} {'is' if len(stopped) == 1 else 'are'} stopped"] if stopped else []
-        )
-        return " and ".join(parts)
+    def memory(self, name: str) -> Path | None:
+        """Return the path of its shared memory of this name; None when no process has it open."""
+        found = (_memory_path(PROC / str(one.pid), name) for one in self.processes)
+        return next((path for path in found if path is not None), None)
 
 
 def is_alive(process: RunProcess) -> bool:
@@ -127,12 +119,20 @@ def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
 
 def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
     """Return what identifies the plan's memory that a process has open, and the robot of the plan."""
-    with suppress(OSError, UnicodeDecodeError):  # it has just ended, or belongs to another user
+    with suppress(OSError, UnicodeDecodeError):  # it has just ended
+        if descriptor := _memory_path(process, "plan"):
+            match = _ROBOT.match(descriptor.read_bytes())
+            inode = descriptor.stat()
+            return ((inode.st_dev, inode.st_ino), match[1].decode()) if match else None
+    return None
+
+
+def _memory_path(process: Path, name: str) -> Path | None:
+    """Return where a process has shared memory of this name open."""
+    with suppress(OSError):  # it has just ended, or belongs to another user
         for descriptor in (process / "fd").iterdir():
-            if os.readlink(descriptor).startswith(_PLAN_MEMORY):
-                match = _ROBOT.match(descriptor.read_bytes())
-                inode = descriptor.stat()
-                return ((inode.st_dev, inode.st_ino), match[1].decode()) if match else None
+            if os.readlink(descriptor).startswith(f"/memfd:dxlrun-{name} "):
+                return descriptor
     return None
 
 

@@ -72,7 +72,9 @@ def test_a_run_of_another_runtime_directory_is_ended_by_name_only(
     dxlrun, orphan: Begin, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     loop = orphan("far_arm")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "other"))
+    other = tmp_path / "other"
+    other.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(other))
     assert "no robot runs that can be steered" in dxlrun("stop").err
     assert "far_arm" not in dxlrun("list").err
     assert dxlrun("stop", "--robot", "far_arm").code == 0

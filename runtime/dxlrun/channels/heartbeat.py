@@ -1,11 +1,11 @@
 """Heartbeats: shared memory by which loop, guardian and supervisor see that the others respond.
 
-A single writer a field: the loop's process, for `looks` the guardian, and for `supervisor_looks` the
-supervisor. Each field is one aligned 64-bit
-store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
-clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
-visible behind what was shown before it, and what makes the guardian's timeout shorter behind the beat before
-it: a guardian that saw it without that beat would take what the loop did in the longer time for a standstill.
+Each field has one writer: the supervisor for `supervisor_looks` and `steering`, the guardian for `looks`,
+and the loop's process for the others. Each field is one aligned 64-bit store through a cast memoryview,
+which 64-bit processors make whole. (`struct.pack_into` would not do: it clears its target first, and a
+process killed in between would seem never to have begun.) A phase becomes visible behind what was shown
+before it, and what makes the guardian's timeout shorter behind the beat before it: a guardian that saw it
+without that beat would take what the loop did in the longer time for a standstill.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dxlrun.channels import shared_memory
 from dxlrun.channels.shared_memory import load, store
 from dxlrun.process_table import read_stat
 
-_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL, _SUPERVISOR_LOOKS = range(8)
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL, _SUPERVISOR_LOOKS, _STEERING = range(9)
 _NAMES = 4096
 _NAME_BYTES = 128
 _MOST_NAMES = 64
@@ -40,6 +40,18 @@ class Phase(IntEnum):
     STOPPING = 4
     DONE = 5
     """The loop itself has left the robot as by its policy: limp, as far as servos answered, or holding."""
+
+
+@unique
+class Steering(IntEnum):
+    """Whether a run can be steered, as its supervisor knows it."""
+
+    AWAITED = 0
+    """The gateway was not started yet, or does not listen yet."""
+    POSSIBLE = 1
+    """The gateway listens."""
+    IMPOSSIBLE = 2
+    """The run has no gateway, or has lost it."""
 
 
 @unique
@@ -115,6 +127,15 @@ class Heartbeat:
     def supervisor_look(self) -> None:
         """Show that the supervisor watches; called by the supervisor alone."""
         self._words[_SUPERVISOR_LOOKS] += 1
+
+    def set_steering(self, steering: Steering) -> None:
+        """Publish whether the run can be steered; called by the supervisor alone."""
+        self._words[_STEERING] = steering
+
+    @property
+    def steering(self) -> Steering:
+        """Whether the run can be steered."""
+        return Steering(self._words[_STEERING])
 
     @property
     def activity(self) -> str:

@@ -39,9 +39,13 @@ LONGEST_PATH = 107
 """Bytes; what Linux takes as the name of a Unix socket (unix(7)), without the final zero."""
 
 
-def place() -> Path:
-    """Return the directory of this user's sockets; it may not exist yet."""
-    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+def place(runtime_directory: str | None = None) -> Path:
+    """Return the directory of this user's sockets; it may not exist yet.
+
+    `runtime_directory`: XDG_RUNTIME_DIR of another process; empty without one. None: our own.
+    """
+    ours = os.environ.get("XDG_RUNTIME_DIR", "")
+    runtime = Path(ours if runtime_directory is None else runtime_directory)
     with suppress(OSError):
         # su and sudo may leave that of another user in the environment
         if runtime.is_absolute() and runtime.stat().st_uid == os.getuid():
@@ -117,6 +121,17 @@ def alive(path: Path) -> bool:
         except OSError:
             return False
         return True
+
+
+def listener(path: Path) -> int | None:
+    """Return the ID of the process that listens at a socket; None when it cannot be connected at once."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        with suppress(OSError):
+            probe.connect(str(path))
+            credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+            return int(struct.unpack("3i", credentials)[0])
+    return None
 
 
 def running() -> tuple[str, ...]:

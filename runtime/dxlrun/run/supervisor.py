@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from dxlrun.channels import process
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.events import Severity
-from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.heartbeat import Heartbeat, Phase, Steering
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import MailboxWriter
 from dxlrun.channels.process import (
@@ -176,6 +176,8 @@ class _Run:
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
         self.held = self.steerable and (not self.plan.simulated or bool(self.options.listen))
+        if not self.steerable:
+            Heartbeat(self.memory.heartbeat).set_steering(Steering.IMPOSSIBLE)
 
     def count_signal(self) -> None:
         """Take a signal."""
@@ -317,6 +319,7 @@ class _Run:
             if isinstance(message, Listening):
                 self.socket = Path(message.socket)
                 self.held = False
+                heartbeat.set_steering(Steering.POSSIBLE)
             else:
                 self._without_gateway(f"did not start ({message.sentence})")
         elif self.gateway.channel.closed:
@@ -325,6 +328,7 @@ class _Run:
     def _without_gateway(self, what: str) -> None:
         """Report that the run cannot be steered any more, and start no other gateway; end one that waits."""
         self.steerable = False
+        Heartbeat(self.memory.heartbeat).set_steering(Steering.IMPOSSIBLE)
         if self.held and self.guardian is not None:
             fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
             self.sentences.append(f"the gateway {what}, so the robot did not move; {fix}")

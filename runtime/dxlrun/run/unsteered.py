@@ -1,4 +1,4 @@
-"""Runs that cannot be steered: no gateway, or one of their processes is dead or stopped. They can be ended.
+"""Runs that cannot be steered: they start, end, have no gateway, or have lost processes. They can be ended.
 
 The signals are those that the processes heed among themselves (`watch.py`), so torque goes off by the run's
 own policy: this process never writes to a port.
@@ -10,60 +10,154 @@ import os
 import signal
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 
+from dxlrun.channels.heartbeat import Heartbeat, Phase, Steering
 from dxlrun.errors import DxlrunError
 from dxlrun.process_table import SUPERVISOR, FoundRun, RunProcess, found_runs, is_alive
+from dxlrun.remote.sockets import listener, place, sockets
 
 _END_S = 30.0
 """For the steps of on_exit, and for the recorder on a slow disk."""
 _POLL_S = 0.05
+_ENDING = (Phase.STOPPING, Phase.DONE)
 
 
-def unsteered_runs() -> list[FoundRun]:
-    """Return the runs that share our runtime directory and cannot be steered."""
-    ours = os.environ.get("XDG_RUNTIME_DIR", "")
-    return [run for run in found_runs() if run.problem and run.runtime_directory == ours]
+@dataclass(frozen=True, slots=True)
+class UnsteeredRun:
+    """A run whose gateway does not take commands now."""
+
+    run: FoundRun
+    name: str
+    """Its name for `--robot`: with a process ID where another run has the robot's name."""
+    problem: str
+    """Why it cannot be steered, as a clause; empty while it starts or ends."""
+
+    def is_named(self, name: str) -> bool:
+        """Return whether a name for `--robot` means this run, with a process ID also where none is needed."""
+        return name in {self.name, *(f"{self.run.robot}-{one.pid}" for one in self.run.processes)}
+
+    @property
+    def is_ours(self) -> bool:
+        """True when its gateway listens where ours would."""
+        return _is_ours(self.run)
 
 
-def unsteered_run(robot: str) -> FoundRun | None:
-    """Return the run of a robot that cannot be steered, whatever its runtime directory."""
-    return next((run for run in found_runs() if run.robot == robot and run.problem), None)
+def unsteered_runs() -> list[UnsteeredRun]:
+    """Return the runs that cannot be steered; those of other runtime directories too.
+
+    A plain robot name belongs to the run that listens under it, else to the only run of that robot in our
+    runtime directory, else to the only one on this computer.
+    """
+    listeners = {listener(path): name for name, path in sockets().items()}
+    found = found_runs()
+    unsteered = []
+    for run in found:
+        problem = _problem(run)
+        listens_as = next((listeners[one.pid] for one in run.processes if one.pid in listeners), None)
+        if problem or (listens_as is None and not _is_steerable(run)):
+            ours = _is_ours(run)
+            rivals = [one for one in found if one.robot == run.robot and (_is_ours(one) or not ours)]
+            is_only = len(rivals) == 1 and run.robot not in listeners.values()
+            name = listens_as or (run.robot if is_only else f"{run.robot}-{run.processes[0].pid}")
+            unsteered.append(UnsteeredRun(run, name, problem))
+    return unsteered
 
 
-def describe(run: FoundRun) -> str:
+def describe(run: UnsteeredRun) -> str:
     """Return a sentence for a person who wants to steer it."""
-    return f"{run.robot} runs but cannot be steered: {run.problem}; `dxlrun stop --robot {run.robot}` ends it"
+    if run.problem:
+        fix = f"`dxlrun stop --robot {run.name}` ends it"
+        return f"{run.name} runs but cannot be steered: {run.problem}; {fix}"
+    if _is_ending(run.run):
+        return f"{run.name} is ending"
+    return f"{run.name} is starting and cannot be steered yet; try again when it runs"
 
 
-def end_run(run: FoundRun, *, wait: bool) -> str:
+def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
     """Ask a run to end in order, and continue its stopped processes; return a sentence.
 
     `wait`: until all its processes have ended. Raises DxlrunError where one does not.
     """
-    # a supervisor that is stopped would act when it is continued, but the loop is nearer to the torque
-    supervisor, loop = run.process(SUPERVISOR), run.process("loop")
-    asked = supervisor if loop is None or (supervisor and not supervisor.stat.is_stopped) else loop
-    if asked is not None:
+    run, name = unsteered.run, unsteered.name
+    # A supervisor switches torque off at its second signal, and Ctrl-C may have been the first. The loop
+    # takes any number of them, unless it has finished and is about to exit.
+    asked = run.process("loop") or run.process(SUPERVISOR)
+    if asked is not None and not _is_ending(run):
         _send(asked, signal.SIGTERM)
     for one in run.processes:
         if one.stat.is_stopped:
             _send(one, signal.SIGCONT)
-    why = f"it could not be steered: {run.problem}"
+    why = f"; it could not be steered: {unsteered.problem}" if unsteered.problem else ""
     if not wait:
-        return f"{run.robot} is ending; {why}"
+        return f"{name} is ending{why}"
     give_up = time.monotonic() + _END_S
     while left := [one for one in run.processes if is_alive(one)]:
         if time.monotonic() > give_up:
-            raise DxlrunError(_not_ended(run.robot, left))
+            raise DxlrunError(_not_ended(name, left))
         time.sleep(_POLL_S)
-    return f"{run.robot} has ended; {why}"
+    return f"{name} has ended{why}"
 
 
-def _not_ended(robot: str, left: list[RunProcess]) -> str:
+def _problem(run: FoundRun) -> str:
+    """Return why a run cannot be steered and will not get ready for it, as a clause; empty otherwise.
+
+    A supervisor that responds ends a run whose guardian or loop is dead or stopped.
+    """
+    supervisor, gateway = run.process(SUPERVISOR), run.process("gateway")
+    if supervisor is not None and not supervisor.stat.is_stopped:
+        if gateway is not None and gateway.stat.is_stopped:
+            return f"its {gateway} is stopped"
+        heartbeat = _heartbeat(run)
+        if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
+            return ""
+        return "it has no gateway" if heartbeat.steering is Steering.IMPOSSIBLE else ""
+    steering = (SUPERVISOR, "guardian", "loop", "gateway")
+    gone = [role for role in steering if run.process(role) is None]
+    stopped = [str(one) for one in run.processes if one.stat.is_stopped and one.role in steering]
+    parts = [f"it has no {' and no '.join(gone)}"] if gone else []
+    parts += (
+        [f"its {' and '.join(stopped)} {'is' if len(stopped) == 1 else 'are'} stopped"] if stopped else []
+    )
+    return " and ".join(parts)
+
+
+def _is_steerable(run: FoundRun) -> bool:
+    heartbeat = _heartbeat(run)
+    if heartbeat is None or run.process("gateway") is None:
+        return False
+    return heartbeat.phase is Phase.RUNNING and heartbeat.steering is Steering.POSSIBLE
+
+
+def _is_ending(run: FoundRun) -> bool:
+    """Return whether its loop stops the robot, has done so, or has died."""
+    heartbeat = _heartbeat(run)
+    if heartbeat is None:
+        return False
+    phase = heartbeat.phase
+    return phase in _ENDING or (phase is not Phase.LOADING and run.process("loop") is None)
+
+
+def _heartbeat(run: FoundRun) -> Heartbeat | None:
+    with suppress(OSError, ValueError):  # the process has just ended
+        if path := run.memory("heartbeat"):
+            descriptor = os.open(path, os.O_RDWR)
+            try:
+                return Heartbeat(descriptor)
+            finally:
+                os.close(descriptor)
+    return None
+
+
+def _is_ours(run: FoundRun) -> bool:
+    return place(run.runtime_directory) == place()
+
+
+def _not_ended(name: str, left: list[RunProcess]) -> str:
     names = " and ".join(map(str, left))
     pids = " ".join(str(one.pid) for one in left)
     return (
-        f"{robot}: {names} did not end within {_END_S:g} s, so torque may be on; "
+        f"{name}: {names} did not end within {_END_S:g} s, so torque may be on; "
         f"switch the servos' power off, then `kill -9 {pids}`"
     )
 

@@ -20,8 +20,8 @@ from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
-    from dxlrun.process_table import FoundRun
     from dxlrun.remote.client import Executed, RemoteRobot
+    from dxlrun.run.unsteered import UnsteeredRun
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 """Names of controllers, one or several behind the option."""
@@ -68,7 +68,7 @@ def list_robots(
     from dxlrun.run.unsteered import describe, unsteered_runs
 
     here = running()
-    unsteered = {run.robot: run for run in unsteered_runs()}
+    unsteered = {run.name: run for run in unsteered_runs() if run.is_ours}
     names = dict.fromkeys((*here, *known_robots(), *unsteered))
     _require_known(robot, names)
     found, code = [], 0
@@ -214,7 +214,7 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     if (run := unsteered_of(chosen)) is not None:
         sentence = end_run(run, wait=not no_wait)
         if chosen.as_json:
-            show_json({"robot": run.robot, "ended": sentence})
+            show_json({"robot": run.name, "ended": sentence})
         else:
             show(sentence)
         return 0
@@ -223,17 +223,20 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
 
 
-def unsteered_of(chosen: Chosen) -> FoundRun | None:
+def unsteered_of(chosen: Chosen) -> UnsteeredRun | None:
     """Return the chosen run if it cannot be steered, else None; raises InputError when the choice is open."""
     from dxlrun.remote.sockets import running
-    from dxlrun.run.unsteered import unsteered_run, unsteered_runs
+    from dxlrun.run.unsteered import unsteered_runs
 
-    if chosen.robot is not None:
-        return unsteered_run(chosen.robot)
-    unsteered = unsteered_runs()
-    names = sorted({*running(), *(run.robot for run in unsteered)})
-    _require_one(names)
-    return unsteered[0] if unsteered else None
+    unsteered, steered = unsteered_runs(), running()
+    if chosen.robot is None:
+        unsteered = [run for run in unsteered if run.is_ours]
+        _require_one(sorted({*steered, *(run.name for run in unsteered)}))
+        return unsteered[0] if unsteered else None
+    found = next((run for run in unsteered if run.is_named(chosen.robot)), None)
+    if found is None and chosen.robot not in steered:
+        _require_one([run.name for run in unsteered if run.run.robot == chosen.robot])
+    return found
 
 
 def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
