@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 PROC = Path("/proc")
 _ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # the beginning of a plan as JSON
+UNKNOWN = "?"
+"""State of a process whose entry cannot be read: it may well be alive."""
 _DEAD = "ZXx"
 _STOPPED = "Tt"
 SUPERVISOR = "supervisor"
@@ -42,13 +44,23 @@ class ProcessStat(NamedTuple):
         """True when a signal or a debugger has stopped it: it does nothing until it is continued."""
         return self.state in _STOPPED
 
+    def has_ended(self, start_ticks: int) -> bool:
+        """Return whether the process that started at this time is dead, or this is another one."""
+        return self.state != UNKNOWN and (self.is_dead or self.start_ticks != start_ticks)
+
 
 def read_stat(folder: Path) -> ProcessStat | None:
-    """Return the entry of a process by its folder in /proc; None when there is none."""
-    with suppress(OSError, ValueError, IndexError):
+    """Return the entry of a process by its folder in /proc; None when there is no such process.
+
+    Only ENOENT and ESRCH prove that. After any other error, such as EMFILE, its state is `UNKNOWN`.
+    """
+    try:
         words = (folder / "stat").read_text(errors="replace").rpartition(")")[2].split()
         return ProcessStat(words[0], int(words[1]), int(words[19]))
-    return None
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    except (OSError, ValueError, IndexError):
+        return ProcessStat(UNKNOWN, 0, 0)
 
 
 class RunProcess(NamedTuple):
@@ -82,8 +94,10 @@ class FoundRun(NamedTuple):
 
 def is_alive(process: RunProcess) -> bool:
     """Return whether a process of a run has not ended; its ID may belong to another one by now."""
-    stat = read_stat(PROC / str(process.pid))
-    return stat is not None and not stat.is_dead and stat.start_ticks == process.stat.start_ticks
+    stat, found = read_stat(PROC / str(process.pid)), process.stat
+    if stat is None or found.state == UNKNOWN:  # without its time, the ID alone identifies it
+        return stat is not None and not stat.is_dead
+    return not stat.has_ended(found.start_ticks)
 
 
 def robot_of(process: Path) -> str | None:

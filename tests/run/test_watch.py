@@ -27,6 +27,7 @@ from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
+from dxlrun.process_table import read_stat
 from dxlrun.run import watch
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
 from dxlrun.run.loop_process import AskedToStop, Pulse
@@ -453,11 +454,11 @@ def watched(tmp_path):
     """Return what sets the state of process 7 in a table of processes, and the table's folder."""
     (tmp_path / "7").mkdir()
 
-    def shown(state, start_ticks=5):
+    def write_state(state, start_ticks=5):
         (tmp_path / "7/stat").write_text(stat_line(state, start_ticks))
         return tmp_path
 
-    return shown
+    return write_state
 
 
 @pytest.mark.parametrize("state", ["T", "t", "Z", "X"])
@@ -489,6 +490,44 @@ def test_a_process_id_of_another_process_is_of_a_dead_one(watched):
     for at_ms in (0, 300):
         signs.look("same", at_ms * MS)
     assert signs.is_silent(5000 * MS)
+
+
+def test_an_unreadable_entry_is_not_a_dead_process(watched):
+    """Such as one with no descriptor left for it: only the timeout decides."""
+    signs = SignsOfLife(7, 1000 * MS, 0, watched("S"))
+    entry = watched("S") / "7/stat"
+    entry.unlink()
+    entry.mkdir()  # EISDIR
+    for at_ms in range(0, 5001, 500):
+        signs.look("same", at_ms * MS)
+        assert not signs.is_silent(5000 * MS)
+    signs.look("same", 5500 * MS)
+    assert signs.is_silent(5000 * MS)
+
+
+def test_a_process_without_an_entry_is_silent_soon(watched):
+    signs = SignsOfLife(7, 1000 * MS, 0, watched("S"))
+    (watched("S") / "7/stat").unlink()
+    for at_ms in (0, 300):
+        signs.look("same", at_ms * MS)
+    assert signs.is_silent(5000 * MS)
+
+
+def test_a_process_whose_time_of_start_is_unknown_is_silent_after_its_timeout(tmp_path):
+    signs = SignsOfLife(7, 1000 * MS, 0, tmp_path)
+    for at_ms in (0, 1000, 2000):
+        signs.look("same", at_ms * MS)
+    assert not signs.is_silent(5000 * MS)
+
+
+def test_a_loop_that_nobody_looks_at_reads_the_process_table_ten_times_a_second(page, monkeypatch):
+    read = []
+    monkeypatch.setattr(watch, "read_stat", lambda folder: read.append(folder) or read_stat(folder))
+    loop_watch = LoopWatch(page, os.getpid(), os.getpid(), MS, 0)
+    read.clear()
+    for at_ms in range(1250):
+        loop_watch.duty(at_ms * MS)
+    assert 18 <= len(read) <= 20  # for two processes, in the second after HALTED_NS
 
 
 class Stopped:

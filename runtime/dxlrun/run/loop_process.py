@@ -106,7 +106,7 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     return check
 
 
-UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit"
+UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit; start it again"
 
 
 class AskedToStop(Exception):

@@ -13,12 +13,14 @@ from enum import Enum, unique
 from pathlib import Path
 
 from dxlrun.channels.heartbeat import Heartbeat, Phase, Standstill
-from dxlrun.process_table import PROC, read_stat
+from dxlrun.process_table import PROC, UNKNOWN, read_stat
 
 HALTED_NS = 250_000_000
-"""How long a heartbeat stands still before the kernel's word counts that the process is stopped or dead: more
-than two polls of the supervisor, and longer than a profiler holds a process for a sample [i]. With the
-shutdown of a loop, torque is off within half a second."""
+"""Standstill after which /proc decides whether the process is stopped or dead: more than two polls of the
+supervisor, and longer than a profiler holds a process for a sample [i]. With the shutdown of a loop, torque
+is off within half a second."""
+_PROC_INTERVAL_NS = 100_000_000
+"""Least time between two readings of a process' entry in /proc: the loop may not read files in each cycle."""
 GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own. One that the
 kernel reports neither stopped nor dead has this long: it may only wait for a processor."""
@@ -85,14 +87,17 @@ class SignsOfLife:
     however long one waits: that is evidence, which shortens the wait to `HALTED_NS`.
     """
 
-    __slots__ = ("_folder", "_started", "_still", "still_ns")
+    __slots__ = ("_folder", "_halted", "_look_ns", "_next_proc_ns", "_started", "_still", "still_ns")
 
     def __init__(self, pid: int, longest_look_ns: int, now_ns: int, proc: Path = PROC) -> None:
         """`longest_look_ns`: a look counts for at most this; after a longer pause of the watcher the watched
         may not have run either."""
         self._folder = proc / str(pid)
         stat = read_stat(self._folder)
-        self._started = stat.start_ticks if stat else None
+        # Without its time of start, only the timeout decides: another process may have the ID by now.
+        self._started = stat.start_ticks if stat and stat.state != UNKNOWN else None
+        self._halted = False
+        self._look_ns = self._next_proc_ns = now_ns
         self._still = Standstill(longest_look_ns, now_ns)
         self.still_ns = 0
         """How long its heartbeat has stood still."""
@@ -100,6 +105,7 @@ class SignsOfLife:
     def look(self, beat: object, now_ns: int) -> int:
         """Note its heartbeat; return for how long that has stood still, ns."""
         self.still_ns = self._still.ns(beat, now_ns)
+        self._look_ns = now_ns
         return self.still_ns
 
     def is_silent(self, timeout_ns: float) -> bool:
@@ -108,10 +114,13 @@ class SignsOfLife:
 
     def is_halted(self) -> bool:
         """Return whether it is stopped or dead, and does not respond; reads /proc only where it does not."""
-        if self.still_ns <= HALTED_NS:
-            return False
-        stat = read_stat(self._folder)
-        return stat is None or stat.start_ticks != self._started or stat.is_dead or stat.is_stopped
+        if self.still_ns <= HALTED_NS or self._started is None:
+            self._halted = False
+        elif self._look_ns >= self._next_proc_ns:
+            self._next_proc_ns = self._look_ns + _PROC_INTERVAL_NS
+            stat = read_stat(self._folder)
+            self._halted = stat is None or stat.is_stopped or stat.has_ended(self._started)
+        return self._halted
 
 
 class LoopWatch:
