@@ -61,8 +61,8 @@ DIFFERS = (
 )
 
 
-def look(protocol, change, *, take_over=False):
-    """Inspect one servo whose registers are as given."""
+def look(protocol, change, *, take_over=False, refused=()):
+    """Inspect one servo whose registers are as given, and which refuses each read of some items."""
     multi_turn = {"multi_turn_offset", "resolution_divider"} & set(change)
     model = "MX-28" if multi_turn else "AX-12A" if protocol == 1.0 else "XM430-W350"
     plan = make_plan((1,), protocol=protocol, model=model)
@@ -87,11 +87,37 @@ def look(protocol, change, *, take_over=False):
         while True:
             start, length = read.packet[5:7] if protocol == 1.0 else unpack_from("<HH", read.packet, 8)
             data = bytes(memory[start : start + length])
+            gaps = [table.items[name].address for name in refused]
+            if any(start <= gap < start + length for gap in gaps):
+                read = program.send(Reply(Outcome.REFUSED, 7, b"", 0, 0, False))
+                continue
             read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
     except StopIteration as end:
         mode = end.value
-    assert mode is not None
+    assert (mode is None) == any(
+        problem.startswith(f"{one} refuses to be read") for problem in found.problems
+    )
     return found
+
+
+def test_firmware_before_an_item_may_refuse_reads_of_it():
+    items = control_table("XM430-W350").items.values()
+    newer = [item.name for item in items if item.firmware > 44 and not item.name.startswith("indirect")]
+    assert "startup_configuration" in newer
+    found = look(2.0, {"firmware_version": 44, "homing_offset": 5}, refused=newer)
+    (problem,) = found.problems
+    assert "Homing Offset (20) = 5" in problem
+
+
+@pytest.mark.parametrize(
+    ("item", "refused"),
+    [("position_p_gain", False), ("bus_watchdog", True), ("drive_mode", True), ("operating_mode", True)],
+)
+def test_refused_read_is_fatal_only_for_an_item_that_decides(item, refused):
+    found = look(2.0, {"temperature_limit": 70}, refused=[item])
+    assert bool(found.problems) == refused
+    if not refused:
+        assert [each.item.name for _, _, each in found.deviations] == ["temperature_limit"]
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])

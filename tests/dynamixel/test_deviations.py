@@ -269,8 +269,8 @@ def test_a_servo_that_refuses_to_read_between_its_items_is_read_without_what_is_
     assert "Secondary (Shadow) ID (12) = 2" in problem
 
 
-def test_a_servo_is_inspected_with_at_most_a_read_for_each_area():
-    for plan, reads in ((make_x((4,)), 2), (full_range(TABLES[0]), 1)):
+def test_inspection_reads_identity_and_each_area_once():
+    for plan, reads in ((make_x((4,)), 3), (full_range(TABLES[0]), 2)):
         rig = make_rig(plan)
         lines = Lines([plan], rig.ports, rig.clock, rig.packets)
         lines.run([inspect(first_reach(plan, plan.servos[0]), Findings(), take_over=False)])

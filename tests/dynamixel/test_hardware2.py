@@ -97,7 +97,7 @@ def test_no_model_starts_that_would_switch_its_torque_on_by_itself(model):
         make_plan((5,), protocol=2.0, model=model, reference=1.5, lower=-0.1, upper=0.1), position=1.5
     )
     rig.servo(5).poke("startup_configuration", 1)
-    with pytest.raises(StartUpError, match=r"Startup Configuration \(\d+\) = 1, so it switches torque on"):
+    with pytest.raises(StartUpError, match=r"Startup Configuration \(\d+\) = 1, which switches its torque"):
         rig.hardware.start()
     assert rig.torque() == [False]
 
@@ -110,9 +110,9 @@ def test_all_x_servos_but_the_xl_320_have_a_startup_configuration():
 def test_older_firmware_is_not_asked_for_what_it_does_not_have():
     rig = start_rig(make_x((11,)), firmware=44)
     assert rig.torque() == [True]
-    read = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
-    assert 10 in read
-    assert 60 not in read
+    starts = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
+    assert 9 in starts
+    assert 60 not in starts
 
 
 def test_a_declared_register_that_older_firmware_does_not_have_is_refused():

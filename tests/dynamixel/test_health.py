@@ -284,7 +284,7 @@ def test_registers_that_a_reboot_took_are_written_again():
 
 def _tick(tick, sent_ns, last_ns=None):
     last_ns = sent_ns if last_ns is None else last_ns
-    return Reply(Outcome.OK, 0, (tick % 32768).to_bytes(2, "little"), last_ns, 0, False, sent_ns)
+    return Reply(Outcome.OK, 0, (tick % 32768).to_bytes(2, "little"), last_ns, 0, False, sent_ns, sent_ns)
 
 
 @pytest.mark.parametrize(

@@ -218,7 +218,8 @@ def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
         said += bring(OneServo(tool, found), plan, plan.servos[0])
     except ServoFault as error:
         said += error.sentences
-    said += tool.run(extend_timeouts(_read_back(plan, plan.servos)))
+    survey = tool.run(extend_timeouts(_read_back(plan, plan.servos)))
+    said += [*survey.problems, *(text for _, text in survey.describe_deviations())]
     return reported(said), replies()
 
 

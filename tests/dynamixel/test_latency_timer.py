@@ -1,6 +1,7 @@
 """The latency timer of an adapter, in a directory that looks like the kernel's; no adapter is here."""
 
 import os
+import re
 
 import pytest
 from msgspec.structs import replace
@@ -111,9 +112,9 @@ def test_a_timer_of_16_ms_is_named_before_any_servo_has_torque(tmp_path):
     with pytest.raises(StartUpError) as refusal:
         robot.run()
     (sentence,) = refusal.value.sentences
-    assert sentence.startswith(
-        "every servo answers too late: replies on bus main come 15.1 ms later than the wire"
-    )
+    start = r"every servo answers too late: replies on bus main come (\S+) ms later than the wire"
+    assert (late := re.match(start, sentence))
+    assert 13 < float(late[1]) < 16, "by the time at which the timer ends, as the requests begin at any time"
     assert "1 ms were planned for the adapter: that is a latency timer of 16 ms" in sentence
     assert "`echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer` shortens it" in sentence
     assert "cable" not in sentence

@@ -375,7 +375,7 @@ class DynamixelHardware:
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
         self._make_devices_safe()
-        programs = [limit_patience(watchdog.release_all(plan)) for plan in self._plans]
+        programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
         for problems in self._lines.run(programs):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)

@@ -53,6 +53,8 @@ class Transaction(msgspec.Struct, frozen=True):
     request would fit, a read asks for more of them."""
     patience_ns: int = 1 << 62
     """How long the transaction may be held back while the late reply to an older request would fit."""
+    any_age: bool = False
+    """The late reply to an older read of the same registers counts, even if a write came between."""
 
 
 @unique
@@ -80,6 +82,7 @@ class Reply(msgspec.Struct):
     strays: int  # Intact packets that were not awaited, and bytes of noise, since the transaction before
     echoed: bool  # True when the instruction itself came back: the adapter echoes
     sent_ns: int = 0  # Start of the write of the instruction
+    asked_ns: int = 0  # The same of its oldest repetition whose late reply this may be
 
     @property
     def answered(self) -> bool:

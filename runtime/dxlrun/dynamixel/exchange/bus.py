@@ -324,7 +324,8 @@ class Bus:
         reply.error = 0
         reply.echoed = False
         self._sent_ns = started_ns
-        reply.sent_ns = started_ns if self._cyclic_job else self.owed.asked_ns(transaction, started_ns)
+        reply.sent_ns = started_ns
+        reply.asked_ns = started_ns if self._cyclic_job else self.owed.asked_ns(transaction, started_ns)
         if transaction.awaited:
             reply.outcome = _TIMEOUT
             self._state = _AWAITING
@@ -439,7 +440,7 @@ class Bus:
                 refused = error != 0 and self._dialect.refused(error, length, one.length)
                 if not refused and length != one.length:
                     return None
-                any_age = self._cyclic_job or not self._awaited.patience_ns
+                any_age = self._cyclic_job or self._awaited.any_age
                 if self.owed.confuses(self._awaited, one, refusal=refused, any_age=any_age):
                     return None
                 if not self._cyclic_job:  # the kernel, which reads most cycles, does not note it either

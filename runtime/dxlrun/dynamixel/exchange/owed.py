@@ -9,6 +9,7 @@ for a few bytes more, or is held back, until no such reply is owed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 from dxlrun.plan.transaction import BROADCAST_ID, Awaited, Transaction
 
@@ -16,6 +17,7 @@ LEAST_WINDOW_NS = 750_000_000
 """A reply is owed for at least this time after its request [i]: stalled machines, virtual machines and USB
 adapters delay replies by up to 600 ms."""
 MOST_WINDOW_NS = 1_500_000_000  # Bounds the wait on a line whose replies were seen even later
+SLOW_MEMORY_NS = 60_000_000_000  # A stall such as that of a suspended machine ends; longer waits end with it
 MOST_OWED = 8  # So many late replies to the same repeated request are recognized
 
 Question = int | bytes
@@ -34,6 +36,14 @@ class _Entry:
         self.first_ns = self.last_ns = sent_ns
 
 
+class _Change(NamedTuple):
+    """The newest instruction to one servo that may have changed registers."""
+
+    packet: bytes
+    first_ns: int  # Start of the first of its repetitions
+    last_ns: int
+
+
 class OwedReplies:
     """Replies that may still arrive on one line, by servo ID and number of parameter bytes.
 
@@ -45,12 +55,15 @@ class OwedReplies:
         self._now_ns = now_ns
         self.version = 0  # Increases with each reply that becomes owed
         self._entries: dict[int, list[_Entry]] = {}
-        self._changes: dict[int, tuple[bytes, int]] = {}
+        self._changes: dict[int, _Change] = {}
         self._slowest_ns = 0
+        self._slowest_at_ns = 0
 
     @property
     def window_ns(self) -> int:
-        """Time after its request for which a reply is owed: more than the slowest reply on this line took."""
+        """Time after its request for which a reply is owed: more than the slowest reply took lately."""
+        if self._slowest_ns and self._now_ns() - self._slowest_at_ns > SLOW_MEMORY_NS:
+            self._slowest_ns = 0
         return min(max(LEAST_WINDOW_NS, self._slowest_ns * 5 // 4), MOST_WINDOW_NS)
 
     def add(self, transaction: Transaction, index: int, sent_ns: int) -> None:
@@ -73,8 +86,9 @@ class OwedReplies:
         if found is None:
             # a refusal has no data, whatever was asked: which request it answers stays open
             return bool(entries) and length == 0 and error != 0
-        if (late_ns := self._now_ns() - found.last_ns) < self.window_ns:
-            self._slowest_ns = max(self._slowest_ns, late_ns)
+        now_ns, window_ns = self._now_ns(), self.window_ns
+        if self._slowest_ns <= (late_ns := now_ns - found.last_ns) < window_ns:
+            self._slowest_ns, self._slowest_at_ns = late_ns, now_ns
         found.count -= 1
         if not found.count:
             entries.remove(found)
@@ -88,10 +102,12 @@ class OwedReplies:
                 one.last_ns = sent_ns
 
     def note_change(self, transaction: Transaction, sent_ns: int) -> None:
-        """Note an instruction that may change registers: an older reading of the servo says nothing more."""
-        before = self._changes.get(transaction.servo_id)
-        if before is None or before[0] != transaction.packet:
-            self._changes[transaction.servo_id] = transaction.packet, sent_ns
+        """Note an instruction that may change registers: older reads are invalid from now on."""
+        before, first_ns = self._changes.get(transaction.servo_id), sent_ns
+        if before is not None and before.packet == transaction.packet:
+            # a retry changes nothing; later the servo may have changed the register itself, as by a reboot
+            first_ns = before.first_ns if sent_ns - before.last_ns < self.window_ns else sent_ns
+        self._changes[transaction.servo_id] = _Change(transaction.packet, first_ns, sent_ns)
 
     def free_ns(self, transaction: Transaction, *, any_age: bool = False) -> int:
         """Return when each reply to a transaction will be unambiguous; 0: it is now."""
@@ -119,12 +135,15 @@ class OwedReplies:
         )
 
     def asked_ns(self, transaction: Transaction, sent_ns: int) -> int:
-        """Return since when a transaction is asked: a reply to an earlier repetition may be older."""
+        """Return when the oldest request was sent that the reply to a transaction may answer.
+
+        A late reply to an earlier repetition counts as the reply to this one.
+        """
         times = [
             one.first_ns
-            for servo_id, length, _ in _shapes(transaction)
+            for servo_id, length, question in _shapes(transaction)
             for one in self._entries.get(servo_id, ())
-            if one.length == length and one.last_ns + self.window_ns > sent_ns
+            if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns
         ]
         return min([sent_ns, *times])
 
@@ -147,7 +166,7 @@ class OwedReplies:
         if one.question != question:
             return False
         changes = (self._changes.get(each) for each in (servo_id, BROADCAST_ID))
-        return any_age or all(change is None or one.first_ns >= change[1] for change in changes)
+        return any_age or all(change is None or one.first_ns >= change.first_ns for change in changes)
 
 
 def _shape(transaction: Transaction, awaited: Awaited) -> tuple[int, int, Question]:

@@ -37,17 +37,22 @@ def pause(duration_ns: int) -> Program[None]:
     yield listen(duration_ns)
 
 
-def limit_patience(program: Program[Result], patience_ns: int = 0) -> Program[Result]:
+def limit_patience(
+    program: Program[Result], patience_ns: int = 0, *, any_age: bool = False
+) -> Program[Result]:
     """Run a program whose transactions are not held back for late replies for longer than a time, ns.
 
     Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request
-    is then charged to the older one, as replies come in the order of their requests. Without any patience, a
-    reply to an earlier reading of the same register counts.
+    is then charged to the older one, as replies come in the order of their requests. With `any_age` a reply
+    to an older read of the same registers counts instead: servos with armed watchdogs would stop during the
+    timeout of a reply that was charged.
     """
     try:
         request = next(program)
         while True:
-            reply = yield replace(request, patience_ns=min(request.patience_ns, patience_ns))
+            reply = yield replace(
+                request, patience_ns=min(request.patience_ns, patience_ns), any_age=any_age or request.any_age
+            )
             request = program.send(reply)
     except StopIteration as end:
         result: Result = end.value
@@ -60,7 +65,8 @@ def extend_timeouts(
     """Run a program of one bus with longer timeouts, as long as few replies are lost.
 
     A servo that answers late costs what it takes; a bus without any servo is reported within about two
-    seconds. `extra_ns` collects how much later than due by the wire each reply came.
+    seconds. `extra_ns` collects how much later than due by the wire each reply came that can answer
+    one request only.
     """
     left_ns = MOST_SILENCE_NS
     try:
@@ -70,7 +76,8 @@ def extend_timeouts(
             reply = (
                 yield replace(request, timeout_ns=request.timeout_ns + longer_ns) if longer_ns else request
             )
-            if extra_ns is not None and request.awaited and reply.answered:
+            certain = reply.answered and reply.asked_ns == reply.sent_ns
+            if extra_ns is not None and request.awaited and certain:
                 extra_ns.append(reply.last_ns - reply.sent_ns - request.due_ns)
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -74,30 +74,38 @@ class Access(NamedTuple):
             found |= decoded(block, start, reply.parameters)
         return found
 
-    def read_near(self, names: Iterable[str]) -> Program[tuple[dict[str, int], Reply]]:
+    def read_near(
+        self, names: Iterable[str], optional: Collection[str] = ()
+    ) -> Program[tuple[dict[str, int], Reply]]:
         """Read items with few reads: what is between two that are near each other is read with them.
 
-        A servo that refuses such a read is read without what is between. Returns the items, and the reply to
-        the last read: where that is not answered, the items are not complete.
+        A servo that refuses a read is asked for less at once, down to single items.
+
+        Args:
+            names: The items to read.
+            optional: Items without which the others are complete: a servo may refuse them.
+
+        Returns:
+            The items, and the reply to the last read. If that is not answered, the items are not complete.
         """
         found, reply = dict[str, int](), Reply(Outcome.OK, 0, b"", 0, 0, False)
-        for near in _near(self.items[name] for name in names):
-            reply = yield from self._read_into(found, near)
-            if reply.outcome is Outcome.REFUSED:
-                for block in side_by_side(near):
-                    reply = yield from self._read_into(found, block)
-                    if not reply.answered:
-                        break
+        left = _near(self.items[name] for name in names)
+        while left:
+            block = left.pop(0)
+            start, end = block[0].address, block[-1].address + block[-1].size
+            last = yield from self.read_bytes(start, end - start)
+            if last.answered:
+                found |= decoded(block, start, last.parameters)
+            elif last.outcome is Outcome.REFUSED and len(block) > 1:
+                blocks = [list(each) for each in side_by_side(block)]
+                left[:0] = blocks if len(blocks) > 1 else [[item] for item in block]
+                continue
+            elif last.outcome is Outcome.REFUSED and block[0].name in optional:
+                continue
+            reply = last
             if not reply.answered:
                 break
         return found, reply
-
-    def _read_into(self, found: dict[str, int], block: Sequence[ControlItem]) -> Program[Reply]:
-        start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield from self.read_bytes(start, end - start)
-        if reply.answered:
-            found |= decoded(block, start, reply.parameters)
-        return reply
 
     def write(self, name: str, value: int) -> Program[str]:
         """Write an item, the integer on the wire, and read it back.

@@ -41,7 +41,8 @@ LISTEN_NS = 2_000_000
 STATUS_ERROR = "status_error"
 """Stands in for a control item: the error byte of Protocol 1.0; in 2.0 an item has the hardware errors."""
 
-_IDENTITY_AND_MODE = {"model_number", "firmware_version", "operating_mode", "control_mode"}
+_IDENTITY = ("model_number", "firmware_version")
+_MODES = {"operating_mode", "control_mode"}
 _MOST_NAMED = 4  # Servos that a sentence about several names
 _SIMULATED = "sim"
 
@@ -221,15 +222,21 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
     when it cannot be read.
     """
     plan, servo = one.plan, one.servo
-    wanted = _inspected(servo.model, plan.protocol)
+    wanted: tuple[str, ...] = _IDENTITY
+    # an older firmware may refuse to read the items that came later
     read, reply = yield from one.read_near(wanted)
+    if reply.answered:
+        items = one.table.with_firmware(read["firmware_version"]).items
+        essential, optional = _inspected(servo.model, plan.protocol)
+        wanted = tuple(name for name in (*essential, *optional) if name in items)
+        more, reply = yield from one.read_near(wanted, optional)
+        read |= more
     if not reply.answered:
         title = next(one.items[name].title for name in wanted if name not in read)
         found.problems.append(f"{one} {_unreadable(one, title, reply)}")
         return None
-    items = one.table.with_firmware(read["firmware_version"]).items
     declared = {each.name: each.value for each in servo.registers}
-    values = {name: declared.get(name, raw) for name, raw in read.items() if name in items}
+    values = {name: declared.get(name, raw) for name, raw in read.items()}
     if plan.protocol == 1.0:
         values[STATUS_ERROR] = reply.error
     text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
@@ -274,14 +281,20 @@ def deviations(
 
 
 @functools.cache
-def _inspected(model: str, protocol: float) -> tuple[str, ...]:
-    """Return the items of a model that a start looks at."""
+def _inspected(model: str, protocol: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the items of a model that decide about a start, and those that only may differ."""
     items = control_table(model, protocol).items
-    names = {check.item for check in CHECKS} | _IDENTITY_AND_MODE
+    essential = {check.item for check in CHECKS} | _MODES
+    optional = set[str]()
     for item in items.values():
         if item.access == "RW" and item.deviation is not None and item.deviation.judgement != "harmless":
-            names |= {item.name, item.limited_by}
-    return tuple(name for name in items if name in names)
+            (essential if item.deviation.may_refuse else optional).add(item.name)
+            optional.add(item.limited_by)
+    essential -= {*_IDENTITY}
+    return (
+        tuple(name for name in items if name in essential),
+        tuple(name for name in items if name in optional - essential),
+    )
 
 
 def _refusal(one: Access, found: FoundDeviation) -> str:
@@ -308,7 +321,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
                 if again and servo.servo_id in before:
                     problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
                 elif not again:
-                    before[servo.servo_id] = raw, reply.sent_ns
+                    before[servo.servo_id] = raw, reply.asked_ns
                     problem = _misplaced(servo, raw, mode)
             if problem:
                 found.problems.append(f"{one} {problem}")

@@ -32,8 +32,8 @@ class TickReading(NamedTuple):
     @classmethod
     def of(cls, reply: Reply) -> TickReading:
         """Return the reading that a reply is."""
-        half_ns = (reply.last_ns - reply.sent_ns) // 2
-        return cls(reply.word(), reply.sent_ns + half_ns, half_ns * 1e-6)
+        half_ns = (reply.last_ns - reply.asked_ns) // 2
+        return cls(reply.word(), reply.asked_ns + half_ns, half_ns * 1e-6)
 
     def rebooted(self, before: TickReading | None) -> bool | None:
         """Return whether the servo rebooted since a reading; None: that is too long ago to know, or none."""

@@ -115,7 +115,7 @@ class StartUp:
         """Arm the Bus Watchdogs, which stop the servos where a reply is awaited for too long."""
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
-        self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found)), longer_ns)
+        self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found), any_age=True), longer_ns)
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no start without it."""
