@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.channels.heartbeat import Phase, Steering
+
 Begin = Callable[..., subprocess.Popen[str]]
 LOOP = """\
 import os, signal, sys
@@ -56,6 +58,48 @@ def test_a_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun, orphan: B
     assert dxlrun("stop") == (0, ended, "")
     assert loop.wait(60) == 0
     assert "no robot runs" in dxlrun("list").out
+
+
+SUPERVISOR = """\
+import os, signal, struct, subprocess, sys
+plan = os.memfd_create("dxlrun-plan")
+os.pwrite(plan, b'{"robot":"young_arm","loop":{}}', 0)
+page = os.memfd_create("dxlrun-heartbeat")
+os.pwrite(page, struct.pack("Q7QQ", PHASE, *[0] * 7, STEERING), 0)
+loop = [sys.executable, "-c", "input()", "dxlrun.run.loop_process"]
+child = subprocess.Popen(loop, stdin=subprocess.PIPE, pass_fds=[plan])  # it ends with this process
+print("ready", flush=True)
+while True:
+    signal.pause()
+"""
+
+
+@pytest.mark.parametrize(
+    ("phase", "steering", "said"),
+    [
+        (Phase.LOADING, Steering.IMPOSSIBLE, "is starting and cannot be steered yet"),
+        (Phase.RUNNING, Steering.AWAITED, "is starting and cannot be steered yet"),
+        (Phase.RUNNING, Steering.IMPOSSIBLE, "runs but cannot be steered: it has no gateway; `dxlrun stop"),
+        (Phase.DONE, Steering.POSSIBLE, "is ending"),
+    ],
+)
+def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(  # noqa: PLR0917  fixtures
+    dxlrun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, phase: Phase, steering: Steering, said: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    source = SUPERVISOR.replace("PHASE", str(int(phase))).replace("STEERING", str(int(steering)))
+    program = tmp_path / "bin/dxlrun"  # a supervisor is known by the name of its program
+    program.parent.mkdir()
+    program.write_text(source)
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True) as child:
+        try:
+            assert child.stdout
+            assert child.stdout.readline() == "ready\n"
+            err = dxlrun("list").err
+        finally:
+            child.kill()
+    assert err.startswith(f"dxlrun: young_arm {said}")
+    assert ("dxlrun stop" in err) == (steering is Steering.IMPOSSIBLE and phase is Phase.RUNNING)
 
 
 def test_a_stopped_loop_is_continued_to_its_end(dxlrun, orphan: Begin) -> None:
