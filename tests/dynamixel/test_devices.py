@@ -282,6 +282,26 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe():
     assert device(rig).registers["led"] == 0
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_release_disarms_watchdogs_before_they_can_wait_for_a_device(silent):
+    """An owed acknowledgement, or silence, of the device must not outlast the watchdogs, 200 ms."""
+    given = devices(("pwm",), commands=["led"])
+    plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given)
+    rig = make_rig(replace(plan, watchdog_ticks=10))
+    rig.hardware.start()
+    rig.cycles(5)
+    (bus,) = rig.hardware._lines.buses
+    bus.owed.add(Line(1_000_000, 0, 500_000, protocol2).write(101, 65, b"\1"), 0, rig.clock.now_ns())
+    if silent:
+        device(rig).silence()
+    before_ns = rig.clock.now_ns()
+    rig.hardware.release()
+    assert rig.clock.now_ns() - before_ns < 100_000_000
+    rig.wait(1_000_000_000)
+    assert rig.registers("bus_watchdog")[: len(SERVOS)] == [0] * len(SERVOS)
+    assert rig.torque()[: len(SERVOS)] == [True] * len(SERVOS)
+
+
 def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(monkeypatch):
     table = TABLE.replace("maximum = 1, safe = 0", "maximum = 3, safe = 2")
     monkeypatch.setitem(globals(), "TABLE", table.replace("maximum = 885", "maximum = 885, safe = 7"))

@@ -7,7 +7,9 @@ from msgspec.structs import replace
 from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
+from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.reboots import RebootCount, TickReading
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.plan.bus_plan import RegisterValue
@@ -280,6 +282,36 @@ def test_registers_that_a_reboot_took_are_written_again():
         assert servo.registers[gain.name] != 555
     assert servo.registers[gain.name] == 555
     assert len(rig.events.of(EventCode.REGISTER_WRITTEN)) == 5
+
+
+@pytest.mark.parametrize("hears_stop", [True, False])
+def test_returned_wheel_is_given_torque_at_rest(hears_stop):
+    """It must not resume its speed before the loop has anchored it, whether it received the stop or not."""
+    rig = start_rig(make_x((11,), continuous=True, start_mode=Mode.VELOCITY))
+    rig.anchors = False
+    rig.goals.velocity[:] = 0.5
+    rig.cycles(20)
+    servo = rig.servo(11)
+    assert servo.registers["goal_velocity"] != 0
+    with rig.away(11, cycles=10):
+        if hears_stop:
+            servo.poke("goal_velocity", 0)
+    rig.cycles(20)
+    assert servo.registers["goal_velocity"] == 0
+    assert rig.states.torque.tolist() == [Torque.GIVEN]
+    ((_, text),) = rig.events.of(EventCode.SERVO_BACK)
+    assert text.endswith("holding where it is")
+
+
+def test_returned_servo_reports_settings_that_differ_but_those_of_the_run():
+    gain = RegisterValue(84, 2, 555, "position_p_gain")
+    rig = start_rig(every_servo(make_x((11, 12)), registers=(gain,)))
+    with rig.away(12) as servo:
+        servo.poke("temperature_limit", 70)
+    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert joint == "arm_12_joint"
+    assert "Temperature Limit (31) = 70" in text
+    assert "Gain" not in text
 
 
 def _tick(tick, sent_ns, last_ns=None):

@@ -416,7 +416,7 @@ def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
 def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
     left = [Mode.VELOCITY]
     with arm.away(1, 20, 80):
-        looks = protocol2.read(1, 0, 64)
+        looks = protocol2.read(1, 0, 7)
         arm.when(lambda data: data == looks, lambda: left and arm.set_modes(left.pop(), 0))
     assert arm.states.mode[0] == Mode.VELOCITY
     assert len([text for text in arm.events.texts(EventCode.MODE) if "is in velocity mode" in text]) == 1

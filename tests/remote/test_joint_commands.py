@@ -8,7 +8,7 @@ import pytest
 
 import dxlrun
 from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote.preparation import Preparation
 from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
@@ -193,6 +193,19 @@ def test_positions_of_a_group_controller_become_a_goal_when_they_are_waited_for(
     asked = [0.5, -0.5] if "pan" in values else [0.25, 0.0]
     assert (part["controller"], part["positions"], numbers[:2]) == (controller, asked, asked)
     assert part["end_ns"] * 1e-9 == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(("controller", "goal"), [("positions", "&goal=true"), ("whole", "")])
+def test_joint_that_a_register_holds_still_is_refused(head, controller, goal):
+    head.record.states.position[:] = [0.25, -0.5]
+    head.finish_cycle()
+    limit = ServoLimit("velocity", 0.0, "Velocity Limit (44) = 0, 0 rad/s")
+    head.gateway._preparation.take_servo_limits("tilt", (limit,))
+    status, answer, taken = send(head, controller, "position", {"tilt": "0 rad"}, f"?units=true{goal}")
+    assert (status, answer["code"], taken) == (422, "invalid", None)
+    assert "tilt cannot move, as its servo has Velocity Limit (44) = 0" in answer["refused"]
+    status, answer, _ = send(head, controller, "position", {"pan": "0.5 rad"}, f"?units=true{goal}")
+    assert status == 200, answer
 
 
 @pytest.mark.parametrize(("controller", "interface"), [("efforts", "effort"), ("trajectory", "position")])

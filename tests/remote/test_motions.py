@@ -13,7 +13,7 @@ import pytest
 
 from dxlrun.channels.answers import Done
 from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
 from dxlrun_controllers import group
@@ -272,6 +272,16 @@ def lead_to(head, position):
 def test_a_joint_that_is_slower_than_the_soft_speed_gets_its_own_time(head):
     head.gateway._preparation.joints["pan"] = JointPlan("pan", -1.0, 1.0, 0.25)
     assert lead_to(head, 0.7)[0][-1] == pytest.approx(2.0)
+
+
+def test_motion_of_a_joint_that_a_register_holds_still_is_refused(head):
+    limit = ServoLimit("velocity", 0.0, "Velocity Limit (44) = 0, 0 rad/s")
+    head.gateway._preparation.take_servo_limits("pan", (limit,))
+    text = HEAD % "positions" + POINT % "pan: {position: 0.7 rad}"
+    status, answer, taken = play(head, text)
+    assert (status, answer["code"], taken) == (422, "wrong_motion", [])
+    assert any("Velocity Limit (44) = 0" in problem for problem in answer["fields"]["problems"])
+    assert lead_to(head, 0.201)[0] == [0.0], "a joint that is there needs no speed"
 
 
 def test_the_way_begins_at_the_goal_of_a_joint_not_where_it_lags_behind(head):

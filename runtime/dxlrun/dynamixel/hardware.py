@@ -374,11 +374,12 @@ class DynamixelHardware:
 
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
-        self._make_devices_safe()
+        # first: the watchdogs stop the servos after a time in which a silent device may be awaited
         programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
         for problems in self._lines.run(programs):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
+        self._make_devices_safe()
 
     def _make_devices_safe(self) -> None:
         for problem in make_safe(self._lines):

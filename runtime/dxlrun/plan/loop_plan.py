@@ -133,6 +133,12 @@ class JointPlan(msgspec.Struct, frozen=True):
         """The full voltage, 1, or less where a register of the servo limits it."""
         return self._highest("pwm")
 
+    @property
+    def immovable(self) -> str:
+        """Why the joint cannot move to a position: a register of its servo; empty: it can."""
+        own = self.find_servo_limit("velocity")
+        return "" if own is None or own.value else f"{self.label} cannot move, as its servo has {own.text}"
+
     def find_servo_limit(self, interface: LimitedInterface) -> ServoLimit | None:
         """Return the register that is tighter than the file and the manual; None where none is."""
         own = next((one for one in self.servo_limits if one.interface == interface), None)

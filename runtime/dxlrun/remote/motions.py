@@ -30,7 +30,7 @@ from dxlrun.control.steering import Play
 from dxlrun.description.motion import MotionDescription
 from dxlrun.errors import InputError, Problem, suggestion
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand
-from dxlrun.remote.preparation import Known, Prepared
+from dxlrun.remote.preparation import Known, Prepared, travel_s
 
 SOFT_SPEED = 0.5
 """rad/s on the way to the first pose; or the joint's limit, if that is lower."""
@@ -93,7 +93,7 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
             speed = min(speed, abs(commanded))
         if math.isfinite(way) and math.isfinite(speed):
             starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
-            longest_s = max(longest_s, way / speed + starting_s)
+            longest_s = max(longest_s, travel_s(joint, way, speed) + starting_s)
     sizes = (len(prepared.data) // 8,)
     end_ns, name = round(longest_s * 1e9), prepared.controller
     part = PlayedPart(name, prepared.kind, (0,), sizes, end_ns, tuple(positions))
@@ -228,7 +228,12 @@ def _check(part: _Part, running: Running, problems: Problems) -> None:
         peaks = speed_peaks(part.controller, commands, part.samples[0].mark)
     check_samples(part.samples, 0, running.joints, problems, peaks)
     for joint, target in part.samples[0].targets.items():
-        if target.position is not None and not math.isfinite(running.position(joint)):
+        if target.position is None:
+            continue
+        problem, position = running.joints[joint].immovable, running.position(joint)
+        if problem and abs(target.position - position) > _STILL:
+            problems.error(target.mark, problem, "write a value above 0 there")
+        elif not math.isfinite(position):
             problems.error(target.mark, f"{joint} has not answered yet", "play the motion when it has")
 
 
@@ -246,7 +251,9 @@ def _way_ns(part: _Part, running: Running) -> int:
     )
     smooth = any(target.velocity is not None for target in part.samples[0].targets.values())
     peak = PEAK_OVER_MEAN if smooth and part.kind == TRAJECTORY else 1.0  # else the way has one speed
-    longest = max((way / min(speed / peak, SOFT_SPEED) for way, speed in ways if way > _STILL), default=0.0)
+    longest = max(
+        (way / min(speed / peak, SOFT_SPEED) for way, speed in ways if way > _STILL and speed), default=0.0
+    )
     return max(_LEAST_NS, round(longest * 1e9)) if longest else 0
 
 

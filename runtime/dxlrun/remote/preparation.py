@@ -77,6 +77,19 @@ def refused(code: Code, fields: Mapping[str, Field]) -> RefusedRequest:
     return RefusedRequest(Refusal(code, fields))
 
 
+def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
+    """Return how long a joint takes for a distance at a speed, s.
+
+    Raises:
+        RefusedRequest: A register of its servo keeps the joint from moving.
+    """
+    if speed:
+        return distance / speed
+    if distance <= joint.goal_tolerance:
+        return 0.0
+    raise invalid(f"{joint.immovable}; write a value above 0 there")
+
+
 def invalid(problem: str) -> RefusedRequest:
     """Return the exception for an input that is wrong in itself."""
     return refused(Code.INVALID, {"problem": problem})

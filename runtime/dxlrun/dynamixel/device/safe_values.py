@@ -6,7 +6,7 @@ Needs neither numpy nor the loop: the guardian writes them after the loop died.
 from __future__ import annotations
 
 from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.plan.retry import limit_patience, retry, setup_line
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Outcome, Program
 
@@ -18,7 +18,7 @@ def make_safe(lines: Lines) -> tuple[str, ...]:
     """
     if not any(device.commands for plan in lines.plans for device in plan.devices):
         return ()
-    found = lines.run([_make_safe(plan) for plan in lines.plans])
+    found = lines.run([limit_patience(_make_safe(plan)) for plan in lines.plans])
     return tuple(problem for problems in found for problem in problems or ())
 
 

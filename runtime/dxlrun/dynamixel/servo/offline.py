@@ -49,6 +49,7 @@ class Offline:
         """Take a silent servo out of the exchange, and stop it where it would go on without an end."""
         loss = self.life.lose(index, FIRST_PROBE_NS)
         if loss.had_torque and self.desired.resting(index) is not None:
+            loss.kept_goal = False
             self.life.do(index, limit_patience(self._stop(index)), "the stop")
 
     def _stop(self, index: int) -> Program[None]:
@@ -136,6 +137,7 @@ class Offline:
         if problem := (yield from watchdog.disarm(one)):
             found.problems.append(problem)
             return False, Mode.UNKNOWN
+        yield from self._stop(index)  # it may not have received the stop when it was lost
         torque, mode = self._may_get_torque(index), self.desired.mode(index)
         if torque and servo.continuous and servo.mode_plan(mode).goals[-1].position is not None:
             torque = False
@@ -202,12 +204,14 @@ def rejoin(
     would be a way to torque that no policy gave. Returns whether torque enable was read as 1, and it is in
     order.
     """
-    seen = Findings()  # its events are those of a start
+    seen = Findings()  # its events are those of a start; settings may have changed since
     if (present := (yield from inspect(one, seen, take_over=True))) is not None:
         yield from inspect_states([(one, present)], seen)
     if seen.problems:
         found.problems += seen.problems
         return False
+    ours = {register.name for register in registers}
+    found.deviations += (each for each in seen.deviations if each[2].item.name not in ours)
     yield from settle(one, registers, found)
     if not found.problems and (problem := (yield from modes.enter(one, mode, again=False))):
         found.problems.append(f"{one} {problem}")

@@ -21,7 +21,7 @@ from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
-from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
+from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
 DEVICE_COMMANDS = "device_commands"
 """The command of controllers that take values for devices: `{"values": {"board/led": 1}}`."""
@@ -174,7 +174,11 @@ def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool =
 def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: CycleRecord) -> float:
     """Return how long the way to these positions takes, s."""
     ways = (
-        abs(position - _present(joint, "positions", record)) / min(joint.highest_speed, POINT_SPEED)
+        travel_s(
+            joint,
+            abs(position - _present(joint, "positions", record)),
+            min(joint.highest_speed, POINT_SPEED),
+        )
         for joint, position in zip(joints, positions, strict=True)
     )
     return max(_SHORTEST_S, *ways)
