@@ -150,6 +150,7 @@ def test_joint_position_of_an_x():
 
 def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     started.cycle()
+    begun = len(started.into_bus())
     started.servo(14).poke("hardware_error_status", 0x20)
     started.cycles(4)
     told = [text for source, text in started.events.of(EventCode.SERVO_ERROR) if source == "arm_14_joint"]
@@ -157,8 +158,7 @@ def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     assert "alert" in told[0]
     assert "Hardware Error Status (70) = 32: overload error" in told[1]
     assert started.states.valid.all()
-    reads = [packet for packet in started.into_bus() if packet == protocol2.read(14, 70, 1)]
-    assert len(reads) == 2  # one at the start, one for the alert
+    assert started.into_bus()[begun:].count(protocol2.read(14, 70, 1)) == 1
 
 
 @pytest.mark.parametrize("late_ms", [20.1, 20.3, 20.6, 20.9, 40.3, 40.6])

@@ -131,7 +131,7 @@ def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(tmp_path, shaft,
 
 
 def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(tmp_path, shaft):
-    """Profile Velocity is RAM: 0, no limit, after a reset."""
+    """Profile Velocity is RAM: 0, no limit, after a reset. A joint that returned waits for a command."""
 
     def begin(robot: VirtualRobot) -> None:
         shaft.watch(robot)
@@ -140,10 +140,12 @@ def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(tmp_path,
 
     file = robot_file(tmp_path, 10, SLOW, POSITION, policies=", on_returned_servo: hold")
     asks = [Ask(1.0, "mover", "positions", COMMANDS["positions"])]
-    asks.append(Ask(4.0, "mover", "positions", {"positions": [0.0]}))
-    steered(tmp_path, file, 6.0, asks, before=begin)
-    assert max(shaft.angles) - shaft.angles[0] > 0.2
-    assert shaft.way == pytest.approx(0.0, abs=0.02), "it has torque again, and moves"
+    asks.append(Ask(4.0, "mover", "positions", {"positions": [-0.6]}))
+    steered(tmp_path, file, 7.0, asks, before=begin)
+    returned, asked = (shaft.angles[round(seconds * 1e9) // LOOK_NS] for seconds in (1.7, 4.0))
+    assert 0.1 < returned < 0.4, "on its way"
+    assert asked == pytest.approx(returned, abs=0.01), "it waits"
+    assert shaft.way == pytest.approx(-0.6, abs=0.02), "it has torque again, and moves"
     assert shaft.too_far(SPEED) <= 0.01
 
 
