@@ -123,7 +123,7 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
         how = "its fall_reflex had others take over" if turned is None else "gravity is "
         how += "" if turned is None else f"{math.degrees(turned):.0f} deg from where it was at the start"
         yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
-    planned = {one.origin for one in totals.plan.loop.commands}
+    planned = totals.plan.loop.origins
     for report in totals.conduct.failed:
         if report.failed and report.origin in planned:
             subject = report.joint or report.controller

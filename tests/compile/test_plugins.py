@@ -47,12 +47,21 @@ class Raising(Foreign):
         raise RuntimeError("not today")
 
 
+class Sleepy(Foreign):
+    Commands: ClassVar = {"play": Goals}
+
+    @classmethod
+    def motions(cls, parameters):
+        raise RuntimeError("not today")
+
+
 @pytest.fixture
 def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
     offers = dict(load_plugins().controllers)
     offers["foreign"] = Offer("foreign", Foreign, "elsewhere 2.1")
     offers["publishing"] = Offer("publishing", Publishing, "elsewhere 2.1")
     offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
+    offers["sleepy"] = Offer("sleepy", Sleepy, "elsewhere 2.1")
     plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
     monkeypatch.setattr(robot, "load_plugins", lambda **_: plugins)
 
@@ -112,6 +121,14 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file():
         "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today" in problem.what
     )
     assert (problem.mark.line, problem.mark.column) == (20, 3)
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_what_its_motions_raise_is_a_warning_of_the_file():
+    plan = compile_text(FOREIGN.replace("foreign", "sleepy"))
+    (warning,) = plan.warnings
+    assert "controller mine (elsewhere 2.1): the speeds of its motions are not checked" in warning.what
+    assert "RuntimeError: not today" in warning.what
 
 
 @pytest.mark.usefixtures("foreign_plugins")

@@ -294,7 +294,7 @@ def test_torque_on_keeps_controllers_of_joints_with_torque(story):
 def test_controller_of_a_joint_that_is_given_torque_begins_again(story):
     limp, given = story.shows(1, torque=Torque.OFF), story.shows(1, torque=Torque.GIVEN)
     story.run(12, {3: limp, 5: given, 6: story.shows(1, torque=Torque.ON)})
-    text = "begins again where its joints are; torque was given again: j1"
+    text = "restarted at the measured positions: j1 regained torque"
     assert story.events.texts(EventCode.POLICY) == [text]
     assert story.column("active") == [1] * 12
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import lz4.frame
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -26,7 +27,7 @@ from msgspec import structs
 from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.channels.events import MOST_FAILED, Event, EventCode, EventRing, GoalReport, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
@@ -91,6 +92,19 @@ def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
     assert first == Event(7, EventCode.STEERED, Severity.INFO, "loop", "in words", data=b'{"kind":"pause"}')
     assert (long.text, long.data) == ("too long", b"")
     assert json.loads(gap.data) == {"ring": "loop/packets", "lost": 3}
+
+
+def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> None:
+    ring = EventRing(Handover(log.take), VirtualClock(7))
+    ring.failed.planned = {"motion.yaml:7:5"}
+    for number in range(MOST_FAILED + 50):
+        report = GoalReport(number, "arm", "trajectory", "a client", "missed")
+        ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(report))
+    planned = GoalReport(999, "arm", "trajectory", "motion.yaml:7:5", "missed")
+    ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(planned))
+    log.close()
+    assert len(ring.totals.failed) == MOST_FAILED + 1
+    assert ring.totals.failed[-1] == planned
 
 
 def test_mcap_ros2_support_decodes_every_topic(

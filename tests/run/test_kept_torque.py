@@ -145,6 +145,6 @@ def test_joints_wait_for_a_command_after_their_line_came_back(tmp_path, protocol
     assert run.shaft(1)[-1] == pytest.approx(0.0, abs=math.radians(1))
     ends = texts(log, GOALS, "arm")
     assert ends[1].startswith("goal 1 aborted")
-    assert "torque was given again" in ends[1]
+    assert "regained torque" in ends[1]
     assert ends[3].startswith("goal 2 reached")
     replayed(run.path)

@@ -105,7 +105,7 @@ class Run:
 
 
 def restarts(log: Log) -> dict[str, str]:
-    begun = "begins again where its joints are; "
+    begun = "restarted at the measured positions: "
     return {
         event.source: event.text.removeprefix(begun)
         for event in log.events
@@ -136,8 +136,8 @@ def test_joint_that_was_limp_in_a_pause_waits_there_for_a_command(tmp_path):
     run.at(ON_MS, torque(["arm"], on=True))
     run.at(AGAIN_MS, run.commands()[0])
     log = run.log()
-    assert restarts(log) == {"arm": "torque was given again: arm"}
-    assert ends(log, "arm")[0] == "goal 1 aborted: torque was given again: arm"
+    assert restarts(log) == {"arm": "arm regained torque"}
+    assert ends(log, "arm")[0] == "goal 1 aborted: arm regained torque"
     assert np.ptp(run.shaft(ARM, TURNED_MS + PERIOD_MS, AGAIN_MS)) <= 2 * TICK
     again = run.shaft(ARM, AGAIN_MS)
     assert np.ptp(again) > 10 * TICK

@@ -349,8 +349,8 @@ class Story:
                 named = [*joints[event.source], f"{event.source} was deactivated"]
                 why = end.text.partition(" aborted: ")[2]
                 assert end.t_ns < LOST_MS * MS or any(name in why for name in named), end.text
-            if event.code == EventCode.POLICY and event.text.startswith("begins again"):
-                named = re.findall(r"\b[jk]\d+", event.text.partition("torque was given again: ")[2])
+            if event.code == EventCode.POLICY and event.text.startswith("restarted at"):
+                named = re.findall(r"\b[jk]\d+", event.text.partition(": ")[2])
                 assert named
                 assert set(named) <= set(joints[event.source]), event.text
                 self.again.add(event.source)

@@ -104,6 +104,7 @@ def bring(desk: Desk, x: float, y: float, seconds: float) -> list[tuple[bool, in
 
 def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
     desk = Desk(noisy=STATES)
+    bring(desk, 1.0, 2.1, 0.01)
     assert all(valid for valid, _ in bring(desk, 1.0, 2.0, 0.2))
     valid, ages = zip(*bring(desk, 1.0, 2.0, 0.3), strict=True)
     assert not any(valid[1:])
@@ -111,7 +112,7 @@ def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
     ((code, text),) = desk.told()
     assert (code, text) == (
         EventCode.SENSOR_LOST,
-        "sensor imu is stuck: it brings the same sample for 210 ms",
+        "sensor imu has returned the same sample for 210 ms; check its cable and its driver",
     )
     desk.sample(1.0, 2.5)
     assert desk.cycle(10) == ([1.0, 2.5], True, 10 * MS)
@@ -134,6 +135,26 @@ def test_few_equal_samples_of_a_slow_sensor_and_many_of_a_fast_poll_are_no_sign(
     for turn in range(400):  # a device at 10 Hz, asked every ms
         polled.sample(float(turn // 100))
         assert polled.cycle(1)[1]
+
+
+def test_a_chip_with_a_dead_band_is_not_stuck_at_rest():
+    desk = Desk(noisy=STATES)
+    bring(desk, 0.1, 0.2, 0.01)
+    assert all(valid for valid, _ in bring(desk, 0.0, 0.0, 3.0))
+
+
+def test_a_sensor_that_measures_each_250_ms_and_is_read_each_10_ms_is_not_stuck():
+    desk = Desk(noisy=STATES)
+    assert all(valid for turn in range(1, 9) for valid, _ in bring(desk, 0.1 * turn, 2.0, 0.25))
+    valid = [valid for valid, _ in bring(desk, 0.9, 2.0, 1.2)]
+    assert all(valid[:100])
+    assert not valid[-1]
+
+
+def test_a_sensor_that_never_changes_is_stuck_after_two_seconds():
+    valid = [valid for valid, _ in bring(Desk(noisy=STATES), 1.0, 2.0, 2.2)]
+    assert all(valid[:200])
+    assert not valid[-1]
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])

@@ -199,7 +199,9 @@ def test_a_stuck_sensor_is_a_lost_one_in_the_run_and_its_replay(crane, tmp_path,
     found = read_log(log)
     ((name, text),) = [(event.name, event.text) for event in found.events if event.source == "imu"]
     assert name == "sensor_lost"
-    assert re.fullmatch(r"sensor imu is stuck: it brings the same sample for 2\d\d ms", text)
+    assert re.fullmatch(
+        r"sensor imu has returned the same sample for 2\d\d ms; check its cable and its driver", text
+    )
     assert result.reason == ("ended" if on_lost == "continue" else "fault")
     assert found.cycles["woken_ns"][-1] * 1e-9 == pytest.approx(
         2.0 if on_lost == "continue" else 1.2, abs=0.1

@@ -17,14 +17,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.events import Event, EventCode, GoalReport
+from dxlrun.channels.events import Event, EventCode, FailedGoals, GoalReport
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _FALLEN_RAD = math.radians(60.0)
 _SOME = 50  # Cycles at the begin and at the end whose median gravity is compared
-_MOST_KEPT = 100  # Goals that were not reached, and takeovers
+_MOST_KEPT = 100  # Origins of goals, and takeovers
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ class ConductHistory:
         self._begin_ns: int | None = None
         self._statuses: Counter[str] = Counter()
         self._origins: set[str] = set()
-        self._failed: list[GoalReport] = []
+        self._failed = FailedGoals()
         self._takeovers: list[Takeover] = []
         self._pending: list[Event] = []  # Controllers that failed, for which nothing has taken over yet
         self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
@@ -76,6 +76,7 @@ class ConductHistory:
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
         plan = plan_of(log)
+        self._failed.planned = plan.loop.origins
         for event in log.events:
             if event.code in _GOALS:
                 with suppress(*UNREADABLE):
@@ -95,8 +96,8 @@ class ConductHistory:
         self._statuses[report.status] += 1
         if report.status == "accepted" and len(self._origins) < _MOST_KEPT:
             self._origins.add(report.origin)
-        if report.status in ("missed", "aborted") and len(self._failed) < _MOST_KEPT:
-            self._failed.append(report)
+        if report.status in ("missed", "aborted"):
+            self._failed.add(report)
 
     def _activated(self, event: Event, plan: LoggedPlan) -> None:
         """Note that a fallback took over: its own for the controller that failed, or of one above that."""
@@ -129,7 +130,7 @@ class ConductHistory:
             reached=statuses["reached"],
             cancelled=statuses["cancelled"],
             origins=frozenset(self._origins),
-            failed=tuple(self._failed),
+            failed=tuple(self._failed.reports),
             takeovers=tuple(self._takeovers),
             unanswered=tuple(event.source for event in self._pending),
             turned_rad=turned,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Container
 from enum import IntEnum, unique
 from typing import Protocol
 
@@ -161,6 +162,30 @@ class GoalReport(msgspec.Struct, frozen=True):
         return f"{self.controller} {verb} the goal of its {self.kind}: {self.text}"
 
 
+MOST_FAILED = 100
+"""Failed goals that are kept of motion files, and of clients."""
+
+
+class FailedGoals:
+    """The first goals that were missed or aborted, in order.
+
+    Goals of motion files decide the exit code, so goals of clients never take their places.
+    """
+
+    def __init__(self) -> None:
+        self.planned: Container[str] = ()
+        """Origins of the goals of motion files."""
+        self.reports: list[GoalReport] = []
+        self._counts: Counter[bool] = Counter()
+
+    def add(self, report: GoalReport) -> None:
+        """Keep a report, unless there are enough of its kind."""
+        planned = report.origin in self.planned
+        if self._counts[planned] < MOST_FAILED:
+            self._counts[planned] += 1
+            self.reports.append(report)
+
+
 class EventSink(Protocol):
     """Takes events; never blocks, never raises."""
 
@@ -177,7 +202,6 @@ LONGEST_DATA = 4096
 LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 """Bytes of an event's record."""
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
-_MOST_FAILED = 100
 _USUAL_EVENT = 192
 
 
@@ -253,7 +277,7 @@ class EventTotals(msgspec.Struct, frozen=True):
     goals: dict[str, int] = {}
     """How many goals were accepted, and ended in each way."""
     failed: tuple[GoalReport, ...] = ()
-    """Goals that were missed or aborted, the first hundred."""
+    """Goals that were missed or aborted: the first hundred of motion files, the first hundred of clients."""
     started_ns: int = 0
     """When the loop started; ns of the run's clock."""
 
@@ -261,20 +285,21 @@ class EventTotals(msgspec.Struct, frozen=True):
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
-    __slots__ = ("_clock", "_errors", "_failed", "_goals", "_started_ns", "_writer")
+    __slots__ = ("_clock", "_errors", "_goals", "_started_ns", "_writer", "failed")
 
     def __init__(self, writer: Appender, clock: Clock) -> None:
         self._writer = writer
         self._clock = clock
         self._errors = EventCounts()
         self._goals: Counter[str] = Counter()
-        self._failed: list[GoalReport] = []
+        self.failed = FailedGoals()
         self._started_ns = 0
 
     @property
     def totals(self) -> EventTotals:
         """What was emitted until now."""
-        return EventTotals(self._errors.groups, dict(self._goals), tuple(self._failed), self._started_ns)
+        failed = tuple(self.failed.reports)
+        return EventTotals(self._errors.groups, dict(self._goals), failed, self._started_ns)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
@@ -284,8 +309,8 @@ class EventRing:
         if code in _GOALS and data:
             report = msgspec.json.decode(data, type=GoalReport)
             self._goals[report.status] += 1
-            if report.failed and len(self._failed) < _MOST_FAILED:
-                self._failed.append(report)
+            if report.failed:
+                self.failed.add(report)
         elif code == EventCode.LOOP_STARTED:
             self._started_ns = t_ns
         event = Event(

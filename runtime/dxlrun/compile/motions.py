@@ -333,7 +333,7 @@ def speed_peaks(
         return list(controller.offer.controller.speed_peaks(command.kind, data, controller.parameters))
     except Exception as error:
         reason = str(error) or type(error).__name__
-        what = f"{controller.plan.name} does not know the speeds of this: {reason}"
+        what = f"{controller.plan.name}: speed_peaks() failed: {reason}"
         raise refusal(mark, what, f"report it to the author of {controller.offer.distribution}") from error
 
 

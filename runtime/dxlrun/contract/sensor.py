@@ -15,8 +15,8 @@ from dxlrun.description.form import ParametersModel
 P = TypeVar("P", bound=ParametersModel)
 
 
-INERTIAL = ("angular_velocity.", "linear_acceleration.")
-"""States of an IMU. Their noise is about one unit of the last digit or more: of an MPU-6050 4 and 8 units."""
+INERTIAL = ("angular_velocity", "linear_acceleration")
+"""Quantities of an IMU. Their noise is about one unit of the last digit or more: of an MPU-6050 4 and 8."""
 
 
 class SensorContext(msgspec.Struct, frozen=True):
@@ -76,9 +76,11 @@ class Sensor(ABC, Generic[P]):
     def noisy(cls, parameters: P) -> tuple[str, ...]:
         """Return the states whose noise is above their resolution: a sensor is stuck while all of them stay.
 
-        Without one of its own: the angular velocity and the linear acceleration of an IMU.
+        Unless overridden: the angular velocity and the linear acceleration of an IMU that measures both.
         """
-        return tuple(state for state in cls.states(parameters) if state.startswith(INERTIAL))
+        noisy = [state for state in cls.states(parameters) if state.partition(".")[0] in INERTIAL]
+        both = {state.partition(".")[0] for state in noisy} == {*INERTIAL}
+        return tuple(noisy) if both else ()
 
     def open(self, context: SensorContext) -> None:
         """Open the device; keep `context`."""

@@ -57,7 +57,7 @@ class Anchoring:
         states = self._record.states
         given = (states.torque == Torque.GIVEN) & states.valid
         if given.any():
-            self._anchor(given, "torque was given again", time_ns)
+            self._anchor(given, "regained torque", time_ns)
             self._hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def begin_pause(self) -> None:

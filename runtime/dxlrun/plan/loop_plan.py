@@ -303,6 +303,11 @@ class LoopPlan(msgspec.Struct, frozen=True):
     sensors: tuple[SensorPlan, ...] = ()  # In the order of those of the sources that are sensors
 
     @property
+    def origins(self) -> frozenset[str]:
+        """Origins of the commands of motion files."""
+        return frozenset(command.origin for command in self.commands)
+
+    @property
     def references(self) -> tuple[str, ...]:
         """Names of all reference interfaces, in the order of the cycle's record."""
         return tuple(name for controller in self.controllers for name in controller.references)

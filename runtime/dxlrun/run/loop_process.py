@@ -237,7 +237,9 @@ def main() -> None:
     try:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
-        outcome = _run(from_json(process.whole(job.memory.plan)), job, heartbeat, sinks)
+        plan = from_json(process.whole(job.memory.plan))
+        events.failed.planned = plan.loop.origins
+        outcome = _run(plan, job, heartbeat, sinks)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
         outcome = LoopOutcome("start-up", sentences=error.sentences)

@@ -146,7 +146,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append(f"States were invalid: {shares} of the cycles.")
     elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
-    planned = {one.origin for one in loop.commands}
+    planned = loop.origins
     failed = [one for one in events.failed if one.origin in planned]
     sentences += [f"{one.sentence}." for one in failed[:_MOST]]
     return RunVerdict(not (errors or often or failed) and kept, f"{'; '.join(happened)}.", tuple(sentences))

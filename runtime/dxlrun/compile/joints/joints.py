@@ -299,12 +299,12 @@ def check_tolerances(
             continue
         error = _static_error(joint)
         if error is not None and error > plan.goal_tolerance:
-            off = "so far" if math.isinf(error) else f"by {degrees(error)} deg"
+            off = "far" if math.isinf(error) else f"by up to {degrees(error)} deg"
             file.warning(
                 file.key("joints", name),
-                f"a weight keeps {name} off its goals {off} where it pulls most, beyond its tolerance of "
-                f"{degrees(plan.goal_tolerance)} deg: its goals there are missed",
-                "raise its P gain, add a controller that carries the weight, or write a larger tolerance",
+                f"{name} sags {off} under its load, more than its tolerance of "
+                f"{degrees(plan.goal_tolerance)} deg",
+                "raise its P gain or its tolerance, or add a controller that carries the load",
             )
 
 

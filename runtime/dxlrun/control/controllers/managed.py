@@ -241,13 +241,15 @@ class Managed:
 
     def activate(self, time_ns: int) -> None:
         """Let the controller take over its joints. Raises ControllerFault."""
-        self._call_anew(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
+        self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
         self._last_ns = -1
         self.due_cycle = self.until_ns = 0
         self.on(Event.ENTER)
 
-    def _call_anew(self, method: ControllerMethod, call: Callable[[int], None], time_ns: int) -> None:
-        """Call a method that begins with fresh states and without commands. Raises ControllerFault."""
+    def _call_without_commands(
+        self, method: ControllerMethod, call: Callable[[int], None], time_ns: int
+    ) -> None:
+        """Call a method with the current states and no commands. Raises ControllerFault."""
         self.withheld = False
         self._outputs.forget()
         self._inputs.gather()
@@ -283,7 +285,7 @@ class Managed:
         self.on(Event.COMMAND)
         self.until_ns = 0
         if self.withheld:
-            self._call_anew(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
+            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -341,7 +343,7 @@ class Managed:
             self.withheld = True
             self._outputs.withdraw()
         else:
-            self._call_anew(ControllerMethod.ON_HOLD, self.controller.on_hold, time_ns)
+            self._call_without_commands(ControllerMethod.ON_HOLD, self.controller.on_hold, time_ns)
 
     def follow(self, time_ns: int) -> None:
         """End what clients had it do: one above commands its references now. Raises ControllerFault."""

@@ -136,16 +136,16 @@ class Switching:
     def restart(self, joints: Collection[str], why: str, time_ns: int) -> None:
         """Activate again every active controller that commands one of these joints, with those above it.
 
-        Each begins where its joints and their goals are now. Its goal is aborted for the reason `why` with
-        the names of its joints. The commands of one whose stream ended stay withheld.
+        Each begins where its joints and their goals are now. Its goal is aborted; the reason is the names of
+        its joints, followed by `why`. The commands of one whose stream ended stay withheld.
         """
         again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
         withheld = [managed for managed in again if managed.withheld]
         for managed in again:
             # one above others may name no joint of its own
             own = [joint for joint in managed.plan.joints if joint in joints] or list(joints)
-            reason = f"{why}: {list_names(own)}"
-            text = f"begins again where its joints are; {reason}"
+            reason = f"{list_names(own)} {why}"
+            text = f"restarted at the measured positions: {reason}"
             self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
             self._deactivate(managed, time_ns, reason)
         if self.fault is not None:

@@ -17,10 +17,15 @@ _GONE = (SlotState.FAILED, SlotState.ENDED)
 
 
 MOST_EQUAL = 20
+"""A sensor is stuck after so many equal samples. With noise of only 0.3 units of the last digit the six
+values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. [i]"""
 STUCK_NS = 200_000_000
-"""A sensor is stuck after so many equal samples, and so much time. With noise of only 0.3 units of the last
-digit the six values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. The time
-is for a driver that is called more often than its device measures. [i]"""
+"""Least time of equal samples of a stuck sensor."""
+STUCK_INTERVALS = 4
+"""The same time in intervals between two changes, the longest until now: a driver may be called more often
+than its device measures."""
+FIRST_STUCK_NS = 2_000_000_000
+"""Most time of equal samples, also before the first change; a Phidget measures each 250 ms by default."""
 QUIET_NS = 100_000_000
 """Between two sentences of a sensor that is there: one that says something in each cycle fills no log."""
 
@@ -66,8 +71,15 @@ class _Row:
         self._are_finite = np.zeros(len(plan.states), np.bool_)
         self._t_ns = self._begun_ns = -1
         self._noisy = np.array([plan.states.index(state) for state in plan.noisy], dtype=np.intp)
+        quantities = [state.partition(".")[0] for state in plan.noisy]
+        self._quantities = [self._noisy[[one == each for each in quantities]] for one in {*quantities}]
+        """Indices of the noisy states of each quantity."""
         self._equal, self._since_ns = 0, -1
         """How many samples equal the one before, and the time of the first of them."""
+        self._stuck_ns = FIRST_STUCK_NS
+        """Time of equal samples after which the sensor is stuck."""
+        self._longest_ns = 0
+        """Longest time between two changes of the noisy values."""
         self._quiet_ns = 0
         self._finite = True
         self._lost = False
@@ -104,8 +116,14 @@ class _Row:
         if noisy.size and np.array_equal(sample[noisy], self._values[noisy]):
             self._equal += 1
         else:
+            if self._since_ns >= 0:
+                if self._equal:  # else samples were missing, which says nothing about the device's interval
+                    self._longest_ns = max(self._longest_ns, t_ns - self._since_ns)
+                self._stuck_ns = min(max(STUCK_NS, STUCK_INTERVALS * self._longest_ns), FIRST_STUCK_NS)
             self._equal, self._since_ns = 0, t_ns
-        stuck = self._equal >= MOST_EQUAL and t_ns - self._since_ns >= STUCK_NS
+        stuck = self._equal >= MOST_EQUAL and t_ns - self._since_ns >= self._stuck_ns
+        # A chip with a dead band returns exactly 0 at rest, which proves nothing.
+        stuck = stuck and all(sample[of].any() for of in self._quantities)
         self._t_ns = self._since_ns if stuck else t_ns
         np.copyto(self._values, sample)
 
@@ -124,7 +142,10 @@ class _Row:
             wrong = ", ".join(f"{state} is {value}" for state, value in values if not math.isfinite(value))
             text = f"sensor {name}: {wrong}; its values are not used"
         elif silent and self._stuck:
-            text = f"sensor {name} is stuck: it brings the same sample for {age_ns / 1e6:.0f} ms"
+            text = (
+                f"sensor {name} has returned the same sample for {age_ns / 1e6:.0f} ms; "
+                "check its cable and its driver"
+            )
         elif silent:
             since = f"for {age_ns / 1e6:.0f} ms" if age_ns >= 0 else "since the start"
             text = f"sensor {name} brought no sample {since}"

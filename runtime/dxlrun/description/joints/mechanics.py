@@ -62,7 +62,7 @@ class GoalTolerance(Form):
     """How near its goal a joint must come, and how slow, to have reached it."""
 
     alone: ClassVar[str] = "position"
-    """What a tolerance without keys is."""
+    """Key that a bare value sets."""
     position: units.Tolerance | None = key(
         "Distance from its goal; 5 deg or 5 mm when absent, inf: any.", "2 deg", None
     )
