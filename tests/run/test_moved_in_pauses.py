@@ -152,11 +152,11 @@ def test_joint_without_a_position_goal_that_was_turned_in_a_pause_waits_there(tm
     run.turn(servo, by_deg)
     run.at(AGAIN_MS, *run.commands()[1:])
     log = run.log()
-    assert restarts(log) == {name: f"moved in the pause: {name}"}
+    assert restarts(log) == {name: f"{name} moved in the pause"}
     assert np.ptp(run.shaft(servo, TURNED_MS + PERIOD_MS, AGAIN_MS)) <= 2 * TICK
     assert np.ptp(run.shaft(servo, AGAIN_MS)) > 10 * TICK
     if name == "led":
-        assert ends(log, name)[0] == "goal 2 aborted: moved in the pause: led"
+        assert ends(log, name)[0] == "goal 2 aborted: led moved in the pause"
 
 
 @pytest.mark.parametrize(("servo", "name"), [(WHEEL, "wheel"), (LED, "led")])
