@@ -176,8 +176,13 @@ class _Run:
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
         self.held = self.steerable and (not self.plan.simulated or bool(self.options.listen))
+
+    @property
+    def steering(self) -> Steering:
+        """Whether the run can be steered now."""
         if not self.steerable:
-            Heartbeat(self.memory.heartbeat).set_steering(Steering.IMPOSSIBLE)
+            return Steering.IMPOSSIBLE
+        return Steering.AWAITED if self.socket is None else Steering.POSSIBLE
 
     def count_signal(self) -> None:
         """Take a signal."""
@@ -246,6 +251,7 @@ class _Run:
             show(heartbeat)
             self._look_at_grants()
             self._look_after_gateway(heartbeat)
+            heartbeat.set_steering(self.steering)
             self._look_after_simulation(guardian)
             for sensor in self.sensors:
                 sensor.look()
@@ -319,7 +325,6 @@ class _Run:
             if isinstance(message, Listening):
                 self.socket = Path(message.socket)
                 self.held = False
-                heartbeat.set_steering(Steering.POSSIBLE)
             else:
                 self._without_gateway(f"did not start ({message.sentence})")
         elif self.gateway.channel.closed:
@@ -328,7 +333,6 @@ class _Run:
     def _without_gateway(self, what: str) -> None:
         """Report that the run cannot be steered any more, and start no other gateway; end one that waits."""
         self.steerable = False
-        Heartbeat(self.memory.heartbeat).set_steering(Steering.IMPOSSIBLE)
         if self.held and self.guardian is not None:
             fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
             self.sentences.append(f"the gateway {what}, so the robot did not move; {fix}")
