@@ -19,6 +19,8 @@ from types import ModuleType
 import pytest
 from tests.kit.loaded import loaded
 
+pytestmark = pytest.mark.needs("release")
+
 ROOT = Path(__file__).parents[1]
 OBJECTS = {
     "dxlrun/channels/libshared_memory.so": {
@@ -44,8 +46,6 @@ VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["versi
 
 @pytest.fixture(scope="module")
 def release() -> ModuleType:
-    for module in ("ziglang", "twine"):
-        importlib.import_module(module)
     return loaded(ROOT / "release/build.py")
 
 

@@ -127,6 +127,10 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
         "name": "id", "address": 7, "size": 1, "access": "RW", "area": "EEPROM", "minimum": 0, "maximum": 252,
         "initial": 1, "encoding": "unsigned", "unit": "", "scale": 1.0, "page": "ID (7)",
         "firmware": 0,
+        "deviation": {
+            "judgement": "harmless", "effect": "the servo is addressed by it", "bits": [], "refused": [],
+            "refused_effect": "", "equivalent": [], "planned": False, "limited_by": "",
+        },
     }  # fmt: skip
 
 

@@ -43,7 +43,7 @@ def test_the_description_is_whole(description):
     assert switch["summary"].startswith("Activate and deactivate controllers")
     parameters = description["paths"]["/controllers/{name}/commands/{kind}"]["post"]["parameters"]
     assert [(one["name"], one["in"]) for one in parameters] == [
-        ("name", "path"), ("kind", "path"), ("units", "query"), ("in", "query"),
+        ("name", "path"), ("kind", "path"), ("units", "query"), ("in", "query"), ("goal", "query"),
     ]  # fmt: skip
 
 

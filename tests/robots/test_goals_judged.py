@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +140,8 @@ def test_a_jammed_gripper_under_a_trajectory_is_missed(tmp_path):
     off = math.radians(40) - shaft(run.robot, 2)
     assert off > math.radians(30)
     assert goal["joint"] == "grip"
-    if goal["status"] == "aborted":  # its servo has shut itself down for overload before
-        assert "grip has no torque" in goal["text"]
+    if goal["status"] == "aborted":  # its servo shut itself down for overload, a moment ago or before
+        assert re.search("joint grip has (no torque|not confirmed its torque)", goal["text"])
     else:
         assert goal["status"] == "missed"
         assert goal["error"] == pytest.approx(off, abs=0.01)

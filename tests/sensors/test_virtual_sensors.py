@@ -155,7 +155,9 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     found = read_log(log)
     events = [(event.name, event.text) for event in found.events if event.source == "imu"]
     assert events[0][0] == "sensor_lost"
-    assert re.fullmatch(r"sensor imu brought no sample for 8\d ms", events[0][1])  # in the first such cycle
+    assert re.fullmatch(
+        r"sensor imu brought no sample for (8\d|90) ms", events[0][1]
+    )  # in the first such cycle
     ages, valid = found.cycles["source_age_ns"][:, 0], found.cycles["source_valid"][:, 0]
     assert (valid == (ages <= 80_000_000)).all()
     if on_lost == "continue":
