@@ -258,7 +258,7 @@ def test_get_shows_what_a_start_would_refuse_or_report(one):
     servo(1, "set", "secondary_shadow_id", 2, "--yes", *NEW)
     servo(1, "set", "pwm_limit", 400, "--yes", *NEW)
     said = servo(1, "get", "secondary_shadow_id", "pwm_limit", "velocity_limit", *NEW).out
-    assert [word in said for word in ("refuses it, as it makes", "reports it, as it limits")] == [True, True]
+    assert [word in said for word in ("refused: makes", "reported: limits")] == [True, True]
     judged = json.loads(servo(1, "get", "--json", *NEW).out)["deviations"]
     assert {name: found["judgement"] for name, found in judged.items()} == {
         "secondary_shadow_id": "refuse",

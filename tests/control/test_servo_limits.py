@@ -137,10 +137,8 @@ def test_a_goal_beyond_a_register_is_held_to_it_counted_and_named(case, tmp_path
     clamped = log.cycles["clamped"][:, 0]
     assert (clamped & case.clamp).any()
     texts = [event.text for event in log.events if event.code == EventCode.GATE]
-    held = [text for text in texts if "a register of its servo" in text]
-    assert [text.lower() for text in held] == [
-        f"a, controller c: held to {case.title}, a register of its servo".lower()
-    ]
+    held = [text for text in texts if "clamped by register" in text]
+    assert [text.lower() for text in held] == [f"a, controller c: clamped by register {case.title}".lower()]
 
 
 @every_case
@@ -189,7 +187,7 @@ def test_goals_without_a_speed_get_the_one_that_the_servo_will_take():
     assert rig.texts[0].startswith(
         "j0: goals of velocity are held to Velocity Limit (44) = 83, 114 deg/s, tighter"
     )
-    assert rig.texts[-1].endswith("held to Velocity Limit (44) = 83, 114 deg/s, a register of its servo")
+    assert rig.texts[-1].endswith("clamped by register Velocity Limit (44) = 83, 114 deg/s")
 
 
 @pytest.mark.parametrize(

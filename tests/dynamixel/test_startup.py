@@ -186,7 +186,7 @@ def test_a_joint_may_stand_one_tick_outside_its_limits_and_no_more(end, beyond, 
     turn_by_hand(rig.servo(1), (getattr(servo, end) + out) * servo.rad_per_tick)
     if not starts:
         (problem,) = refusal(rig)
-        assert "main_1_joint (ID 1 on bus main) stands at" in problem
+        assert "main_1_joint (ID 1 on bus main) is at" in problem
         assert "outside its limits -57.0..57.0 deg" in problem
         return
     rig.hardware.start()
@@ -228,7 +228,7 @@ def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_t
     outside = (plan.servos[1].upper_tick + 30) * plan.servos[1].rad_per_tick
     gets_torque = b"\x01\x04\x03\x18\x01"  # the first one
     rig.when(lambda data: data[2:7] == gets_torque, lambda: turn_by_hand(rig.servo(2), outside))
-    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* stands at 65.8 deg, outside its"):
+    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* is at 65.8 deg, outside its"):
         rig.hardware.start()
     assert [packet for packet in rig.into_bus() if packet[2:5] == b"\x02\x07\x03"] == []
     assert rig.torque() == [False, False]
@@ -240,7 +240,7 @@ def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque():
     rig = make_rig(plan, position=3.1)
     rig.servo(1).poke("operating_mode", 16)
     turn_by_hand(rig.servo(1), (plan.servos[0].upper_tick + 30) * plan.servos[0].rad_per_tick)
-    with pytest.raises(StartUpError, match=r"ID 1 on bus main.* stands at .* deg, outside its limits"):
+    with pytest.raises(StartUpError, match=r"ID 1 on bus main.* is at .* deg, outside its limits"):
         rig.hardware.start()
     assert rig.torque() == [False, False]
 

@@ -256,7 +256,7 @@ def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_r
     robot = VirtualRobot(plan())
     for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
         turn_by_hand(robot.buses[0].servo(servo), math.radians(180 + angle))
-    with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) stands at 80.0 deg, outside"):
+    with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) is at 80.0 deg, outside"):
         robot.run()
 
 
@@ -320,7 +320,7 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, 
 @pytest.mark.parametrize(
     ("moved", "joint", "problem"),
     [
-        ({5: 260, 6: 100}, "roll", "pitch (ID 5 and 6 on bus main) stands at 80.0 deg, outside its limits"),
+        ({5: 260, 6: 100}, "roll", "pitch (ID 5 and 6 on bus main) is at 80.0 deg, outside its limits"),
         ({3: 170}, "hip", "the servos of hip disagree by 10.0 deg, more than its tolerance of 3.0 deg"),
     ],
 )

@@ -164,7 +164,7 @@ def test_joint_gets_no_torque_at_the_start_outside_its_limits_unless_all_its_ser
     joints = Joints(replace(made, buses=(replace(bus, servos=servos),)))
     joints.arrays.servo_states.position[HIP_SERVOS] = 2.0
     found = [text.split(":")[0] for text in joints.together.at_start()]
-    outside = "hip (ID 2 and 3 on bus main) stands at 114.6 deg, outside its limits -60.0 deg..60.0 deg"
+    outside = "hip (ID 2 and 3 on bus main) is at 114.6 deg, outside its limits -60.0 deg..60.0 deg"
     assert found == [outside] * (len(limp) == 1)
 
 

@@ -209,7 +209,7 @@ class Gate:
                 # what commands it now may stand in for the controller whose fault this is, which has an event
                 by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
-                text = f"{name}{by}: {f'held to {own.text}, a register of its servo' if own else what}"
+                text = f"{name}{by}: {f'clamped by register {own.text}' if own else what}"
                 self._events.emit(EventCode.GATE, Severity.WARNING, name, text)
 
     def _owner(self, joint: str) -> str:

@@ -200,7 +200,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
         first, last = sorted(map(self.joint_position, (lower_tick, upper_tick)))
         lower = self.position_text(first).partition(" ")[0]  # the unit follows the upper limit
         return (
-            f"stands at {self.position_text(self.joint_position(raw))}, outside its limits "
+            f"is at {self.position_text(self.joint_position(raw))}, outside its limits "
             f"{lower}..{self.position_text(last)}: move the joint inside by hand"
         )
 

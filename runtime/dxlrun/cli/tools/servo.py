@@ -184,11 +184,12 @@ def _registers(
         Column("access", "name"),
         Column("value"),
         Column("is", "name"),
-        Column("a start", "text"),
+        Column("at start", "text"),
     ]
     judged = {
-        each.item.name: f"{each.judgement}s it, as it {each.effect} (factory: {each.factory})"
+        each.item.name: f"{verdict}: {each.effect} (factory: {each.factory})"
         for each in deviations
+        for verdict in ("refused" if each.refused else "reported",)
     }
     rows = [
         (

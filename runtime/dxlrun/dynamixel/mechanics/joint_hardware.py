@@ -104,7 +104,7 @@ class ServosTogether:
                 continue
             first = self._servos[coupling.servos[0]]
             problems.append(
-                f"{joint.label} stands at {first.position_text(position)}, outside its limits "
+                f"{joint.label} is at {first.position_text(position)}, outside its limits "
                 f"{first.position_text(joint.lower)}..{first.position_text(joint.upper)}: move the joint "
                 "inside by hand"
             )
