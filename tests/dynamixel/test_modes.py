@@ -379,7 +379,7 @@ def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_t
     servo.poke("goal_pwm", 0)
     servo.poke("torque_enable", 1)
     turn_by_hand(servo, (plan.servos[1].lower_tick - 30) * plan.servos[1].rad_per_tick)
-    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* stands at -59.9 deg, outside its"):
+    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* is at -59.9 deg, outside its"):
         rig.hardware.start()
     assert rig.torque() == [False, False]
     assert [address for instruction, address in instructions(rig, 2) if instruction == 3] == [64, 11]
