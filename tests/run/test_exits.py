@@ -338,7 +338,7 @@ def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(start, tmp_pat
     code, _, err = run.finish()
     assert code == 1
     assert len(err.splitlines()) == 1
-    assert "tilt (ID 7 on bus main) stands at" in err
+    assert "tilt (ID 7 on bus main) is at" in err
     assert bytes((24, 1)) not in sent(run)
     assert all_limp(run)
     wire_equals_log(run)
