@@ -98,7 +98,7 @@ class FallReflex(Controller[FallParameters]):
         if time_ns - self._since_ns < (parameters.rearm if within else parameters.time):
             return
         self._fallen, self._since_ns = not within, -1
-        posture = f"roll {math.degrees(roll):.0f} deg, pitch {math.degrees(pitch):.0f} deg"
+        posture = f"roll {round(math.degrees(roll))} deg, pitch {round(math.degrees(pitch))} deg"
         if within:
             self.context.say(f"upright again ({posture}): the next fall counts")
         else:

@@ -53,6 +53,11 @@ def test_a_posture_beyond_the_roll_counts_after_its_time(roll: float) -> None:
     assert bench.stage.context.provided[0] == 1.0
 
 
+def test_an_angle_that_rounds_to_zero_has_no_sign() -> None:
+    bench = Bench().tip(-0.2, 51.0, cycles=20)
+    assert bench.stage.takeovers == [(("curl",), "falls with roll 0 deg, pitch 51 deg")]
+
+
 @pytest.mark.parametrize(
     ("pitch", "falls"), [(49.0, 0), (51.0, 1), (-29.0, 0), (-31.0, 1), (89.9, 1), (-90.0, 1)]
 )
