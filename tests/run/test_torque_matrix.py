@@ -252,8 +252,11 @@ class Story:
     def command(self, other: bool = False) -> None:
         """Let clients command every joint; of leaders, turn them by hand."""
         for what, plural in (("velocity", "velocities"), ("position", "positions")) if other else ():
-            count = sum(len(one.joints) for one in self.ways if one.other == what)
-            self._send(what, plural, {plural: [0.9] * count})
+            rows = [self.rows[joint] for one in self.ways if one.other == what for joint in one.joints]
+            # A goal on the other side of 0 is never where a joint already is.
+            away = -np.copysign(0.9, self.robot.record.states.position[rows])
+            goals = away.tolist() if what == "position" else [0.9] * len(rows)
+            self._send(what, plural, {plural: goals})
         for one in self.ways:
             for kind, data in () if other else one.asks:
                 self._send(one.top, kind, data)
