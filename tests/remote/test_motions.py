@@ -89,9 +89,10 @@ def test_a_motion_begins_softly_when_the_slowest_joint_is_there(head):
     real = head.mailbox.answer
     head.mailbox.answer = lambda number, _: real(number, Done(7, goals=(4, 5)))
     status, answer, (positions, posvel) = play(head, NOD)
-    assert (status, answer) == (200, {"done": True, "cycle": 7, "goals": [4, 5], "seconds": 4.0})
+    assert (status, answer) == (200, {"done": True, "cycle": 7, "goals": [4, 5], "seconds": 4.4})
     name, kind, times, arrays, end = positions
-    assert (name, kind, end) == ("positions", "positions", 2.0), "from then on it is judged"
+    assert (name, kind) == ("positions", "positions")
+    assert end == pytest.approx(2.3), "it is judged when the last way is over at the highest speed"
     ramp = [array[0] for array in arrays]
     assert ramp[0] == 0.2
     assert max(np.diff(ramp[:-1])) <= 0.5 * 0.02 + 1e-9
@@ -99,7 +100,7 @@ def test_a_motion_begins_softly_when_the_slowest_joint_is_there(head):
     assert ramp[-2:] == [0.7, 0.1]
     assert all(later > before for before, later in pairwise(times))
     name, kind, times, arrays, end = posvel
-    assert (name, kind, end) == ("posvel", "posvel", 3.0)
+    assert (name, kind, end) == ("posvel", "posvel", 3.4), "the last 0.4 rad take 0.4 s"
     assert times.tolist() == [0.0, 2.0, 3.0]
     np.testing.assert_allclose(arrays[0], [0.1, 0.05])
     np.testing.assert_allclose(arrays[1:], [[0.1, 1.0], [0.5, 1.0]])
@@ -121,7 +122,7 @@ def test_the_speed_scales_times_and_velocities(head, speed):
     np.testing.assert_allclose(positions[2][-2:], [lead, lead + 1 / speed])
     np.testing.assert_allclose(posvel[2][-2:], [lead + 1 / speed, lead + 2 / speed])
     np.testing.assert_allclose(posvel[3][1:], [[0.1, speed], [0.5, speed]])
-    assert answer["seconds"] == pytest.approx(lead + 2 / speed + 1)
+    assert answer["seconds"] == pytest.approx(lead + 2.4 / speed + 1)
 
 
 def test_a_trajectory_is_one_goal_with_its_parts_in_a_row(head):

@@ -200,10 +200,10 @@ loop: {{rate: 50}}
 joints:
   pan:
     {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
-     tolerance: {{time: 450 ms}}}}
+     tolerance: {{time: 150 ms}}}}
   tilt:
     {{bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, limits: {{velocity: 2 rad/s}},
-     tolerance: {{time: 450 ms}}}}
+     tolerance: {{time: 150 ms}}}}
 controllers:
   neck: {{type: joint_group_position_controller, joints: [pan, tilt]}}
 """
@@ -250,6 +250,26 @@ def test_the_positions_that_a_motion_gives_a_group_controller_are_a_goal(tmp_pat
     else:
         assert shaft(run.robot, 1) == pytest.approx(math.radians(40), abs=0.02)
         assert shaft(run.robot, 2) == pytest.approx(math.radians(30), abs=0.02)
+
+
+SLOW = """
+name: slow
+motions:
+  - controller: neck
+    points:
+      - time: 0 s
+        joints: {pan: {position: 0 deg, velocity: 60 deg/s}, tilt: {position: 0 deg, velocity: 60 deg/s}}
+      - {time: 1 s, joints: {pan: {position: 60 deg, velocity: 30 deg/s}}}
+"""
+
+
+def test_a_played_goal_is_judged_when_its_commanded_speed_allows_it(tmp_path):
+    robot = GROUP.replace("joint_group_position_controller", "joint_group_posvel_controller")
+    motion = written(tmp_path, SLOW, "motion.yaml")
+    run = steered(tmp_path, written(tmp_path, robot), 4.5, play=[motion])
+    (goal,) = ended(run)
+    assert goal["status"] == "reached", goal
+    assert shaft(run.robot, 1) == pytest.approx(math.radians(60), abs=0.02)
 
 
 def test_a_command_of_a_client_takes_the_place_of_a_planned_goal(tmp_path):

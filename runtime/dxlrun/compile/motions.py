@@ -93,6 +93,7 @@ def compile_motion(
             warn_of_turns(samples, plans, getattr(controller.parameters, "wrap", ()), problems)
         last_ns = part.start + lead_ns + samples[-1].t_ns
         if kind not in controller.offer.controller.Goals:
+            last_ns = part.start + lead_ns + last_arrival_ns(samples, plans)
             goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
             commands = (structs.replace(commands[0], goal=goal), *commands[1:])
         end_ns = last_ns + _settle_ns(controller, plans)
@@ -275,6 +276,26 @@ def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[fl
             if target.position is not None:
                 held[joint] = target.position
     return tuple(held.get(joint) for joint in joints) if held else ()
+
+
+def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) -> int:
+    """Return when the joints of single commands can be at their last positions, ns since the part's start.
+
+    A joint goes to a position at the speed that is commanded with it, else at its highest speed.
+    """
+    arrival_ns = samples[-1].t_ns
+    held: dict[str, float] = {}
+    for sample in samples:
+        for name, target in sample.targets.items():
+            if target.position is None or (joint := joints.get(name)) is None:
+                continue
+            speed = min(joint.highest_speed, abs(target.velocity or math.inf))
+            if 0 < speed < math.inf:
+                way_s = abs(target.position - held.get(name, target.position)) / speed
+                starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
+                arrival_ns = max(arrival_ns, sample.t_ns + round((way_s + starting_s) * 1e9))
+            held[name] = target.position
+    return arrival_ns
 
 
 def commands_of(

@@ -18,6 +18,7 @@ from dxlrun.compile.motions import (
     TRAJECTORY,
     affordable,
     commands_of,
+    last_arrival_ns,
     last_positions,
     playable,
     speed_peaks,
@@ -137,6 +138,8 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
         times = tuple(command.at_ns for command in commands)
         sizes = tuple(len(command.data) // 8 for command in commands)
         end_ns = lead_ns + part.samples[-1].t_ns
+        if part.kind not in part.controller.offer.controller.Goals:
+            end_ns = lead_ns + last_arrival_ns(part.samples, running.joints)
         positions = last_positions(part.controller.plan.joints, part.samples)
         played.append(PlayedPart(part.controller.plan.name, part.kind, times, sizes, end_ns, positions))
         arrays += (command.data for command in commands)
