@@ -32,12 +32,12 @@ def old(directory: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two logs and one in parts."""
+    """Two logs and one in two parts, the second of which ends well before its time."""
     directory = tmp_path_factory.mktemp("made")
     (directory / "may").mkdir()
     simulated_robot(JOINT, duration_s=0.3, log=directory / "one.mcap").run()
     simulated_robot(JOINT, duration_s=0.2, log=directory / "may" / "second.mcap").run()
-    plan = replace(plan_of(JOINT, duration_s=2.0), recording=RecordingPlan(split_ns=10**9))
+    plan = replace(plan_of(JOINT, duration_s=1.5), recording=RecordingPlan(split_ns=10**9))
     VirtualRobot(plan, log=directory / "parts").run()
     return old(directory)
 

@@ -195,7 +195,15 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, stage, capsys):
+@pytest.fixture
+def hangup() -> Iterator[None]:
+    """Let SIGHUP end this process, as without nohup: where it is ignored an experiment goes on."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, stage, capsys, hangup):
     """With the robot of the other tests beside it: two runs of the same robot."""
     others = set(sockets())
 
