@@ -119,7 +119,7 @@ def steered(
     result = virtual.run()
     assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())
     refused = {number: answer for number, answer in client.answers.items() if not isinstance(answer, Done)}
-    assert not refused
+    assert not refused, refused
     report = replay_log(log)
     assert (report.different, report.compared) == (0, report.cycles)
     return Run(virtual, read_log(log))

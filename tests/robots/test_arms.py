@@ -102,7 +102,7 @@ def test_a_goal_in_a_chain_is_cancelled_preempted_and_slowed_down(tmp_path):
     run = steered(
         tmp_path,
         arm(tmp_path, CHAIN),
-        7.0,
+        8.0,
         [
             Ask(0.5, "arm", "trajectory", LIFT),
             Ask(1.5, "", "cancel", {"controller": "arm"}),
@@ -110,7 +110,7 @@ def test_a_goal_in_a_chain_is_cancelled_preempted_and_slowed_down(tmp_path):
             Ask(3.5, "arm", "trajectory", one),
             Ask(4.5, "", "parameters", {"controller": "arm", "values": {"speed": 2.0}}),
             Ask(4.5, "", "parameters", {"controller": "arm_pid", "values": {"gains.p": 8.0}}),
-            Ask(4.6, "arm", "trajectory", LIFT),
+            Ask(5.5, "arm", "trajectory", LIFT),
         ],
     )
     assert results(run) == [(1, "cancelled"), (2, "preempted"), (3, "reached"), (4, "reached")]
@@ -177,8 +177,8 @@ def test_preempted_cancelled_and_waiting_it_stays_within_its_limits(tmp_path, wa
         [
             Ask(0.5, "arm", "trajectory", points((0.8, 0.9, -0.9))),
             Ask(0.9, "arm", "trajectory", points((0.9, -0.6, 0.8))),  # to the other side, in mid-motion
-            Ask(2.5, "arm", "trajectory", points((0.8, UPPER, -UPPER))),
-            Ask(2.95, "", "cancel", {"controller": "arm"}),  # fast, and toward the limit
+            Ask(3.0, "arm", "trajectory", points((0.9, UPPER, -UPPER))),
+            Ask(3.45, "", "cancel", {"controller": "arm"}),  # fast, and toward the limit
             Ask(4.0, "arm", "trajectory", points((1.0, 0.0, 0.0))),
             Ask(4.4, "", "parameters", {"controller": "arm", "values": {"speed": 0.0}}),
             Ask(5.4, "", "parameters", faster),

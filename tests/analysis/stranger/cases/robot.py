@@ -131,7 +131,7 @@ def goal_aborted(story: Story) -> None:
     "mx_bulk x_three",
     subject=("body",),
     cause=r"fallback|stand|took over|takes over",
-    word="fallback",
+    word="not good",  # the motion that was to be played is aborted
     first=0,
 )
 def raises_with_fallback(story: Story) -> None:
@@ -187,7 +187,7 @@ def goal_missed(story: Story) -> None:
     "ax_single x_sync",
     subject=("body",),
     cause=r"nan|not a number|finite",
-    word="fallback",
+    word="not good",  # the motion that was to be played is aborted
     first=0,
     innocents=("stand", *JOINTS),
 )
