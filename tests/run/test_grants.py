@@ -69,6 +69,7 @@ name: wisher
 buses: {m: {port: sim, protocol: 1.0, baud_rate: 1_000_000}}
 loop:
   rate: 100
+  tolerated_skips: 100 %  # without rights and on a busy machine the loop may stand still
   scheduler: {policy: fifo, priority: 30, lock_memory: true, cores: [0], idle_latency: true}
 joints: {j: {bus: m, id: 3, model: AX-12A, reference: 150 deg, direction: 1}}
 """
