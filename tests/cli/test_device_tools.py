@@ -57,8 +57,8 @@ def test_items_of_a_board_are_read_and_written(dxlrun, simulated_line):
     assert "9.80665 m/s^2" in said.out, said.err
     shown = json.loads(dxlrun("servo", path, 42, "get", "--json", *NEW).out)
     assert (shown["registers"]["vdxl"], shown["servo"]["model"]) == (574, "bitbots-core")
-    assert "Led 0 Red (10) was 0 and is 200" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
-    assert "Led 0 Red (10) is 200 already" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
+    assert "LED 0 Red (10) was 0 and is 200" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
+    assert "LED 0 Red (10) is 200 already" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
     said = dxlrun("servo", path, 241, "set", "accel_gain", "0.25", "--yes", *NEW)
     assert said.code == 0, said.err
     assert "0.25" in dxlrun("servo", path, 241, "get", "accel_gain", *NEW).out
@@ -82,7 +82,7 @@ WRONG = (
         "bitbots-core, ID 42 at 1000000 bit/s is no servo, so it cannot reboot; it has get",
     ),
     ((42, "set", "vdxl", 3), "Vdxl (32) can only be read"),
-    ((42, "set", "led", 2), "Led (22) of an bitbots-core is 0..1, not 2"),
+    ((42, "set", "led", 2), "LED (22) of an bitbots-core is 0..1, not 2"),
     ((42, "set", "id", 9), "id of a device is not set by dxlrun"),
     ((42, "get", "vbatt"), "has no vbatt"),
     ((241, "set", "accel_gain", "much"), "'much' is no number; Accel Gain (110) is a float32"),
