@@ -37,7 +37,6 @@ def test_without_policies_a_run_ends_limp_and_a_lost_servo_does_not_end_it() -> 
     policies = compile_text(PAIR).plan.loop.policies
     assert (policies.on_exit, policies.on_fault) == (LIMP, LIMP)
     assert (policies.on_lost_servo, policies.on_stale_command) == (HOLD, HOLD)
-    assert not policies.reduces_torque
 
 
 def test_policies_become_steps_in_radians() -> None:
@@ -51,7 +50,6 @@ def test_policies_become_steps_in_radians() -> None:
     assert policies.on_lost_servo.steps[0].targets == (None, pytest.approx(math.radians(10)))
     assert policies.on_lost_servo.last == "hold"
     assert not policies.on_lost_servo.goes_on
-    assert policies.reduces_torque
 
 
 def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second() -> None:

@@ -107,9 +107,10 @@ def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not
 
 def test_nothing_that_dxlrun_owns_is_declarable_on_any_model():
     own = {"id", "baud_rate", "torque_enable", "goal_position", "moving_speed", "goal_velocity", "goal_current",
-           "goal_pwm", "goal_torque", "torque_limit", "bus_watchdog", "operating_mode", "control_mode", "lock"}  # fmt: skip
+           "goal_pwm", "goal_torque", "bus_watchdog", "operating_mode", "control_mode", "lock"}  # fmt: skip
     for table in all_tables():
         assert not own.intersection(declarable(table))
+        assert ("max_torque" in table.items) <= ("torque_limit" not in declarable(table))
         assert not [name for name in declarable(table) if name.startswith("indirect")]
 
 

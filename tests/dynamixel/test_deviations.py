@@ -11,20 +11,23 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
+from dxlrun.compile.joints.registers import register_value
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import (
     ControlItem,
     ControlTable,
     all_tables,
+    control_table,
     find_deviations,
     read_control_table,
 )
-from dxlrun.dynamixel.control_table.deviation import UNDESCRIBED, deviation_of, deviations_by_name
+from dxlrun.dynamixel.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan, position_layout
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
+from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
 from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue
 
@@ -167,6 +170,81 @@ def test_a_setting_of_another_program_is_refused_reported_or_silent_as_its_table
                 found = bench.inspect(**{item.name: value})
                 assert (found.problems, said(found)) == ([], []), (item.name, value)
     assert judged > 10
+
+
+@every_table
+def test_a_reported_setting_that_the_robot_file_then_declares_is_no_longer_reported(table):
+    bench = Bench(table)
+    items = [item for item in table.items.values() if item.access == "RW" and item.deviation]
+    for item in items:
+        rule, start = item.deviation, bench.servo.registers.ticks(item.name)
+        value = another_value(item, start)
+        if rule.planned or rule.judgement != "report" or rule.remedy != Deviation("report", "").remedy:
+            continue
+        if value == start or (item.initial is None and not rule.limited_by):
+            continue
+        declared = register_value(table, item.name, value)
+        servo = replace(bench.plan.servos[0], registers=(declared,))
+        bench.one = first_reach(bench.plan, servo)
+        assert said(bench.inspect(**{item.name: value})) == [], item.name
+
+
+def test_a_setting_that_cannot_be_declared_is_reported_with_its_own_remedy():
+    bench = Bench(control_table("AX-12A", 1.0))
+    (text,) = said(bench.inspect(lock=1))
+    assert text.endswith("; switch its power off and on")
+    (text,) = said(bench.inspect(lock=1, punch=40))
+    assert text.endswith(
+        "; switch its power off and on (Lock (47)); declare what the robot needs in `registers`, or "
+        "write it by `dxlrun servo` (Punch (48))"
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol", "item"),
+    [
+        ("AX-12A", 1.0, "torque_limit"),
+        ("XL-320", 2.0, "torque_limit"),
+        ("XL430-W250", 2.0, "goal_pwm"),
+        ("PM42-010-S260", 2.0, "goal_pwm"),
+    ],
+)
+def test_a_start_restores_a_torque_limit_and_reports_what_it_was(model, protocol, item):
+    bench = Bench(control_table(model, protocol))
+    full = bench.servo.registers[item]
+    bench.servo.poke(item, 20)
+    bench.rig.hardware.start()
+    assert bench.servo.registers[item] == full > 20
+    title = bench.one.items[item].title
+    assert f"{title} was 20 and is {full} again" in bench.rig.events.texts(EventCode.SETUP)
+    assert bench.rig.events.of(EventCode.REGISTER_DIFFERS) == []
+
+
+@every_table
+def test_a_torque_limit_is_restored_or_reported(table):
+    bench = Bench(table)
+    place = bench.plan.servos[0].torque_limit
+    if place is None:
+        (item,) = (item for item in table.items.values() if item.name in {"torque_limit", "goal_pwm"})
+        assert item.deviation.judgement == "report"
+        return
+    (item,) = (item for item in table.items.values() if item.address == place.address)
+    bench.servo.poke(item.name, 20)
+    full = bench.servo.registers["max_torque" if item.name == "torque_limit" else "pwm_limit"]
+    bench.lines.run([restore_torque_limits(bench.plan, Findings())])
+    assert bench.servo.registers[item.name] == full > 20
+
+
+def test_a_torque_limit_that_another_program_lowered_is_restored_when_the_servo_returns():
+    rig = start_rig(make_x((4, 5)))
+    servo = rig.servo(5)
+    servo.silence()
+    rig.cycles(10)
+    servo.poke("goal_pwm", 50)
+    servo.silence(False)
+    rig.cycles(80)
+    assert rig.events.of(EventCode.SERVO_BACK)
+    assert rig.registers("goal_pwm") == [885, 885]
 
 
 @every_table

@@ -556,7 +556,6 @@ def test_extended_positions_reach_as_far_as_the_manual_says():
 def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it():
     """Goal PWM (100) is the limit in the other modes, and full voltage in this one."""
     rig = make_rig(make_pair(continuous=True, start_mode=Mode.PWM, lower=-np.inf, upper=np.inf))
-    rig.hardware._restore_torque = True
     rig.hardware.start()
     assert rig.registers("goal_pwm") == [0, 0]
     standing = rig.servo(1).position

@@ -64,7 +64,6 @@ class DynamixelHardware:
         events: EventSink,
         beat: Callable[[], None],
         take_over: bool = False,
-        restore_torque: bool = False,
         sources: SourceStates | None = None,
         device_commands: Floats | None = None,
         refusals: Callable[[], Sequence[str]] | None = None,
@@ -85,7 +84,6 @@ class DynamixelHardware:
         self._goals = goals
         self._events = events
         self._take_over = take_over
-        self._restore_torque = restore_torque
         self._refusals = refusals
         self._full_torque: list[list[int]] = []
         self._by_kernel: bool | None = None
@@ -132,8 +130,7 @@ class DynamixelHardware:
                     raise StartUpError("\n".join(problems))
             engaging()
             self._start_up.engage(self._goals)
-            if self._restore_torque:
-                self._full_torque = self._start_up.stage(restore_torque_limits)
+            self._full_torque = self._start_up.stage(restore_torque_limits)
             self._first_states()
             self._start_up.watch()
             for bus in self._buses:
@@ -307,7 +304,7 @@ class DynamixelHardware:
         return self._places[row]
 
     def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
+        """Let no servo exert more than a fraction of its own limit; the next start restores it."""
         self._look = True
         for servos in self._servos:
             servos.goals.weaken(fraction)

@@ -106,11 +106,6 @@ class PolicyPlan(msgspec.Struct, frozen=True):
     limit_ns: int = 1_500_000_000
     """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
 
-    @property
-    def reduces_torque(self) -> bool:
-        """True when any of them leaves the servos with less torque, which a start-up must give back."""
-        return any(step.levels for name in POLICIES for step in self.named(name).steps)
-
     def slowest_period_ns(self, planned_ns: int) -> int:
         """Return the longest period in which a run ends within its exit timeout; `planned_ns` is the plan's.
 

@@ -23,7 +23,6 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.sensors.readings import Readings
-from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
@@ -143,7 +142,6 @@ def assemble(
         sinks.events,
         beat,
         take_over=take_over,
-        restore_torque=plan.loop.policies.reduces_torque or _limits_torque(plan),
         sources=record.sources,
         device_commands=record.device_command,
         refusals=None if together is None else together.at_start,
@@ -184,9 +182,3 @@ def assemble(
     )
     manager.configure()
     return AssembledRobot(hardware, manager, loop, record)
-
-
-def _limits_torque(plan: Plan) -> bool:
-    """Return whether a controller of the file leaves servos of Protocol 1.0 with a smaller Torque Limit."""
-    modes = [mode_of(one.command) for one in plan.loop.controllers if one.commands_servos]
-    return Mode.EFFORT_POSITION in modes and any(bus.protocol == 1.0 for bus in plan.buses)

@@ -52,6 +52,8 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 """Items that dxlrun writes itself or relies on: why, and what to do instead."""
+_RESTORED = ("profile_velocity", "torque_limit")
+"""Items that a start writes, but not on all models; on the others they are reported."""
 _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")
@@ -139,6 +141,9 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
             "both angle limits choose the mode, which dxlrun sets",
             "write `limits: {position: ...}` instead",
         )
+    rule = item.deviation
+    if rule is not None and item.name in _RESTORED and rule.judgement == "report":
+        return None  # no start writes it on this model
     return _OWN.get(item.name)
 
 

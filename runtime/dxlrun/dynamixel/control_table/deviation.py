@@ -35,6 +35,7 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """True where the value is compared with the plan of a run instead of with the factory's."""
     limited_by: str = ""
     """Item that bounds this one, and with whose value it begins where it has no initial value."""
+    remedy: str = "declare what the robot needs in `registers`, or write it by `dxlrun servo`"
 
     @property
     def may_refuse(self) -> bool:

@@ -245,6 +245,7 @@ class FoundDeviation(msgspec.Struct, frozen=True):
     factory: int
     judgement: Judgement
     effect: str  # What the value does: a verb with its object
+    remedy: str
 
     @property
     def refused(self) -> bool:
@@ -275,5 +276,5 @@ def find_deviations(items: Iterable[ControlItem], values: Mapping[str, int]) -> 
                 continue  # the item that bounds it may have been lowered since power-up
         judgement = rule.judge(value, factory)
         if judgement != "harmless":
-            found.append(FoundDeviation(item, value, factory, judgement, rule.effect_of(value)))
+            found.append(FoundDeviation(item, value, factory, judgement, rule.effect_of(value), rule.remedy))
     return tuple(found)

@@ -35,11 +35,14 @@ class Findings(msgspec.Struct):
             named = "; ".join(f"{each.text}, which {each.effect}" for each in own[:_MOST_NAMED])
             if len(own) > _MOST_NAMED:
                 named += f"; {len(own) - _MOST_NAMED} more, see `dxlrun check ROBOT.yaml --online`"
-            text = (
-                f"{place} differs from the factory's settings: {named}; set what the robot needs by "
-                "`registers` in its file or by `dxlrun servo`"
+            remedies: dict[str, list[str]] = {}
+            for each in own[:_MOST_NAMED]:
+                remedies.setdefault(each.remedy, []).append(each.item.title)
+            how = "; ".join(
+                remedy if len(remedies) == 1 else f"{remedy} ({', '.join(titles)})"
+                for remedy, titles in remedies.items()
             )
-            sentences.append((joint, text))
+            sentences.append((joint, f"{place} differs from the factory's settings: {named}; {how}"))
         return sentences
 
     def log(self, events: EventSink) -> None:

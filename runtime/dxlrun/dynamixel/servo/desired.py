@@ -22,7 +22,7 @@ from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import compare, merged, settle
-from dxlrun.dynamixel.servo.torque_limits import unlimit
+from dxlrun.dynamixel.servo.torque_limits import limits_positions, restore_torque_limit
 from dxlrun.plan.bus_plan import RegisterValue
 from dxlrun.plan.transaction import Program
 
@@ -119,7 +119,12 @@ class DesiredState:
                 problem = yield from modes.enter(one, mode, inward=True, rebooted=rebooted)
             except LookupError as error:
                 problem = f"cannot follow: {error}"
-        problem = problem or (yield from self.unlimit(index, mode))
+        servo = self._servos[index]
+        if not problem and any(limits_positions(servo, each) for each in servo.modes):
+            limits = Findings()
+            yield from self.restore_torque_limit(index, mode, limits)
+            limits.log(life.events)
+            problem = "; ".join(limits.problems)
         yield from self._reboots.unwatch(index)
         if problem == modes.STARTED_ANEW:
             self._changing[index] = False
@@ -140,9 +145,10 @@ class DesiredState:
             self.entered(index, mode)
             life.report(EventCode.MODE, Severity.INFO, index, f"is in {_words(mode)}")
 
-    def unlimit(self, index: int, mode: Mode) -> Program[str]:
-        """Give a servo all of its torque again after a mode that limited it, unless a policy reduced it."""
-        return "" if self._goals.fraction < 1.0 else (yield from unlimit(self._life.reach(index), mode))
+    def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
+        """Restore the torque limit of a servo that holds in a mode, unless a policy reduced it."""
+        if self._goals.fraction >= 1.0:
+            yield from restore_torque_limit(self._life.reach(index), mode, found)
 
     def read_register(self, index: int, item: str, done: RegisterDone) -> None:
         """Read an item in idle time; `done` takes what went wrong, and what the servo has."""

@@ -143,9 +143,10 @@ class Offline:
             torque = False
             life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, _OTHER_TURN)
         torqued = yield from rejoin(one, found, mode, self.desired.registers(index), torque=torque)
-        for last in (self.desired.unlimit(index, mode), watchdog.arm(one)):
-            if not found.problems and (problem := (yield from last)):
-                found.problems.append(problem)
+        if not found.problems:
+            yield from self.desired.restore_torque_limit(index, mode, found)
+        if not found.problems and (problem := (yield from watchdog.arm(one))):
+            found.problems.append(problem)
         return torqued, mode
 
     def _may_get_torque(self, index: int) -> bool:
