@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
-from dxlrun.channels.events import RUN_ENDED, EventCode, EventGroup, GoalReport, Severity
+from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.errors import counted
+from dxlrun.plan.played_goals import motion_name, played_name
 from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
 from dxlrun_analysis.tally import RunTotals
 
@@ -28,6 +28,7 @@ _REASONS = {
     "run_failed": "a process of the run failed",
     "never_ran": "{sentence}",
     "goal_missed": "",
+    "motion_cut": "",
     "another_host": "another host sent on bus {subject}",
     "noise": "noise on bus {subject}",
     "sensor_hangs": "sensor {subject} hung",
@@ -55,11 +56,11 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
         parts.append(_reason(worst, totals, found))
     parts += _goals_not_reached(totals)
     parts.append(_played(totals))
-    conduct = totals.conduct
-    if conduct.goals:
-        parts.append(f"{conduct.reached} of {counted(conduct.goals, 'goal', 'goals')} reached")
-    if conduct.cancelled:
-        parts.append(f"{counted(conduct.cancelled, 'goal', 'goals')} cancelled")
+    goals = totals.conduct.goals
+    if goals.asked:
+        parts.append(f"{goals.reached} of {counted(goals.asked, 'goal', 'goals')} reached")
+    if cancelled := goals.counts.get("cancelled"):
+        parts.append(f"{counted(cancelled, 'goal', 'goals')} cancelled")
     return Finding(ROBOT, "", f"{word.capitalize()}: {'; '.join(filter(None, parts))}.")
 
 
@@ -123,18 +124,21 @@ def _at(t_ns: int, begin_ns: int) -> str:
 
 
 def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
-    for report in totals.conduct.failed[:_MOST_NAMED]:
-        if report.text == RUN_ENDED:
+    for report in totals.conduct.goals.failed[:_MOST_NAMED]:
+        if report.cut:
             yield f"the run ended before {_goal(report)} did"
         else:
             status = "missed its goal" if report.status == "missed" else report.status
             joint = totals.plan.joint(report.joint)
             yield f"{_goal(report)} {status}{_off(report, linear=joint.linear)}"
+    unbegun = [goal for goal in totals.unreached_goals if goal.report is None]
+    yield from (f"{goal.name} never began" for goal in unbegun[:_MOST_NAMED])
 
 
 def _goal(report: GoalReport) -> str:
-    place = _motion(report.origin)
-    return f"{place} of {report.controller}" if place else f"{report.kind} of {report.controller}"
+    if motion_name(report.origin):
+        return played_name(report.origin, report.controller)
+    return f"{report.kind} of {report.controller}"
 
 
 def _off(report: GoalReport, *, linear: bool) -> str:
@@ -165,23 +169,16 @@ def _played(totals: RunTotals) -> str:
     """Return which motions were played, or what moved the robot, and how closely."""
     until_ns = totals.periods.seconds * 1e9
     begun = [one for one in totals.plan.loop.commands if one.at_ns <= until_ns and totals.periods.records]
-    origins = totals.conduct.origins
-    motions = {one.origin if one.origin in origins else one.controller for one in begun}
-    files = [motion for motion in dict.fromkeys(_motion(one.origin) for one in begun) if motion]
+    motions = sum(one.goal is not None for one in begun) or len({one.controller for one in begun})
+    files = [motion for motion in dict.fromkeys(motion_name(one.origin) for one in begun) if motion]
     within = _within(totals)
     if files:
-        return f"played {listed(files)} ({counted(len(motions), 'motion', 'motions')}){within}"
+        return f"played {listed(files)} ({counted(motions, 'motion', 'motions')}){within}"
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
-    if totals.conduct.origins or any(act.set_points for act in sent):
+    if totals.conduct.goals.counts or any(act.set_points for act in sent):
         return f"moved by commands from outside{within}"
     ran = "the log has" if totals.damage else "ran for"
     return f"{ran} {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
-
-
-def _motion(origin: str) -> str:
-    """Return the name of the motion file that a command is from; empty: it is from none."""
-    path, *place = origin.rsplit(":", 2)
-    return Path(path).stem if len(place) == 2 and all(part.isdigit() for part in place) else ""
 
 
 def _within(totals: RunTotals) -> str:

@@ -17,6 +17,7 @@ from dxlrun.channels.events import (
 )
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun.plan.played_goals import UnreachedGoal, find_unreached_goals
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.clients import Clients
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
@@ -71,6 +72,16 @@ class RunTotals:
     trends: tuple[Trend, ...] = ()
     conduct: Conduct = NO_CONDUCT
     findings: tuple[Finding, ...] = ()  # What the accumulators of each room found by rules of their own
+
+    @property
+    def unreached_goals(self) -> list[UnreachedGoal]:
+        """Goals of played motions that the run did not reach, as the run itself judged them.
+
+        A motion that begins in another part of the log is not one of them.
+        """
+        conduct, ran_ns = self.conduct, round(self.periods.seconds * 1e9)
+        found = find_unreached_goals(self.plan.loop, conduct.goals, ran_ns)
+        return [goal for goal in found if conduct.whole or goal.report is not None]
 
     def bus_of(self, subject: str) -> str:
         """Return the bus of a servo that a finding accuses; of another subject itself."""

@@ -10,7 +10,8 @@ was not good when
   client requested do not count;
 - more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
   least;
-- a goal of a played motion was missed or aborted;
+- a played motion did not reach its goal: it was missed or aborted, or the run ended before, see
+  `dxlrun.plan.played_goals`;
 - an error was logged, a servo reported one, or the log is not whole.
 
 All else is reported and tolerated: a lost packet is data. Wake-ups are *rough* when more than 1 % are later
@@ -110,24 +111,24 @@ def judge(totals: RunTotals) -> Verdict:
     word = "good" if good else "not good"
     if good and totals.conduct.takeovers:
         word = "good, with fallbacks"
-    elif good and any(report.failed for report in totals.conduct.failed):
+    elif good and any(report.failed for report in totals.conduct.goals.failed):
         word = "good, with missed goals"
     findings = (robot_line(totals, word, ordered), *ordered)
     return Verdict(good, word, tuple(finding.line for finding in findings), findings)
 
 
 def _robot(totals: RunTotals) -> Iterable[Finding]:
-    """Report a robot that ended lying, and goals of a played motion that were missed."""
+    """Report a robot that ended lying, and goals of played motions that were not reached."""
     if totals.conduct.lies:
         turned = totals.conduct.turned_rad
         how = "its fall_reflex had others take over" if turned is None else "gravity is "
         how += "" if turned is None else f"{math.degrees(turned):.0f} deg from where it was at the start"
         yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
-    planned = totals.plan.loop.origins
-    for report in totals.conduct.failed:
-        if report.failed and report.origin in planned:
-            subject = report.joint or report.controller
-            yield Finding("goal_missed", subject, f"{report.sentence}.", rank=Rank.ERROR)
+    for goal in totals.unreached_goals:
+        subject = (goal.report and goal.report.joint) or goal.controller
+        code = "goal_missed" if goal.failed else "motion_cut"
+        remedy = f"{goal.remedy[:1].upper()}{goal.remedy[1:]}." if goal.remedy else ""
+        yield Finding(code, subject, f"{goal.sentence}.", remedy, rank=Rank.ERROR)
 
 
 def _beyond(totals: RunTotals) -> Iterable[Finding]:

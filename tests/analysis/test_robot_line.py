@@ -15,10 +15,10 @@ import pytest
 from msgspec import structs
 from tests.kit.totals import totals_of
 
-from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
+from dxlrun.channels.events import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
-from dxlrun.plan.loop_plan import ScheduledCommand
+from dxlrun.plan.loop_plan import ScheduledCommand, ScheduledGoal
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.conduct.conduct import Conduct, ConductHistory, Takeover
 from dxlrun_analysis.conduct.steering import Act
@@ -37,10 +37,9 @@ PLAN = LoggedPlan(
     structs.replace(
         NO_LOOP,
         commands=(
-            ScheduledCommand(0, "arm", "", b"", f"{WAVE}:4:5"),
-            ScheduledCommand(S, "head", "", b"", f"{WAVE}:9:9"),
+            ScheduledCommand(0, "arm", "", b"", f"{WAVE}:4:5", goal=ScheduledGoal(25 * S)),
+            ScheduledCommand(S, "head", "", b"", f"{WAVE}:9:9", goal=ScheduledGoal(3 * S)),
             ScheduledCommand(2 * S, "head", "", b"", f"{WAVE}:10:9"),
-            ScheduledCommand(90 * S, "late", "", b"", f"{WAVE}:12:5"),
         ),
     )
 )
@@ -57,8 +56,14 @@ def totals(**changed: Any) -> RunTotals:
         tracked("wrist", math.radians(0.3)),
         tracked("free", None),
     )
-    conduct = Conduct(begin_ns=5 * S, goals=2, reached=2, origins=frozenset([f"{WAVE}:4:5"]))
+    conduct = Conduct(begin_ns=5 * S, goals=goals(2), whole=True)
     return replace(RunTotals(account, plan=PLAN, tracking=tracking, conduct=conduct), **changed)
+
+
+def goals(reached: int, *failed: GoalReport) -> GoalTotals:
+    """Return two goals of the motion file that began, so many of which were reached."""
+    begun = {f"{WAVE}:4:5": 1, f"{WAVE}:9:9": 1}
+    return GoalTotals({"accepted": 2, "reached": reached}, begun, failed)
 
 
 def line(**changed: Any) -> str:
@@ -94,7 +99,7 @@ def test_what_fails_comes_before_what_was_played() -> None:
         happened(EventCode.SERVO_LOST, "hip", 9.0),
         happened(EventCode.SERVO_LOST, "knee", 8.0),
     )
-    assert line(events=events, conduct=conduct(reached=1, failed=(missed,))) == (
+    assert line(events=events, conduct=conduct(goals=goals(1, missed))) == (
         "Not good: knee, hip were lost from 3.0 s on; elbow went limp at 12.3 s; wave of arm aborted (elbow "
         "12.0 deg off); played wave (2 motions) within 0.3 deg (wrist); 1 of 2 goals reached."
     )
@@ -117,21 +122,30 @@ def test_what_happened_to_the_same_joints_is_told_together_as_it_came() -> None:
 
 def test_a_goal_of_a_played_motion_that_was_missed_is_not_good() -> None:
     missed = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "missed", "elbow is 0.2 off", "elbow", 0.2)
-    verdict = judge(totals(conduct=conduct(failed=(missed,))))
+    verdict = judge(totals(conduct=conduct(goals=goals(1, missed))))
     assert not verdict.good
     assert verdict.findings[1].code == "goal_missed"
     assert "Not good: wave of arm missed its goal (elbow 11.5 deg off);" in verdict.sentences[0]
-    a_client_s = replace(
-        totals().conduct, failed=(missed.__class__(1, "arm", "trajectory", "anna", "missed"),)
-    )
+    a_client_s = conduct(goals=goals(2, structs.replace(missed, origin="anna")))
     assert judge(totals(conduct=a_client_s)).good
 
 
-def test_a_goal_that_only_the_end_of_the_run_ended_is_not_called_aborted() -> None:
-    cut = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", "the run ended")
-    assert line(conduct=conduct(reached=1, failed=(cut,))).startswith(
-        "Good: the run ended before wave of arm did; played wave "
-    )
+def test_played_goal_that_the_end_of_the_run_cut_is_not_good() -> None:
+    cut = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", RUN_ENDED)
+    verdict = judge(totals(conduct=conduct(goals=goals(1, cut))))
+    assert not verdict.good
+    assert verdict.sentences[0].startswith("Not good: the run ended before wave of arm did; played wave ")
+    assert verdict.sentences[1] == "The run ended at 20 s, before wave of arm ended at 25 s."
+    a_client_s = structs.replace(cut, origin="anna")
+    assert line(conduct=conduct(goals=goals(1, a_client_s))).startswith("Good: the run ended before ")
+
+
+def test_played_goal_that_never_began_is_not_good() -> None:
+    begun = structs.replace(goals(1), begun={f"{WAVE}:9:9": 1})
+    verdict = judge(totals(conduct=conduct(goals=begun)))
+    assert verdict.sentences[0].startswith("Not good: wave of arm never began; ")
+    part = judge(totals(conduct=conduct(goals=begun, whole=False)))
+    assert part.good, "the motion may have begun in another part of the log"
 
 
 def test_what_failed_before_the_first_cycle_has_no_time_of_the_run() -> None:
@@ -178,7 +192,7 @@ def test_an_error_that_was_logged_is_the_reason_in_its_own_words() -> None:
 
 
 def test_goals_that_a_client_cancelled_are_said() -> None:
-    gone = conduct(goals=0, reached=0, cancelled=1)
+    gone = conduct(goals=GoalTotals({"accepted": 1, "cancelled": 1}))
     assert line(conduct=gone, plan=LoggedPlan()).endswith(
         "moved by commands from outside within 2.1 deg (elbow); 1 goal cancelled."
     )

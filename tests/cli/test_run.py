@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
@@ -20,7 +21,9 @@ from dxlrun.channels.events import (
     EventGroup,
     EventRing,
     EventTotals,
+    GoalHistory,
     GoalReport,
+    GoalTotals,
     Severity,
 )
 from dxlrun.errors import PortError
@@ -75,7 +78,7 @@ def meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
 def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path):
     said = dxlrun(torso, "rate:=25", "--play", three_parts, "--duration", "1.5", "--no-record", "--take-over")
 
-    assert said.code == 0
+    assert said.code == 1, "no motion of the plan began"
     ((plan, options),) = runs.asked
     assert options == RunOptions(record=False, take_over=True, debug=False)
     assert plan.loop.period_ns == 40_000_000
@@ -184,7 +187,6 @@ def test_virtual_time_runs_in_this_process(
 TOO_MANY = "The loop did not keep 50 Hz: 300 of 1000 periods skipped (30.00%; 100 tolerated)."
 LIMP = EventGroup(EventCode.SERVO_LIMP, Severity.ERROR, "head_pitch_joint", 1, 5_100_000_000, "torque is off")
 TAKEOVER = EventGroup(EventCode.TAKEOVER, Severity.WARNING, "reflex", 1, 5_100_000_000, "it falls")
-GOALS = {"accepted": 3, "reached": 1, "cancelled": 1}
 FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_000_000, "head: nan")
 
 
@@ -214,7 +216,7 @@ FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_
         ),
         ({"events": EventTotals((FAULT,))}, 1, "ran for 2.0 s.", "head: head: nan."),
         (
-            {"events": EventTotals(goals={"accepted": 3, "reached": 1, "cancelled": 1})},
+            {"events": EventTotals(goals=GoalTotals({"accepted": 3, "reached": 1, "cancelled": 1}))},
             0,
             "1 of 2 goals reached.",
             "",
@@ -236,34 +238,68 @@ def test_the_loop_s_own_counts_make_the_verdict(  # noqa: PLR0917  fixtures
 def test_a_played_motion_that_missed_its_goal_fails_the_run(
     dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path
 ):
-    def ends(status: str, origin: str, text: str = "after 2 s, joint elbow is 9.00 deg off") -> Said:
-        failed = GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157)
-        runs.answer = structs.replace(GOOD, events=EventTotals(failed=(failed,) * failed.failed))
+    plan = plan_of(torso, play=[three_parts])
+    own = plan.loop.commands[0].origin
+
+    def ends(
+        status: str, origin: str, text: str = "after 2 s, joint elbow is 9.00 deg off", **ran: Any
+    ) -> Said:
+        history = GoalHistory()
+        history.planned = plan.loop.origins
+        for command in plan.loop.commands:
+            if command.goal is not None:
+                history.add(GoalReport(1, command.controller, command.kind, command.origin, "accepted"))
+        history.add(GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157))
+        runs.answer = structs.replace(GOOD, events=EventTotals(goals=history.totals), **ran)
         return dxlrun(torso, "--play", three_parts)
 
     assert ends("missed", "a client").code == 0
-    ((plan, _),) = runs.asked
-    own = plan.loop.commands[0].origin
     for status in ("missed", "aborted"):
         said = ends(status, own)
         assert said.code == 1
         sentence = f"left_arm {status} the goal of its trajectory: after 2 s, joint elbow is 9.00 deg off."
         assert sentence in said.out
-    assert ends("aborted", own, RUN_ENDED).code == 0
     assert ends("reached", own).code == 0
+    stopped = ends("aborted", own, RUN_ENDED)
+    assert (stopped.code, "The run ended at 2.04 s, before three_parts of " in stopped.out) == (1, True)
+    interrupted = ends("aborted", own, RUN_ENDED, exit_code=130, reason="interrupted")
+    assert (interrupted.code, interrupted.out.split(": ")[1]) == (130, "interrupted")
+    assert ends("missed", own, exit_code=130, reason="interrupted").code == 1
+
+
+def test_duration_that_cuts_a_played_motion_fails_the_run(dxlrun: Callable, torso: Path, three_parts: Path):
+    said = dxlrun(torso, "--virtual", "--play", three_parts, "--duration", "1.5", "--no-record")
+    assert said.code == 1
+    assert said.out.startswith("bioloid_torso: failed: ran for 1.5 s; 0 of ")
+    (sentence,) = [
+        line for line in said.out.splitlines() if "by its duration at 1.5 s, before three" in line
+    ][:1]
+    assert sentence.endswith(" s; leave out --duration.")
+    assert any("but the run ends at 1.5 s; leave out --duration" in line for line in said.errors)
+
+
+def test_run_that_ends_before_a_motion_begins_fails(dxlrun: Callable, torso: Path, tmp_path: Path):
+    motion = tmp_path / "nod.yaml"
+    motion.write_text(
+        "name: nod\nmotions:\n  - controller: head\n    start: 3 s\n    points:\n"
+        "      - {time: 1 s, joints: {head_yaw_joint: {position: 0 deg, velocity: 1 rad/s},"
+        " head_pitch_joint: {position: 0 deg, velocity: 1 rad/s}}}\n"
+    )
+    said = dxlrun(torso, "--virtual", "--play", motion, "--duration", "1", "--no-record")
+    assert (said.code, "before nod of head ended at 4 s" in said.out) == (1, True)
 
 
 def test_a_controller_with_a_fallback_may_fail(torso: Path):
     plan = plan_of(torso)
     failing = next(one for one in plan.loop.controllers if not one.into)
-    assert run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), plan).good is False
+    assert run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), plan).exit_code == 1
     taken = [structs.replace(one, fallback="hold") for one in plan.loop.controllers]
     caught = structs.replace(plan, loop=structs.replace(plan.loop, controllers=tuple(taken)))
     verdict = run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), caught)
-    assert (verdict.good, f"{failing.name} failed and fell back;" in verdict.line) == (True, True)
+    assert (verdict.exit_code, f"{failing.name} failed and fell back;" in verdict.line) == (0, True)
     refused = structs.replace(GOOD, reason="fault", events=EventTotals((group(failing.name),)))
     verdict = run_verdict(refused, caught)
-    assert (verdict.good, "fell back" in verdict.line) == (False, False)
+    assert (verdict.exit_code, "fell back" in verdict.line) == (1, False)
 
 
 def test_a_traceback_with_any_bytes_reaches_the_end_of_the_run():

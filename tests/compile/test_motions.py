@@ -108,12 +108,18 @@ def test_duration_overrules_the_end_of_the_motions():
 
 
 def test_commands_of_several_files_are_sorted_by_time():
-    early = POSVEL.replace("start: 2 s", "start: 1 s")
+    late = POSVEL.replace("start: 2 s", "start: 20 s")
 
-    times = [c.at_ns for c in compile_text(PAIR, POSVEL, early).plan.loop.commands]
+    times = [c.at_ns for c in compile_text(PAIR, late, POSVEL).plan.loop.commands]
 
     assert times == sorted(times)
     assert len(times) == 4
+
+
+def test_motion_for_a_controller_that_still_plays_another_one_is_refused():
+    (problem,) = problems_in(PAIR, POSVEL, POSVEL.replace("start: 2 s", "start: 2100 ms"))
+
+    assert "gets this motion at 2.1 s, while it still plays that of" in problem.what
 
 
 def test_problems_of_robot_and_motion_files_come_together():

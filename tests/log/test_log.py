@@ -96,15 +96,15 @@ def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
 
 def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> None:
     ring = EventRing(Handover(log.take), VirtualClock(7))
-    ring.failed.planned = {"motion.yaml:7:5"}
+    ring.goals.planned = {"motion.yaml:7:5"}
     for number in range(MOST_FAILED + 50):
         report = GoalReport(number, "arm", "trajectory", "a client", "missed")
         ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(report))
     planned = GoalReport(999, "arm", "trajectory", "motion.yaml:7:5", "missed")
     ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(planned))
     log.close()
-    assert len(ring.totals.failed) == MOST_FAILED + 1
-    assert ring.totals.failed[-1] == planned
+    assert len(ring.totals.goals.failed) == MOST_FAILED + 1
+    assert ring.totals.goals.failed[-1] == planned
 
 
 def test_mcap_ros2_support_decodes_every_topic(

@@ -8,24 +8,24 @@ orientation (quaternion of the frame in the world), else the acceleration; the m
 from __future__ import annotations
 
 import math
-from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.events import Event, EventCode, FailedGoals, GoalReport
+from dxlrun.channels.events import Event, EventCode, GoalHistory, GoalReport, GoalTotals
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _FALLEN_RAD = math.radians(60.0)
 _SOME = 50  # Cycles at the begin and at the end whose median gravity is compared
-_MOST_KEPT = 100  # Origins of goals, and takeovers
+_MOST_KEPT = 100  # Takeovers
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
+_ENDS = (EventCode.LOOP_STARTED, EventCode.LOOP_STOPPED)
 
 Floats = NDArray[np.float64]
 
@@ -45,11 +45,8 @@ class Conduct:
     """What the robot did in a run."""
 
     begin_ns: int = 0  # The first deadline, on the run's clock
-    goals: int = 0  # Accepted, but for those that a client cancelled or replaced
-    reached: int = 0
-    cancelled: int = 0
-    origins: frozenset[str] = frozenset()  # Of the goals
-    failed: tuple[GoalReport, ...] = ()  # Goals that were missed or aborted
+    goals: GoalTotals = field(default_factory=GoalTotals)
+    whole: bool = False  # The log has the first and the last cycle of the run
     takeovers: tuple[Takeover, ...] = ()
     unanswered: tuple[str, ...] = ()  # Controllers that failed without a fallback that took over
     turned_rad: float | None = None  # How far gravity turned from the start to the end; None: no IMU
@@ -64,9 +61,8 @@ class ConductHistory:
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None
-        self._statuses: Counter[str] = Counter()
-        self._origins: set[str] = set()
-        self._failed = FailedGoals()
+        self._goals = GoalHistory()
+        self._ends: set[int] = set()  # LOOP_STARTED and LOOP_STOPPED, as far as the log has them
         self._takeovers: list[Takeover] = []
         self._pending: list[Event] = []  # Controllers that failed, for which nothing has taken over yet
         self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
@@ -76,11 +72,13 @@ class ConductHistory:
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
         plan = plan_of(log)
-        self._failed.planned = plan.loop.origins
+        self._goals.planned = plan.loop.origins
         for event in log.events:
             if event.code in _GOALS:
                 with suppress(*UNREADABLE):
-                    self._goal(msgspec.json.decode(event.data, type=GoalReport))
+                    self._goals.add(msgspec.json.decode(event.data, type=GoalReport))
+            elif event.code in _ENDS:
+                self._ends.add(event.code)
             elif event.code == EventCode.TAKEOVER:
                 fell = plan.controller(event.source).type == "fall_reflex"
                 self._take_over(event, "", fell)
@@ -91,13 +89,6 @@ class ConductHistory:
         gravity = _gravity(log)
         self._first = np.concatenate([self._first, gravity[: _SOME - len(self._first)]])
         self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
-
-    def _goal(self, report: GoalReport) -> None:
-        self._statuses[report.status] += 1
-        if report.status == "accepted" and len(self._origins) < _MOST_KEPT:
-            self._origins.add(report.origin)
-        if report.status in ("missed", "aborted"):
-            self._failed.add(report)
 
     def _activated(self, event: Event, plan: LoggedPlan) -> None:
         """Note that a fallback took over: its own for the controller that failed, or of one above that."""
@@ -123,14 +114,10 @@ class ConductHistory:
             upright = math.cos(_FALLEN_RAD)
             got_up = abs(begin[2]) < upright <= end[2]
             lies = turned > _FALLEN_RAD and not got_up
-        statuses = self._statuses
         return Conduct(
             begin_ns=self._begin_ns or 0,
-            goals=statuses["accepted"] - statuses["cancelled"] - statuses["preempted"],
-            reached=statuses["reached"],
-            cancelled=statuses["cancelled"],
-            origins=frozenset(self._origins),
-            failed=tuple(self._failed.reports),
+            goals=self._goals.totals,
+            whole=len(self._ends) == len(_ENDS),
             takeovers=tuple(self._takeovers),
             unanswered=tuple(event.source for event in self._pending),
             turned_rad=turned,

@@ -128,7 +128,7 @@ class Granted(msgspec.Struct, frozen=True):
 
 
 RUN_ENDED = "the run ended"
-"""Text of a goal that ran when its run ended in order."""
+"""Text of a goal that was running when its run ended."""
 
 
 class GoalReport(msgspec.Struct, frozen=True):
@@ -151,9 +151,14 @@ class GoalReport(msgspec.Struct, frozen=True):
     """How far that joint was from the goal, SI units; None: not known."""
 
     @property
+    def cut(self) -> bool:
+        """True for a goal that was aborted because the run ended."""
+        return self.status == "aborted" and self.text == RUN_ENDED
+
+    @property
     def failed(self) -> bool:
         """True for a goal that was missed or aborted, but not because the run ended."""
-        return self.status in ("missed", "aborted") and self.text != RUN_ENDED
+        return self.status in ("missed", "aborted") and not self.cut
 
     @property
     def sentence(self) -> str:
@@ -166,24 +171,54 @@ MOST_FAILED = 100
 """Failed goals that are kept of motion files, and of clients."""
 
 
-class FailedGoals:
-    """The first goals that were missed or aborted, in order.
+class GoalTotals(msgspec.Struct, frozen=True):
+    """The goals of a run."""
 
-    Goals of motion files decide the exit code, so goals of clients never take their places.
-    """
+    counts: dict[str, int] = {}
+    """Number of goals that were accepted, and that ended in each way."""
+    begun: dict[str, int] = {}
+    """Number of goals of motion files that were accepted, by their origins."""
+    failed: tuple[GoalReport, ...] = ()
+    """Goals that were missed or aborted: the first hundred of motion files, the first hundred of clients."""
+
+    @property
+    def asked(self) -> int:
+        """Number of goals that were accepted and neither cancelled nor replaced by another goal."""
+        counts = self.counts
+        withdrawn = counts.get("preempted", 0) + counts.get("cancelled", 0)
+        return counts.get("accepted", 0) - withdrawn
+
+    @property
+    def reached(self) -> int:
+        """Number of goals that were reached."""
+        return self.counts.get("reached", 0)
+
+
+class GoalHistory:
+    """Counts goals by their events; goals of clients never take the places of those of motion files."""
 
     def __init__(self) -> None:
         self.planned: Container[str] = ()
         """Origins of the goals of motion files."""
-        self.reports: list[GoalReport] = []
-        self._counts: Counter[bool] = Counter()
+        self._counts: Counter[str] = Counter()
+        self._begun: Counter[str] = Counter()
+        self._failed: list[GoalReport] = []
+        self._kept: Counter[bool] = Counter()
 
     def add(self, report: GoalReport) -> None:
-        """Keep a report, unless there are enough of its kind."""
+        """Count a report, and keep it if the goal failed and few of its kind did before."""
         planned = report.origin in self.planned
-        if self._counts[planned] < MOST_FAILED:
-            self._counts[planned] += 1
-            self.reports.append(report)
+        self._counts[report.status] += 1
+        if report.status == "accepted" and planned:
+            self._begun[report.origin] += 1
+        if report.status in ("missed", "aborted") and self._kept[planned] < MOST_FAILED:
+            self._kept[planned] += 1
+            self._failed.append(report)
+
+    @property
+    def totals(self) -> GoalTotals:
+        """The goals that were added until now."""
+        return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed))
 
 
 class EventSink(Protocol):
@@ -274,10 +309,7 @@ class EventTotals(msgspec.Struct, frozen=True):
 
     errors: tuple[EventGroup, ...] = ()
     """And takeovers that controllers requested."""
-    goals: dict[str, int] = {}
-    """How many goals were accepted, and ended in each way."""
-    failed: tuple[GoalReport, ...] = ()
-    """Goals that were missed or aborted: the first hundred of motion files, the first hundred of clients."""
+    goals: GoalTotals = GoalTotals()
     started_ns: int = 0
     """When the loop started; ns of the run's clock."""
 
@@ -285,21 +317,19 @@ class EventTotals(msgspec.Struct, frozen=True):
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
-    __slots__ = ("_clock", "_errors", "_goals", "_started_ns", "_writer", "failed")
+    __slots__ = ("_clock", "_errors", "_started_ns", "_writer", "goals")
 
     def __init__(self, writer: Appender, clock: Clock) -> None:
         self._writer = writer
         self._clock = clock
         self._errors = EventCounts()
-        self._goals: Counter[str] = Counter()
-        self.failed = FailedGoals()
+        self.goals = GoalHistory()
         self._started_ns = 0
 
     @property
     def totals(self) -> EventTotals:
         """What was emitted until now."""
-        failed = tuple(self.failed.reports)
-        return EventTotals(self._errors.groups, dict(self._goals), failed, self._started_ns)
+        return EventTotals(self._errors.groups, self.goals.totals, self._started_ns)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
@@ -307,10 +337,7 @@ class EventRing:
         if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
             self._errors.add(Event(t_ns, code, severity, source, _writable(text)))
         if code in _GOALS and data:
-            report = msgspec.json.decode(data, type=GoalReport)
-            self._goals[report.status] += 1
-            if report.failed:
-                self.failed.add(report)
+            self.goals.add(msgspec.json.decode(data, type=GoalReport))
         elif code == EventCode.LOOP_STARTED:
             self._started_ns = t_ns
         event = Event(

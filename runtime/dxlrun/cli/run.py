@@ -151,11 +151,10 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     from dxlrun.run.run_summary import run_verdict
 
     verdict = run_verdict(summary, plan)
-    code = 1 if summary.cycles and not verdict.good else summary.exit_code
-    lines = [f"{robot}: {_WORDS.get(code, 'failed')}: {verdict.line}"]
+    lines = [f"{robot}: {_WORDS.get(verdict.exit_code, 'failed')}: {verdict.line}"]
     lines += [f"  {sentence}" for sentence in verdict.sentences]
     if summary.log is not None:
         lines.append(f"log: {summary.log} ({counted(summary.messages, 'message', 'messages')})")
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)
     show(*lines, console=console)
-    return code
+    return verdict.exit_code

@@ -94,13 +94,45 @@ def compile_motion(
         last_ns = part.start + lead_ns + samples[-1].t_ns
         if kind not in controller.offer.controller.Goals:
             last_ns = part.start + lead_ns + last_arrival_ns(samples, plans)
-            goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
-            commands = (structs.replace(commands[0], goal=goal), *commands[1:])
+        goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
+        commands = (structs.replace(commands[0], goal=goal), *commands[1:])
         end_ns = last_ns + _settle_ns(controller, plans)
+        mark = motion.marks.value("motions", index, "controller")
         parts.append(
-            MotionPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands)
+            MotionPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands, mark)
         )
     return parts
+
+
+def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: Problems) -> None:
+    """Refuse a part that replaces another one on its way; warn of a run that ends before a part does."""
+    by_start = sorted(parts, key=lambda part: part.start_ns)
+    for index, part in enumerate(by_start):
+        replaced = [
+            one
+            for one in by_start[:index]
+            if one.controller == part.controller and one.motion_end_ns > part.start_ns
+        ]
+        if replaced:
+            last = max(replaced, key=lambda one: one.motion_end_ns)
+            problems.error(
+                part.mark,
+                f"{part.controller} gets this motion at {_seconds(part.start_ns)}, while it still plays that "
+                f"of {last.mark} until {_seconds(last.motion_end_ns)}",
+                f"write start: {_seconds(last.end_ns)}, or play them in two runs",
+            )
+    for part in parts:
+        if duration_ns is not None and part.motion_end_ns > duration_ns:
+            problems.warning(
+                part.mark,
+                f"the motion of {part.controller} ends at {_seconds(part.motion_end_ns)}, but the run ends "
+                f"at {_seconds(duration_ns)}",
+                "leave out --duration",
+            )
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns / 1e9:.4g} s"
 
 
 def affordable(motion: MotionDescription, problems: Problems) -> bool:

@@ -199,11 +199,12 @@ def compile_robot(
     recording = compile_recording(file)
     parts: list[MotionPart] = []
     if motions:
-        from dxlrun.compile.motions import compile_motion  # as above
+        from dxlrun.compile.motions import check_times, compile_motion  # as above
 
         names = (*file.robot.controllers, *left_out_names(description, "controllers"))
         for motion in motions:
             parts += compile_motion(motion, controllers, names, joints, file)
+        check_times(parts, duration_ns, file)
     file.refuse()
     if duration_ns is None and parts:
         duration_ns = max(part.end_ns for part in parts)

@@ -264,9 +264,9 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 
 
 class ScheduledGoal(msgspec.Struct, frozen=True):
-    """A goal that the runtime pursues with several scheduled commands of one controller."""
+    """The goal of a played motion, for one controller."""
 
-    end_ns: int  # Since the loop's first deadline; from then on it is judged
+    end_ns: int  # End of the motion since the loop's first deadline; from then on the goal is judged
     positions: tuple[float | None, ...] = ()
     """Goal of each joint of the controller, rad or m, None: it has none; empty: the goal has no positions"""
 
@@ -280,7 +280,8 @@ class ScheduledCommand(msgspec.Struct, frozen=True):
     data: bytes  # Little-endian float64
     origin: str  # Its source: `three_parts.yaml:7:5`
     request: str = ""  # The command that `data` was prepared from, as JSON
-    goal: ScheduledGoal | None = None  # Begins with this command, where that is not a goal itself
+    goal: ScheduledGoal | None = None
+    """Begins with this command; the runtime pursues it where the controller takes no such goal."""
 
 
 class LoopPlan(msgspec.Struct, frozen=True):

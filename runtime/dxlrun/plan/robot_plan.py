@@ -8,6 +8,7 @@ import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.motor import MotorModel
+from dxlrun.errors import Mark
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
@@ -81,6 +82,13 @@ class MotionPart(msgspec.Struct, frozen=True):
     end_ns: int
     points: int
     commands: tuple[ScheduledCommand, ...]
+    mark: Mark
+
+    @property
+    def motion_end_ns(self) -> int:
+        """End of its way, from which on its goal is judged; at the latest at `end_ns`."""
+        goal = self.commands[0].goal
+        return self.end_ns if goal is None else goal.end_ns
 
 
 def to_json(plan: Plan) -> bytes:

@@ -238,7 +238,7 @@ def main() -> None:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
         plan = from_json(process.whole(job.memory.plan))
-        events.failed.planned = plan.loop.origins
+        events.goals.planned = plan.loop.origins
         outcome = _run(plan, job, heartbeat, sinks)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:

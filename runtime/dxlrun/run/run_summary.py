@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from dxlrun.channels.events import EventCode, EventGroup, EventTotals
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
+from dxlrun.plan.played_goals import find_unreached_goals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -96,9 +96,10 @@ def caught_signals(act: Callable[[], None]) -> Iterator[None]:
 
 
 class RunVerdict(NamedTuple):
-    """What the loop's own counters and events say of a run; why it went so, `dxlrun analyze` says."""
+    """Judgement of a run by the loop's own counters and events; `dxlrun analyze` finds the causes."""
 
-    good: bool
+    exit_code: int
+    """0 good, 1 failed, 130 interrupted."""
     line: str
     """What happened to the robot, without the word for it."""
     sentences: tuple[str, ...]
@@ -108,10 +109,11 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     """Judge a run: good where no event is an error, states were valid, played motions reached their goals
     and no more periods were skipped than the robot file tolerates.
 
-    Controllers that failed and have a fallback are told and tolerated; `plan` names them.
+    Controllers that failed and have a fallback are reported and tolerated; `plan` names them. A run that was
+    interrupted before its motions ended is interrupted, not failed.
     """
     if not run.cycles:
-        return RunVerdict(False, "the loop never ran a cycle.", ())
+        return RunVerdict(run.exit_code, "the loop never ran a cycle.", ())
     loop, events, happened = plan.loop, run.events, list[str]()
     fallbacks = {one.name for one in loop.controllers if one.fallback}
     while above := {one.name for one in loop.controllers if fallbacks & {*one.into}} - fallbacks:
@@ -131,11 +133,11 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     for one in taken_over:
         after_s = max(one.t_ns - events.started_ns, 0) / 1e9
         happened.append(f"at {after_s:.1f} s {one.source} had others take over: {last_line(one)}")
-    goals = Counter(events.goals)
-    asked = goals["accepted"] - goals["preempted"] - goals["cancelled"]
-    happened.append(f"ran for {(run.cycles + run.skipped) * loop.period_ns / 1e9:.1f} s")
-    if asked:
-        happened.append(f"{goals['reached']} of {counted(asked, 'goal', 'goals')} reached")
+    ran_ns = (run.cycles + run.skipped) * loop.period_ns
+    happened.append(f"ran for {ran_ns / 1e9:.1f} s")
+    if events.goals.asked:
+        asked = counted(events.goals.asked, "goal", "goals")
+        happened.append(f"{events.goals.reached} of {asked} reached")
     kept, rate = _rate(run, plan)
     fewest = max(FEW_INVALID, INVALID_SHARE * run.cycles)
     invalid = zip(run.invalid, (joint.name for joint in loop.joints), strict=False)
@@ -146,10 +148,11 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append(f"States were invalid: {shares} of the cycles.")
     elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
-    planned = loop.origins
-    failed = [one for one in events.failed if one.origin in planned]
-    sentences += [f"{one.sentence}." for one in failed[:_MOST]]
-    return RunVerdict(not (errors or often or failed) and kept, f"{'; '.join(happened)}.", tuple(sentences))
+    unreached = list(find_unreached_goals(loop, events.goals, ran_ns))
+    sentences += [f"{'; '.join(filter(None, (one.sentence, one.remedy)))}." for one in unreached[:_MOST]]
+    failed = errors or often or not kept or any(one.failed for one in unreached)
+    exit_code = 1 if failed or (unreached and not run.exit_code) else run.exit_code
+    return RunVerdict(exit_code, f"{'; '.join(happened)}.", tuple(sentences))
 
 
 def named(names: Iterable[str]) -> str:

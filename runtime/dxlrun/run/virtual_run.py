@@ -99,7 +99,7 @@ class VirtualRobot:
 
         to_log = Handover(take)
         self._events = EventRing(to_log, self.clock)
-        self._events.failed.planned = plan.loop.origins
+        self._events.goals.planned = plan.loop.origins
         self.sinks = Sinks(
             to_log,
             PacketBatch(to_log) if log else PacketLog(),

@@ -255,7 +255,8 @@ class Manager:
     def _pursue(self, command: ScheduledCommand) -> RunningGoal | None:
         """Return the goal that the runtime pursues with a command of the plan, which may begin with it."""
         name, planned = command.controller, command.goal
-        if planned is not None and isinstance(managed := self._commandable(name), Managed):
+        managed = self._commandable(name) if planned is not None else None
+        if planned and isinstance(managed, Managed) and command.kind not in managed.controller.Goals:
             goal = self._pursued[name] = self._accept(managed, command.kind, command.origin)
             managed.adopt(goal)
             part = PlayedPart(name, command.kind, (), (), planned.end_ns, planned.positions)

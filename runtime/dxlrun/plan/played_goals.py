@@ -1,0 +1,78 @@
+"""Goals of played motions that a run did not reach: the one rule of run summary, exit code and analysis."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from dxlrun.channels.events import GoalReport, GoalTotals
+from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
+
+
+class UnreachedGoal(NamedTuple):
+    """A goal of a played motion that a run did not reach."""
+
+    controller: str
+    name: str
+    """`wave of arm`"""
+    sentence: str
+    """Without its full stop."""
+    remedy: str = ""
+    report: GoalReport | None = None
+    """How it ended; None: it never began."""
+
+    @property
+    def failed(self) -> bool:
+        """True for a goal that was missed or aborted, but not because the run ended."""
+        return self.report is not None and self.report.failed
+
+
+def find_unreached_goals(loop: LoopPlan, goals: GoalTotals, ran_ns: int) -> Iterator[UnreachedGoal]:
+    """Yield the goals of played motions that a run of `ran_ns` did not reach.
+
+    A goal that a client cancelled, or replaced by another one, does not count.
+    """
+    starts = [command for command in loop.commands if command.goal is not None]
+    origins, by_origin = loop.origins, {command.origin: command for command in starts}
+    planned = [report for report in goals.failed if report.origin in origins]
+    for report in sorted(planned, key=lambda report: report.cut):
+        name, sentence, remedy = played_name(report.origin, report.controller), report.sentence, ""
+        if report.cut:
+            sentence, remedy = _describe_end(loop, name, by_origin.get(report.origin), ran_ns)
+        yield UnreachedGoal(report.controller, name, sentence, remedy, report)
+    missing = Counter(command.origin for command in starts)
+    missing.subtract(goals.begun)
+    for command in starts:
+        if missing[command.origin] > 0:
+            missing[command.origin] -= 1
+            name, sentence, remedy = played_name(command.origin, command.controller), "", ""
+            sentence = f"{name} never began"
+            if command.at_ns >= ran_ns:
+                sentence, remedy = _describe_end(loop, name, command, ran_ns)
+            yield UnreachedGoal(command.controller, name, sentence, remedy)
+
+
+def _describe_end(
+    loop: LoopPlan, name: str, command: ScheduledCommand | None, ran_ns: int
+) -> tuple[str, str]:
+    """Return a sentence about a run that ended before a motion did, and the remedy."""
+    end_ns = None if command is None or command.goal is None else command.goal.end_ns
+    end = "" if end_ns is None else f" at {end_ns / 1e9:.4g} s"
+    duration_ns = loop.end_ns
+    if duration_ns is None or not duration_ns <= ran_ns + loop.period_ns or duration_ns >= (end_ns or 0):
+        return f"The run ended at {ran_ns / 1e9:.4g} s, before {name} ended{end}", ""
+    ended = f"The run ended by its duration at {duration_ns / 1e9:.4g} s"
+    return f"{ended}, before {name} ended{end}", "leave out --duration"
+
+
+def played_name(origin: str, controller: str) -> str:
+    """Return the name of a played goal: `wave of arm`; of a goal of a client that of its controller."""
+    return f"{motion} of {controller}" if (motion := motion_name(origin)) else controller
+
+
+def motion_name(origin: str) -> str:
+    """Return the name of the motion file that a command comes from; empty: it comes from none."""
+    path, *place = origin.rsplit(":", 2)
+    return Path(path).stem if len(place) == 2 and all(part.isdigit() for part in place) else ""
