@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -25,8 +26,8 @@ def keys(
     name: str | None = None,
     /,
     *,
-    role: Literal["observe", "command", "admin"] = "observe",
-    days: int = 365,
+    role: Literal["observe", "command", "admin"] | None = None,
+    days: int | None = None,
     to: Path | None = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
@@ -43,9 +44,10 @@ def keys(
     name
         Of a robot, as in its robot file, or of a client, as the robot's log shall name it.
     role
-        What a client may do: observe, command, or admin, which is registers, rates and controllers, too.
+        What a client may do: observe (if left out), command, or admin, which is registers, rates and
+        controllers, too.
     days
-        How long the certificate is valid.
+        How long the certificate is valid, 365 if left out.
     to
         Write it to this directory, to be copied to `~/.config/dxlrun/keys` of another computer; without, this
         computer uses it.
@@ -56,11 +58,13 @@ def keys(
         raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
     from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
 
+    _refuse_unused(action, {"--role": role, "--days": days, "--to": to, "a name": name})
     if action != "list":
         if name is None or not _NAME.fullmatch(name) or name in (CLIENT, "ca"):
             raise InputError(
                 f"`dxlrun keys {action}` needs a name of letters, digits, _ . and -, such as torso"
             )
+        days = 365 if days is None else days
         if not 0 < days <= MOST_DAYS:
             raise InputError(f"--days {days} is no time from 1 to {MOST_DAYS}")
         known = {one.name: one for one in authority.issued()}
@@ -70,7 +74,7 @@ def keys(
                 raise InputError(
                     f"{name} has a certificate: `dxlrun keys renew {name}`, or take another name"
                 )
-            chosen = None if action == "robot" else Role[role.upper()]
+            chosen = None if action == "robot" else Role[(role or "observe").upper()]
         elif name not in known:
             raise InputError(f"{name} has no certificate; there are: {', '.join(known) or 'none'}")
         else:
@@ -107,6 +111,22 @@ def keys(
         else "no certificate yet; `dxlrun keys robot NAME` and `dxlrun keys client NAME` make some"
     )
     return 0
+
+
+_ACTIONS_WITH = {
+    "--role": ("client",),
+    "--days": ("robot", "client", "renew"),
+    "--to": ("robot", "client", "renew"),
+    "a name": ("robot", "client", "renew", "revoke"),
+}
+
+
+def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
+    """Raise InputError for what is given and this action does not use."""
+    for option, value in given.items():
+        if value is not None and action not in _ACTIONS_WITH[option]:
+            actions = " and ".join(_ACTIONS_WITH[option])
+            raise InputError(f"`dxlrun keys {action}` does not use {option}, only {actions}; leave it out")
 
 
 def _state(one: Issued, refused: frozenset[str]) -> str:

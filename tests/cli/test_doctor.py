@@ -230,8 +230,9 @@ def test_what_could_be_better_is_listed_with_the_command_that_fixes_it(
             "it belongs to the group dialout, and anna is not in it",
             "sudo usermod -aG dialout anna",
         ),
-        ("root", 0o660, "anna may not open it", "sudo chmod a+rw /dev/ttyUSB0"),
-        ("dialout", 0o600, "anna may not open it", "sudo chmod a+rw /dev/ttyUSB0"),
+        ("root", 0o660, "anna may not open it", 'KERNEL=="ttyUSB*", GROUP="dialout", MODE="0660"'),
+        ("wheel", 0o660, "anna may not open it", "sudo tee /etc/udev/rules.d/60-dxlrun.rules"),
+        ("dialout", 0o600, "anna may not open it", "sudo tee /etc/udev/rules.d/60-dxlrun.rules"),
     ],
 )
 def test_a_port_that_may_not_be_opened_is_missing(
@@ -247,6 +248,7 @@ def test_a_port_that_may_not_be_opened_is_missing(
     one = look(may_write=closed)["/dev/ttyUSB0"]
     assert (one.state, one.found) == ("missing", found)
     assert mend in one.mend
+    assert f"-aG {group} " not in one.mend or group == "dialout"
 
 
 def test_without_an_adapter_nothing_is_wrong(look: Look) -> None:

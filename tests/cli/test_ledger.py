@@ -31,13 +31,16 @@ def test_the_log_of_a_run_is_what_its_buses_saw(dxlrun: Callable, torso: Path, *
         (("port:=/dev/ttyUSB9", "--ledger", "seen.jsonl"), "what simulated buses saw"),
         (("--ledger", "missing/seen.jsonl"), "--ledger missing/seen.jsonl cannot be written"),
         (("--ledger", "."), "cannot be written"),
+        (("--ledger", "letter.txt"), "--ledger letter.txt exists, and is not written over"),
     ],
 )
 @pytest.mark.usefixtures("in_a_new_directory")
 def test_a_ledger_that_cannot_be_is_refused_before_the_run(
     dxlrun: Callable, torso: Path, words: tuple[str, ...], sentence: str
 ):
+    Path("letter.txt").write_text("Dear servo")
     said = dxlrun(torso, "--virtual", "--duration", "1", *words)
     assert said.code == 2
     assert sentence in said.err
-    assert list(Path().iterdir()) == []
+    assert list(Path().iterdir()) == [Path("letter.txt")]
+    assert Path("letter.txt").read_text() == "Dear servo"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,12 +19,13 @@ from tests.kit.stages import Stage
 from dxlrun import Floats, InputError, JointController, connect, reading, running
 from dxlrun.cli import main
 from dxlrun.contract.joint_controller import _TAKEN
+from dxlrun.control.controllers import single_files
 from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.log.identity import IDENTITY_NAME
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.testing import plan_of, read_log, simulated_robot
-from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.replay import Setting, replay_log
 from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
 
 SHORT = Path(__file__).with_name("short")
@@ -81,19 +83,52 @@ def test_the_law_is_the_formula_to_the_last_bit(written: Written) -> None:
     np.testing.assert_array_equal(read.cycles["command_position"], law)
 
 
-def test_the_log_has_the_file_and_a_replay_runs_that_one(written: Written) -> None:
+def test_the_log_has_the_file_and_a_replay_runs_the_same_one_on_the_disk(written: Written) -> None:
     file, log = written(), Path("run.mcap")
     simulated_robot(file, duration_s=0.3, log=log).run()
     read = read_log(log)
     assert read.attachments["included/wave.py"].decode() == WAVE
     digest = read.metadata[IDENTITY_NAME]["included wave.py"]
     assert read.metadata["plugins"]["./wave.py:Wave"] == f"wave.py {digest[:12]}"
+    for code in (None, "current", "log"):
+        report = replay_log(log, code=code)
+        assert (report.same, report.remarks) == (True, ())
+
+
+def test_code_of_a_log_is_executed_only_on_request(written: Written) -> None:
+    file, log = written("", "\nimport pathlib\npathlib.Path('ran').write_text('')\n"), Path("run.mcap")
+    simulated_robot(file, duration_s=0.3, log=log).run()
+    Path("ran").unlink()
+    single_files._executed.cache_clear()  # a process executes a text once
     written(LAW, "self.start")
-    report = replay_log(log)
-    assert report.same
-    assert report.remarks == ("wave.py has changed since the run; the replay ran the one in the log",)
+    with pytest.raises(InputError, match=r"changed since the run.* --code current .* --code log .* trust"):
+        replay_log(log)
+    with pytest.raises(InputError, match="--code current"):
+        replay_log(log, [Setting.parse("head.frequency=1")], {})
+    current = replay_log(log, code="current")
+    assert current.different > 10
+    assert current.first is not None
+    assert current.first.what == "command of the position"
+    assert any("came from wave.py" in remark for remark in current.remarks)
+    assert not Path("ran").exists()
+    trusted = replay_log(log, code="log")
+    assert trusted.same
+    assert Path("ran").exists()
+    assert trusted.remarks == ("wave.py has changed since the run; the replay ran the one in the log",)
     Path("wave.py").unlink()
-    assert (replay_log(log).same, replay_log(log).remarks) == (True, ())
+    with pytest.raises(InputError, match=r"wave\.py cannot be read, and the code in a log is not executed"):
+        replay_log(log)
+    with pytest.raises(InputError, match=r"--code current: wave\.py cannot be read"):
+        replay_log(log, code="current")
+    assert replay_log(log, code="log").same
+
+
+def test_changed_code_that_wants_another_joint_is_refused(written: Written) -> None:
+    file, log = written(), Path("run.mcap")
+    simulated_robot(file, duration_s=0.3, log=log).run()
+    written("class Wave", "class Other(JointController):\n    pass\n\n\nclass Another")
+    with pytest.raises(InputError, match=r"wave\.py has no class Wave"):
+        replay_log(log, code="current")
 
 
 def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
@@ -111,7 +146,7 @@ def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
             assert changed == {"amplitude": ("0.3 rad", "0.2 rad")}
             robot.stop()
         assert ran.wait(30) == 0, Path("said").read_text()
-    assert replay_log(next(Path("logs").glob("*.mcap"))).same
+    assert replay_log(next(Path("logs").glob("*.mcap")), code="log").same
 
 
 def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Written) -> None:
@@ -349,3 +384,53 @@ def test_it_waits_for_a_joint_that_was_not_heard_yet() -> None:
 def test_names_of_the_entry_are_no_fields_and_the_class_fits_the_contract() -> None:
     assert set(ControllerEntry.model_fields) - {"parameters"} <= set(_TAKEN)
     assert controller_breach(Quick) is None
+
+
+FIRST_WORDS = {
+    "print": "print('here')",
+    "a log record": "__import__('logging').warning('here')",
+    "a warning of numpy": "np.log(np.zeros(2) - 1)",
+    "a complex number": "np.zeros(2) + np.array([1j, 0])",
+}
+
+
+@pytest.mark.parametrize("to", ["pipe", "file", "terminal"])
+@pytest.mark.parametrize("word", FIRST_WORDS)
+def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
+    written: Written, word: str, to: str
+) -> None:
+    written(f"return {LAW}", f"{FIRST_WORDS[word]}\n        return {LAW}")
+    program = "import sys; from dxlrun.cli import main; sys.exit(main())"
+    words = [sys.executable, "-c", program, "robot.yaml", "--virtual", "--duration", "0.1"]
+    if to == "terminal":
+        main_end, end = os.openpty()
+        ran = subprocess.run(words, stdout=end, stderr=end, check=False, timeout=60)
+        os.close(end)
+        os.close(main_end)
+    else:
+        with Path("said").open("w") as said:
+            ran = subprocess.run(
+                words,
+                stdout=subprocess.PIPE if to == "pipe" else said,
+                stderr=subprocess.STDOUT,
+                check=False,
+                timeout=60,
+            )
+    assert ran.returncode == 0, ran.stdout or Path("said").read_text()
+
+
+def test_an_interrupt_that_a_controller_raises_is_its_fault(
+    written: Written, capfd: pytest.CaptureFixture[str]
+) -> None:
+    written(f"return {LAW}", "raise KeyboardInterrupt")
+    assert main(["robot.yaml", "--virtual", "--duration", "1"]) == 1
+    said = "".join(capfd.readouterr())
+    assert "controller head raised in update: KeyboardInterrupt" in said
+
+
+def test_a_pipe_is_no_file_of_a_controller(written: Written, capfd: pytest.CaptureFixture[str]) -> None:
+    written()
+    Path("wave.py").unlink()
+    os.mkfifo("wave.py")
+    assert main(["check", "robot.yaml"]) == 2
+    assert "wave.py of controller head cannot be read (this is not a regular file)" in capfd.readouterr().err

@@ -263,6 +263,12 @@ def test_keys_write_over_nothing_that_is_anothers(computers):
         "robot ../x",
         "renew carl",
         "client bert --days 0",
+        "renew carl --role admin",
+        "renew anna --role admin",
+        "robot arm --role admin",
+        "revoke anna --days 3",
+        "list anna",
+        "list --to elsewhere",
     ):
         assert main(["keys", *line.split()]) == 2, line
     assert main(["keys", "client", "bert", "--to", "bert"]) == 0

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from dxlrun.compile.robot import compile_robot
 from dxlrun.control.controllers.plugins import PlugIns, mismatches
+from dxlrun.description.document import confined
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, suggestion
@@ -59,8 +60,25 @@ def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns)
             )
         controllers[setting.controller] = _changed(controllers[setting.controller], setting)
     for name in {setting.controller for setting in settings}:
-        controllers[name] = _asked(controllers[name], joints, plugins, loop.urdf)
+        controllers[name] = _asked(f"--set {name}", controllers[name], joints, plugins, loop.urdf)
     return replace(loop, controllers=tuple(controllers[name] for name in names))
+
+
+def with_changed_code(loop: LoopPlan, then: LoopPlan, plugins: PlugIns) -> LoopPlan:
+    """Return the plan with what controllers of changed files claim now; raises InputError for a misfit.
+
+    `then`: the loop of the run.
+    """
+    joints = {joint.name: joint for joint in loop.joints}
+    return replace(
+        loop,
+        controllers=tuple(
+            now
+            if now.distribution == before.distribution
+            else _asked(f"--code current: {now.name}", now, joints, plugins, loop.urdf)
+            for before, now in zip(then.controllers, loop.controllers, strict=True)
+        ),
+    )
 
 
 def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
@@ -75,9 +93,9 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
 
 
 def _asked(
-    plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
+    change: str, plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
 ) -> ControllerPlan:
-    """Let the controller check its new parameters, and return its claims anew."""
+    """Let the controller check its parameters after a change, and return what it claims then."""
     offer = plugins.controllers.get(plan.type)
     if offer is None:
         return plan  # the manager reports it
@@ -86,20 +104,21 @@ def _asked(
         interfaces = offer.controller.interfaces(parameters, tuple(joints))
     except ValidationError as error:
         wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
-        raise InputError("\n".join(f"--set {sentence}" for sentence in wrong)) from error
+        prefix = change.removesuffix(plan.name)
+        raise InputError("\n".join(f"{prefix}{sentence}" for sentence in wrong)) from error
     except Exception as error:  # foreign code: one sentence instead of its traceback
-        raise InputError(f"--set {plan.name}: {type(error).__name__}: {error}") from error
+        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
     unknown = [joint for joint in interfaces.joints if joint not in joints]
     if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
         what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
-        raise InputError(f"--set {plan.name}: the controller would want {what}")
+        raise InputError(f"{change}: the controller would want {what}")
     own = [joints[joint] for joint in interfaces.joints]
     try:
         found = mismatches(offer.controller, parameters, interfaces.motors, own, urdf)
     except Exception as error:  # as above
-        raise InputError(f"--set {plan.name}: {type(error).__name__}: {error}") from error
+        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
     if found:
-        raise InputError(f"--set {plan.name}: the controller {found[0].what}")
+        raise InputError(f"{change}: the controller {found[0].what}")
     changed = replace(
         plan,
         joints=interfaces.joints,
@@ -110,13 +129,9 @@ def _asked(
         device_commands=interfaces.device_commands,
     )
     if changed.references != plan.references:
-        raise InputError(
-            f"--set {plan.name}: the controller would export other references than those of the log"
-        )
+        raise InputError(f"{change}: the controller would export other references than those of the log")
     if changed.provides != plan.provides:
-        raise InputError(
-            f"--set {plan.name}: the controller would provide other states than those of the log"
-        )
+        raise InputError(f"{change}: the controller would provide other states than those of the log")
     return changed
 
 
@@ -165,11 +180,12 @@ def _compiled(plan: RecordedPlan, arguments: Mapping[str, str]) -> LoopPlan:
         for relative, text in files.items():
             _write(root, home / relative, text)
         try:
-            description = read_robot(home / name, arguments)
-            urdf = plan.loop.urdf
-            if urdf is not None and description.robot.model is not None:
-                _write(root, home / description.robot.model.urdf, urdf)
-            return compile_robot(description, []).plan.loop
+            with confined(root):
+                description = read_robot(home / name, arguments)
+                urdf = plan.loop.urdf
+                if urdf is not None and description.robot.model is not None:
+                    _write(root, home / description.robot.model.urdf, urdf)
+                return compile_robot(description, []).plan.loop
         except InputError as error:
             raise InputError(str(error).replace(f"{home}/", "")) from error
 

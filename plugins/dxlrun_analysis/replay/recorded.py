@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from contextlib import suppress
 from dataclasses import field
 from importlib import metadata
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,7 +15,6 @@ from dxlrun.channels.events import EventCode
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.single_files import file_of
 from dxlrun.errors import LogError
 from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key
 from dxlrun.log.reader import UNREADABLE, Log
@@ -170,11 +167,6 @@ def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
         if changed:
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             sentences.append(f"the plug-in {name} has changed since the run (file {changed[0]}{more})")
-    folder = Path(inputs.plan.source_file).parent
-    for name in sorted({file_of(plan.type) or "" for plan in inputs.plan.loop.controllers} - {""}):
-        with suppress(OSError):  # gone, or of another machine
-            if (folder / name).read_bytes() != inputs.plan.included[name].encode():
-                sentences.append(f"{name} has changed since the run; the replay ran the one in the log")
     return tuple(sentences)
 
 

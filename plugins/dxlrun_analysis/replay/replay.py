@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, Severity
@@ -17,7 +18,8 @@ from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.errors import PlugInError, counted
 from dxlrun.log.reader import open_log
 from dxlrun.plan.loop_plan import LoopPlan
-from dxlrun_analysis.replay.changes import Setting, with_arguments, with_settings
+from dxlrun_analysis.replay.changes import Setting, with_arguments, with_changed_code, with_settings
+from dxlrun_analysis.replay.code import CodeChoice, with_code
 from dxlrun_analysis.replay.comparison import Comparison, JointDifferences
 from dxlrun_analysis.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
 from dxlrun_analysis.replay.prepared import PreparedComparison
@@ -85,19 +87,26 @@ class ReplayReport(msgspec.Struct, frozen=True):
 
 
 def replay_log(
-    log: Path, settings: Sequence[Setting] = (), arguments: Mapping[str, str] | None = None
+    log: Path,
+    settings: Sequence[Setting] = (),
+    arguments: Mapping[str, str] | None = None,
+    code: CodeChoice | None = None,
 ) -> ReplayReport:
     """Run the controllers of a log on its inputs and compare what they command; changes are made before.
 
-    Memory does not grow with packets, states and messages of the log. Raises LogError when the log does not
-    hold the inputs, PlugInError when a controller is not to be had, InputError when a change does not fit,
-    ControllerFault when a controller cannot be configured.
+    `code`: which single files are executed where those on the disk are not those of the log. Memory does not
+    grow with packets, states and messages of the log. Raises LogError when the log does not hold the inputs,
+    PlugInError when a controller is not to be had, InputError when a change does not fit or code has changed
+    since the run, ControllerFault when a controller cannot be configured.
     """
     reader = open_log(log)
     read = overview(reader)
     inputs = recorded(read)
-    plugins = load_plugins(files=inputs.plan.included)
-    plan = with_settings(with_arguments(inputs.plan, inputs.loop, arguments or {}), settings, plugins)
+    coded, code_changes = with_code(inputs.plan, code)
+    plugins = load_plugins(files=coded.included)
+    plan = replace(inputs.loop, controllers=coded.loop.controllers)
+    plan = with_changed_code(with_arguments(coded, plan, arguments or {}), inputs.loop, plugins)
+    plan = with_settings(plan, settings, plugins)
     _offered(reader.path, plan, plugins)
     prepared = PreparedComparison(inputs)
     plan = prepared.of_plan(plan, plugins)
@@ -158,6 +167,7 @@ def replay_log(
             *read.damage,
             *version_remarks(inputs, plugins),
             *code_remarks(inputs),
+            *code_changes,
             *inbox.remarks,
             *messages.remarks,
         ),

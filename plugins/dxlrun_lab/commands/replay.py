@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -28,6 +28,7 @@ def replay(
     /,
     *assignments: AssignmentOfItsOwn,
     settings: Settings = (),
+    code: Literal["current", "log"] | None = None,
     played_on: PlayedOn = NOWHERE,
     part: RecordedPart = ALL_OF_IT,
     as_json: JsonFlag = False,
@@ -46,12 +47,17 @@ def replay(
         Other arguments for the robot file that is in the log, or for that of --on.
     settings
         Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
+    code
+        Which files of controllers (`./wave.py:Wave`) to execute where the disk has others than the log:
+        current, as they are now; log, as the log has them, which trusts the log.
     """
     if played_on.on is not None:
         if settings:
             raise InputError(
                 "--set belongs to the controllers of the log, which --on does not run; leave one out"
             )
+        if code:
+            raise InputError("--code belongs to a replay, which --on is none of; leave one out")
         chosen = Chosen(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
@@ -62,7 +68,7 @@ def replay(
 
     from dxlrun_analysis.replay import Setting, replay_log
 
-    report = replay_log(log, [Setting.parse(text) for text in settings], arguments)
+    report = replay_log(log, [Setting.parse(text) for text in settings], arguments, code)
     for remark in report.remarks:
         print_warning(f"{report.robot}: {remark}")
     if report.stopped:

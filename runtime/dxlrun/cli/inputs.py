@@ -132,14 +132,17 @@ def terminated_as_interrupted() -> Iterator[None]:
 
 
 def check_ledger(ledger: Path) -> None:
-    """Raise InputError where no ledger can be written, before anything starts."""
+    """Raise InputError where no new ledger can be written, before anything starts."""
     from dxlrun.simulation.bus.ledger import for_group
 
     try:
-        open(ledger, "a", opener=for_group).close()
+        with open(ledger, "ab", opener=for_group) as file:
+            taken = file.tell() > 0  # an empty one was left by a run that did not start
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"--ledger {ledger} cannot be written ({reason}); choose another file") from None
+    if taken:
+        raise InputError(f"--ledger {ledger} exists, and is not written over; choose another file")
 
 
 def check_report(target: Path, library: str = "matplotlib") -> None:

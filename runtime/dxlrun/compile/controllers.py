@@ -21,7 +21,7 @@ from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, s
 from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.controllers.single_files import file_of, is_of_file
-from dxlrun.description.document import KeyPath
+from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.description.problems import problems_of
@@ -71,7 +71,7 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
             file.error(mark, what, "write ./wave.py:Wave for the class Wave of wave.py in the same folder")
             continue
         try:
-            texts[name] = path.read_text("utf-8")
+            texts[name] = read_file(path).decode("utf-8")
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
             what = f"{name} of controller {controller} cannot be read ({why})"

@@ -14,7 +14,7 @@ from dxlrun.compile.joints.servos import check_bus
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
-from dxlrun.description.document import KeyPath
+from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable, read_device_table
 from dxlrun.dynamixel.control_table.devices import device_table, perhaps_meant_device
@@ -156,7 +156,7 @@ def _file(description: Description, name: str, device: Device) -> Path | None:
 
 def _read(path: Path) -> DeviceTable:
     """Return the table of a file; raises OSError, and ValueError when it is none."""
-    text = path.read_text("utf-8")
+    text = read_file(path).decode("utf-8")
     try:
         return replace(read_device_table(text), text=text)
     except KeyError as error:

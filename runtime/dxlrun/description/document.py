@@ -7,10 +7,14 @@ while the values are made.
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import re
 import stat
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Protocol
 
@@ -22,7 +26,9 @@ from dxlrun.errors import InputError, Mark, Problem
 
 KeyPath = tuple[str | int, ...]
 """The way from the top of a document to a value: keys of mappings, indices of lists."""
-LARGEST_FILE = 1 << 20  # Bytes
+LARGEST_FILE = 1024 * 1024
+"""The most bytes of a file that a person wrote."""
+_folder: ContextVar[Path | None] = ContextVar("folder", default=None)
 DEEPEST = 32  # Mappings and lists inside each other
 MOST_NODES = 200_000  # Keys, values, mappings and lists of a file, with every use of an anchor counted
 
@@ -85,6 +91,43 @@ class Tree(msgspec.Struct, frozen=True):
     problems: tuple[Problem, ...]
 
 
+def read_file(path: Path) -> bytes:
+    """Return the bytes of a regular file of at most `LARGEST_FILE`.
+
+    Raises OSError, whose `strerror` is the reason, also for what is no such file.
+    """
+    folder = _folder.get()
+    if folder is not None and not path.resolve().is_relative_to(folder):
+        raise PermissionError(errno.EACCES, "it is outside of the folder that may be read", str(path))
+    with open(path, "rb", opener=_opened) as stream:
+        data = stream.read(LARGEST_FILE + 1)
+    if len(data) > LARGEST_FILE:
+        raise OSError(errno.EFBIG, f"the file is larger than {LARGEST_FILE // 1024} KiB", str(path))
+    return data
+
+
+def _opened(name: str, flags: int) -> int:
+    """Open a file for `open`, without waiting for the other end of a pipe."""
+    descriptor = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "this is a directory", name)
+    raise OSError(errno.EINVAL, "this is not a regular file", name)
+
+
+@contextmanager
+def confined(folder: Path) -> Iterator[None]:
+    """Refuse every file outside of a folder: for a robot file that came from somebody else."""
+    token = _folder.set(folder.resolve())
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
 def read_text(path: Path, language: str = "YAML") -> str:
     """Return the text of a file; raises InputError when it is missing, too large, or no UTF-8.
 
@@ -92,25 +135,18 @@ def read_text(path: Path, language: str = "YAML") -> str:
     """
     file = str(path)
     try:
-        mode = path.stat().st_mode
-        data = b""
-        if stat.S_ISREG(mode):  # reading a pipe or a device might never end
-            with path.open("rb") as stream:
-                data = stream.read(LARGEST_FILE + 1)
+        data = read_file(path)
     except FileNotFoundError:
         raise refusal(Mark(file), "there is no such file", "check the path; it counts from here") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        number = error.errno if isinstance(error, OSError) else None
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise refusal(
-            Mark(file), f"the file cannot be read ({reason})", "check its name and its rights"
-        ) from None
-    if not stat.S_ISREG(mode):
-        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-        raise refusal(Mark(file), f"this is {kind}", f"name a {language} file")
-    if len(data) > LARGEST_FILE:
-        raise refusal(
-            Mark(file), f"the file is larger than {LARGEST_FILE // 1024} KiB", "split it, or thin it out"
-        )
+        if number in (errno.EISDIR, errno.EINVAL):
+            raise refusal(Mark(file), reason, f"name a {language} file") from None
+        if number == errno.EFBIG:
+            raise refusal(Mark(file), reason, "split it, or thin it out") from None
+        what, fix = f"the file cannot be read ({reason})", "check its name and its rights"
+        raise refusal(Mark(file), what, fix) from None
     return _decoded(data, file, language)
 
 

@@ -67,6 +67,7 @@ class _Unblocked:
 class _Writer:
     """A thread that is the only one to wait for a reader.
 
+    It runs before anything is written: the first print may be that of a controller, which starts no thread.
     O_NONBLOCK would be shared with other processes of the same terminal or pipe, and a poll before each write
     does not tell how much fits.
     """
@@ -75,13 +76,11 @@ class _Writer:
         self._waiting: deque[tuple[int, bytes]] = deque(maxlen=MOST_WRITES)
         self._changed = threading.Condition()
         self._idle = True
-        self._thread = threading.Thread(target=self._write_for_ever, daemon=True)
+        threading.Thread(target=self._write_for_ever, daemon=True).start()
 
     def write(self, descriptor: int, data: bytes) -> None:
         """Take what is to be written."""
         with self._changed:
-            if not self._thread.is_alive():
-                self._thread.start()
             self._waiting.append((descriptor, data))
             self._changed.notify_all()
 

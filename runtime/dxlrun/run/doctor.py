@@ -26,6 +26,7 @@ from dxlrun.control.realtime import (
     user,
 )
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
+from dxlrun.dynamixel.port.rights import command_for_access, serial_group
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
@@ -223,24 +224,11 @@ def _port(machine: Machine, path: Path) -> Finding:
     check = _Check(name, "the guardian opens the port to read and to write")
     if machine.may_write(path):
         return check.good(f"{machine.user} may open it")
-    group = _helpful_group(path)
-    if group is None:
-        return check.missing(
-            f"{machine.user} may not open it", f"sudo chmod a+rw {name}  # until it is unplugged"
-        )
+    group = serial_group(path)
+    found = f"it belongs to the group {group}, and {machine.user} is not in it"
     return check.missing(
-        f"it belongs to the group {group}, and {machine.user} is not in it",
-        f"sudo usermod -aG {group} {machine.user}  # then log in again",
+        found if group else f"{machine.user} may not open it", command_for_access(path, name, machine.user)
     )
-
-
-def _helpful_group(path: Path) -> str | None:
-    """Return the group of a file whose members may read and write it."""
-    try:
-        mode = path.stat().st_mode
-        return path.group() if mode & 0o060 == 0o060 and path.group() != "root" else None
-    except (KeyError, OSError):
-        return None
 
 
 def _timer(machine: Machine, path: Path) -> Finding:

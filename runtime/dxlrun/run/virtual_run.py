@@ -260,7 +260,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures, *incomplete)
     interrupted = robot.stop.requested and not sentences
     return RunSummary(
-        exit_code=130 if interrupted else 1 if sentences or result.reason == "fault" else 0,
+        exit_code=130 if interrupted else 0 if result.reason == "ended" and not sentences else 1,
         reason="interrupted" if interrupted else result.reason,
         cycles=result.cycles,
         skipped=result.skipped,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from msgspec.structs import replace
 
+from dxlrun.description.document import read_file
 from dxlrun.errors import InputError, Mark, Problem
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
     from dxlrun.simulation.faults.fault import parse_fault
 
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_file(file).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"the faults in {file} cannot be read ({reason}); give a text file") from None

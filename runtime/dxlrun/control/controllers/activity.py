@@ -34,9 +34,18 @@ _ident, _process = threading.get_ident, os.getpid
 def is_interrupt(error: BaseException) -> bool:
     """Return whether what foreign code seems to raise is Ctrl-C of the process that it runs in.
 
-    In the loop's own process SIGINT is ignored: there, as for all other exceptions, it is that code's.
+    In the loop's own process SIGINT is ignored: there, as for all other exceptions, it is that code's. A
+    handler of this package raises in a frame of its own, which that code cannot be the last of.
     """
-    return type(error) is KeyboardInterrupt and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+    handler = signal.getsignal(signal.SIGINT)
+    if type(error) is not KeyboardInterrupt or handler is signal.SIG_IGN:
+        return False
+    if handler is signal.default_int_handler:
+        return True  # its frame is not seen
+    raised_in = [
+        str(frame.f_globals.get("__name__", "")) for frame, _ in traceback.walk_tb(error.__traceback__)
+    ]
+    return raised_in[-1].startswith("dxlrun.")
 
 
 class Activity:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import serial
 
+from dxlrun.dynamixel.port.rights import command_for_access
 from dxlrun.errors import PortError
 from dxlrun.process_table import robot_of
 
@@ -73,8 +74,8 @@ def _sentence(path: str, baud_rate: int, error: Exception) -> str:
         return f"there is no {path}; {_what_exists()}"
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
         return (
-            f"this user may not open {path}: join its group with `sudo usermod -aG {_group(path)} $USER` "
-            "and log in again"
+            f"this user may not open {path}: "
+            f"`{command_for_access(Path(os.path.realpath(path)), os.path.realpath(path), '$USER')}`"
         )
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return f"{path} is in use by {_holder(path)}"
@@ -108,13 +109,6 @@ def _what_exists() -> str:
     if not devices:
         return "this machine has no serial adapter now: is it plugged in?"
     return f"there are: {', '.join(devices)}"
-
-
-def _group(path: str) -> str:
-    try:
-        return Path(path).group()
-    except (OSError, KeyError):
-        return "dialout"
 
 
 def _holder(path: str) -> str:

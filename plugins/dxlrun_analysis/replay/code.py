@@ -1,0 +1,68 @@
+"""Code: the single files that a replay executes.
+
+A log comes from anybody, so the Python text in it is executed only where the user says so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from msgspec.structs import replace
+
+from dxlrun.control.controllers.single_files import file_of, publisher_of
+from dxlrun.description.document import read_file
+from dxlrun.errors import InputError
+from dxlrun_analysis.replay.recorded import RecordedPlan
+
+CodeChoice = Literal["current", "log"]
+"""`current`: the files beside the robot file as they are now. `log`: the texts in the log."""
+
+
+def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPlan, tuple[str, ...]]:
+    """Return the plan with the code that the replay executes, and remarks on what has changed since the run.
+
+    Without a choice the files on the disk must be those of the log. Raises InputError where they are not.
+    """
+    code = {name: text for name, text in plan.included.items() if name.endswith(".py")}
+    if not code:
+        return plan, ()
+    folder = Path(plan.source_file).parent
+    now = {name: _text(folder, name) for name in code}
+    changed = sorted(name for name, text in code.items() if now[name] != text)
+    if choice == "log":
+        return plan, tuple(
+            f"{name} has changed since the run; the replay ran the one in the log" for name in changed
+        )
+    missing = [name for name in changed if now[name] is None]
+    if choice is None and changed:
+        raise InputError("\n".join(_refusal(folder, name, gone=name in missing) for name in changed))
+    if missing:
+        raise InputError("\n".join(f"--code current: {folder / name} cannot be read" for name in missing))
+    texts = {**plan.included, **{name: text for name, text in now.items() if text is not None}}
+    controllers = tuple(
+        replace(one, distribution=publisher_of(file, texts[file]))
+        if (file := file_of(one.type)) in changed
+        else one
+        for one in plan.loop.controllers
+    )
+    return replace(plan, included=texts, loop=replace(plan.loop, controllers=controllers)), ()
+
+
+def _text(folder: Path, name: str) -> str | None:
+    """Return the text of a file beside the robot file; None: there is none."""
+    if Path(name).name != name:
+        return None  # no compiler wrote this name
+    try:
+        return read_file(folder / name).decode("utf-8")
+    except (OSError, ValueError):
+        return None
+
+
+def _refusal(folder: Path, name: str, *, gone: bool) -> str:
+    state = "cannot be read" if gone else "has changed since the run"
+    current = "" if gone else "--code current runs the file as it is now, "
+    return (
+        f"{folder / name} {state}, and the code in a log is not executed unasked; "
+        f"{current}--code log runs what is in the log: only if you trust who sent it"
+    )

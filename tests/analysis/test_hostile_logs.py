@@ -1,0 +1,136 @@
+"""Logs are what people send each other: no verb executes what is in one, or leaves its own folder for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.kit.anew import plan, written_anew
+
+from dxlrun.cli import main
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: short
+loop: {rate: 50}
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
+joint_defaults: {bus: main, model: XM430-W350, reference: 180 deg, direction: 1}
+joints: {pan: {id: 1}, tilt: {id: 2}}
+controllers:
+  head: {type: ./still.py:Still, joints: [pan, tilt]}
+"""
+STILL = """\
+from pathlib import Path
+
+from dxlrun import Angle, Floats, JointController
+
+
+class Still(JointController):
+    offset: Angle = 0.0
+
+    def positions(self, time: float, dt: float) -> Floats:
+        return self.start + self.offset
+"""
+ATTACK = "\nPath('executed').write_text('')\n"
+FOREIGN = "a_word_of_nobody_else: 1\n"
+READERS = (
+    ["analyze", "bad.mcap"],
+    ["analyze", "bad.mcap", "--json"],
+    ["analyze", "bad.mcap", "--report", "page.html"],
+    ["logs", "."],
+    ["export", "bad.mcap", "rows.csv", "--format", "csv"],
+    ["export", "bad.mcap", "tables", "--format", "parquet"],
+    ["export", "bad.mcap", "bag", "--format", "ros2bag"],
+    ["convert", "bad.mcap", "motion.yaml"],
+)
+REPLAYS = (
+    ["replay", "bad.mcap"],
+    ["replay", "bad.mcap", "--code", "current"],
+    ["replay", "bad.mcap", "--set", "head.offset=0.1"],
+    ["replay", "bad.mcap", "x:=1"],
+)
+
+
+def _included(name: str, text: str) -> Callable[[Any], None]:
+    def edit(content: Any) -> None:
+        content["included"][name] = text
+
+    return edit
+
+
+def _robot_text(old: str, new: str) -> Callable[[Any], None]:
+    def edit(content: Any) -> None:
+        assert old in content["source_text"]
+        content["source_text"] = content["source_text"].replace(old, new)
+
+    return edit
+
+
+HOSTILE: dict[str, Callable[[Path], Callable[[Any], None]]] = {
+    "other code": lambda outside: _included("still.py", STILL + ATTACK),
+    "code above the folder": lambda outside: _included("../" * 9 + "above.py", ATTACK),
+    "code at a place of its own": lambda outside: _included(str(outside / "new.py"), ATTACK),
+    "code that is not used": lambda outside: _included("more.py", ATTACK),
+    "a file of another folder": lambda outside: _robot_text(
+        "name: short", f"include: [{outside}/foreign.yaml]\nname: short"
+    ),
+    "a URDF of another folder": lambda outside: _robot_text(
+        "name: short", f"model: {{urdf: {outside}/foreign.yaml}}\nname: short"
+    ),
+    "a motor of another folder": lambda outside: _robot_text(
+        "{id: 1}", f"{{id: 1, motor: {outside}/foreign.yaml}}"
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("honest")
+    (folder / "still.py").write_text(STILL)
+    (folder / "good.yaml").write_text(ROBOT)
+    simulated_robot(folder / "good.yaml", duration_s=0.3, log=folder / "run.mcap").run()
+    return folder
+
+
+@pytest.mark.parametrize("attack", HOSTILE)
+def test_no_verb_executes_a_log_or_leaves_its_folder(
+    honest: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    attack: str,
+) -> None:
+    outside, work = tmp_path / "outside", tmp_path / "work"
+    outside.mkdir()
+    work.mkdir()
+    (outside / "foreign.yaml").write_text(FOREIGN)
+    for name in ("still.py", "good.yaml"):
+        (work / name).write_text((honest / name).read_text())
+    monkeypatch.chdir(work)
+    written_anew(honest / "run.mcap", work / "bad.mcap", plan(HOSTILE[attack](outside)))
+    before = sorted(tmp_path.rglob("*"))
+    for words in (*READERS, *REPLAYS) if attack == "other code" else REPLAYS:
+        code = main(words)
+        said = "".join(capfd.readouterr())
+        assert code in {0, 1, 2}, (words, said)
+        assert "Traceback" not in said, (words, said)
+        assert "a_word_of_nobody_else" not in said, (words, said)
+        assert not (work / "executed").exists(), (words, said)
+    made = set(tmp_path.rglob("*")) - set(before)
+    assert all(path.is_relative_to(work) for path in made)
+    assert sorted(path.name for path in outside.iterdir()) == ["foreign.yaml"]
+
+
+def test_the_same_log_is_executed_when_it_is_trusted(
+    honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written_anew(honest / "run.mcap", Path("bad.mcap"), plan(_included("still.py", STILL + ATTACK)))
+    assert main(["replay", "bad.mcap", "--json"]) == 2
+    assert "--code log" in json.dumps(json.loads(capfd.readouterr().out))
+    assert not Path("executed").exists()
+    assert main(["replay", "bad.mcap", "--code", "log"]) == 0
+    assert Path("executed").exists()
