@@ -115,7 +115,8 @@ class Taught(msgspec.Struct, frozen=True):
         speed = np.minimum(self.way_speed * self.size, _SPARE * self.speed)
         return max(LEAST_WAY_S, float((np.abs(end - begin) / speed).max()))
 
-
-def text_of(motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
-    """Return the motion file for the controllers among `plans` that are active."""
-    return motion_file(motion, tolerances(motion, None), motion.path, None, origin, plans=plans).text
+    def text_of(self, motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
+        """Return the motion file for the controllers among `plans` that are active."""
+        allowed = tolerances(motion, None)
+        speeds = dict(zip(self.joints, self.speed.tolist(), strict=True))
+        return motion_file(motion, allowed, motion.path, None, origin, plans=plans, speeds=speeds).text

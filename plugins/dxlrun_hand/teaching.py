@@ -17,7 +17,7 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, ending_with, yes
-from dxlrun_hand.taught_motion import Shown, Taught, text_of
+from dxlrun_hand.taught_motion import Shown, Taught
 
 LONGEST_AGE_NS = 1_000_000_000
 """A joint whose newest position is older does not answer."""
@@ -101,7 +101,7 @@ class Teaching:
                 f"  It was shown faster than the joints may move, and takes {longer:.2g} times as long."
             )
         origin = f"Shown by hand to {self._robot.name}.\nWritten by `dxlrun teach`."
-        text = text_of(motion, self._plans, origin)
+        text = taught.text_of(motion, self._plans, origin)
         with new_target(target) as beside:
             beside.write_text(text, encoding="utf-8")
         self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")

@@ -15,10 +15,11 @@ from dxlrun.compile.motions import TRAJECTORY, command_kind
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError, LogError
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.plan.robot_plan import from_json
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import PINION_M, SplinePath, fit
+from dxlrun_controllers.joints import CLOSING_SPEED
 
 LEAD_S = 1.0  # Before the first point: controllers lead their joints there meanwhile, as in the thesis
 _STEP_S = 0.02  # Between two points of a controller that takes single positions
@@ -48,14 +49,19 @@ def motion_file(
     origin: str,
     *,
     plans: Sequence[ControllerPlan] | None = None,
+    speeds: Mapping[str, float] | None = None,
 ) -> MotionFile:
     """Return the file for a recorded motion, within `allowed` of it, rad, shape (joints,).
 
     `origin` is the comment at its beginning.
 
     Its parts are for the controllers that moved the joints in the log, or for `controller`, which has to take
-    trajectories, or for those among `plans` that are active. Raises InputError where no controller is known.
+    trajectories, or for those among `plans` that are active. `speeds` are the highest of the joints, rad/s or
+    m/s; without them those of the log's robot count. Raises InputError where no controller is known.
     """
+    if speeds is None:
+        robot = () if motion.plan is None else _logged_loop(motion).joints
+        speeds = {joint.name: joint.highest_speed for joint in robot}
     parts = [_Part(controller, motion.joints, True)] if controller else _parts(motion, plans)
     name = re.sub(r"\W", "_", target.stem, flags=re.ASCII).strip("_") or "motion"
     name = name if name[0].isalpha() else f"motion_{name}"
@@ -64,7 +70,8 @@ def motion_file(
     points: dict[str, int] = {}
     for part in parts:
         linear = {joint for joint, slides in zip(motion.joints, motion.linear, strict=True) if slides}
-        rows = list(_points(part, _path_of(part, motion, allowed), linear))
+        closing = [_closing_speed(joint, linear, speeds) for joint in part.joints]
+        rows = list(_points(part, _path_of(part, motion, allowed), linear, closing))
         points[part.controller] = len(rows)
         lines += [f"  - controller: {part.controller}", "    points:", *rows]
     text = "\n".join(lines) + "\n"
@@ -77,14 +84,19 @@ def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath
     return fit(replace(motion, joints=part.joints, position=motion.position[:, columns]), allowed[columns])
 
 
-def _points(part: _Part, path: SplinePath, linear: Set[str]) -> Iterator[str]:
+def _closing_speed(joint: str, linear: Set[str], speeds: Mapping[str, float]) -> float:
+    """Return the least speed given with a position: a slower servo would not be there within the step."""
+    speed = CLOSING_SPEED * (PINION_M if joint in linear else 1.0)
+    return min(speed, speeds.get(joint, speed))
+
+
+def _points(part: _Part, path: SplinePath, linear: Set[str], closing: Sequence[float]) -> Iterator[str]:
     times, positions, velocities = path.time_s, path.position, path.velocity
     if not part.trajectory:
         times = np.linspace(0.0, path.duration_s, max(2, round(path.duration_s / _STEP_S) + 1))
         positions = path.at(times)
         way = np.abs(np.diff(positions, axis=0, prepend=positions[:1]))
-        slowest = [_SLOWEST * (PINION_M if joint in linear else 1.0) for joint in part.joints]
-        velocities = np.maximum(way / (times[1] - times[0]), slowest)
+        velocities = np.maximum(way / (times[1] - times[0]), closing)
         moved: NDArray[np.bool_] = way.max(axis=1) > 0
         moved[[0, -1]] = True
         times, positions, velocities = times[moved], positions[moved], velocities[moved]
@@ -92,9 +104,6 @@ def _points(part: _Part, path: SplinePath, linear: Set[str]) -> Iterator[str]:
         given = velocity if part.trajectory or part.speeds else None
         at = f"{LEAD_S + time:.9f}".rstrip("0").rstrip(".")
         yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, linear)}}}}}"
-
-
-_SLOWEST = 0.05  # rad/s beside a single position: at 0 a servo would not get there
 
 
 def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, linear: Set[str]) -> str:
@@ -123,8 +132,13 @@ def _plans_of(motion: RecordedMotion) -> Sequence[ControllerPlan]:
             f"{motion.path}: a foreign recording does not say which controllers are to play it; name one "
             "that takes trajectories by --controller"
         )
+    return _logged_loop(motion).controllers
+
+
+def _logged_loop(motion: RecordedMotion) -> LoopPlan:
+    """Return the loop's plan of a log of dxlrun; raises LogError."""
     try:
-        return from_json(motion.plan).loop.controllers
+        return from_json(motion.plan or b"").loop
     except ValueError as error:
         raise LogError(f"{motion.path}: its plan cannot be read: {error}") from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,9 @@ import pytest
 
 from dxlrun.description.motion import read_motion as read_motion_file
 from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun_analysis.playback.motion_file import motion_file
+from dxlrun_analysis.playback.recorded_motion import RecordedMotion
 
 Dxlrun = Callable[..., Any]
 
@@ -96,6 +100,33 @@ def test_controllers_of_single_positions_get_them_every_20_ms(
             (target.velocity is not None) == given for point in points for target in point.joints.values()
         )
     assert dxlrun("groups.yaml", "--virtual", "--play", "second.yaml").code == 0
+
+
+def test_posvel_joint_reaches_the_end_of_a_motion_that_becomes_slow() -> None:
+    time = np.linspace(0.0, 2.0, 101)
+    position = np.stack([0.5 * np.sin(time * np.pi / 4), np.zeros(101)], axis=1)  # at rest at its end
+    motion = RecordedMotion(
+        Path("log"), ("pan", "wheel"), ("states", "states"), time, position, 0.0, (False, False)
+    )
+    group = ControllerPlan(
+        name="head",
+        type="joint_group_posvel_controller",
+        distribution="",
+        parameters="",
+        joints=("pan", "wheel"),
+        command=("position", "velocity"),
+        publishes=(),
+        active=True,
+        every=1,
+    )
+    allowed = np.full(2, math.radians(0.5))
+
+    text = motion_file(
+        motion, allowed, Path("slow.yaml"), None, "", plans=[group], speeds={"pan": math.inf, "wheel": 0.2}
+    ).text
+
+    *_, last = [line for line in text.splitlines() if "time:" in line]
+    assert re.findall(r"velocity: ([^ ]+) rad/s", last) == ["0.500000", "0.200000"]
 
 
 def _only(line: str, joint: str, *, speed: bool) -> str:
