@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import pytest
 from tests.kit.loops import GateRig
-from tests.kit.stories import replayed, send, tell
+from tests.kit.stories import replayed, send, silence, tell
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.cycle import Clamp
@@ -169,6 +169,64 @@ def test_the_start_reports_a_register_that_is_tighter_than_the_file(limits, seve
         assert event.text.startswith("a (ID 1 on bus main): ")
         limits_found = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
         assert limits_found[-1].interface in {"effort", "velocity"}
+
+
+@pytest.mark.parametrize("gears", [False, True], ids=["single", "transmission"])
+@pytest.mark.parametrize(("before", "after"), [(1023, 50), (50, 1023), (50, 40)])
+def test_limits_are_read_again_when_another_servo_took_the_place_of_a_lost_one(
+    gears, before, after, tmp_path
+):
+    """Its goals are held to its own registers, an event names them, and a replay decides like the run."""
+    text = ROBOT.format(model="XM430-W350", protocol=2.0, kind="velocity", reference=180, limits="LIMITS")
+    if gears:
+        text = text.replace(
+            "joints:\n  a: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: -1, LIMITS}",
+            "joints: {a: {limits: {position: [-90 deg, 90 deg]}}}\n"
+            "transmissions: {g: {type: matrix, matrix: [[1]], joints: [a], servos: "
+            "{s: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: -1}}}}",
+        )
+    file = tmp_path / "robot.yaml"
+    file.write_text(text.replace("LIMITS", "limits: {position: [-90 deg, 90 deg]}"))
+    robots = []
+
+    def replace_servo(robot: VirtualRobot) -> None:
+        servo = robot.buses[0].servo(1)
+        servo.poke("velocity_limit", before)
+        silence(robot, [1], 300, 900)
+        robot.buses[0].at(600_000_000, lambda: servo.poke("velocity_limit", after))
+        robots.append(robot)
+
+    speed = 45 * control_table("XM430-W350", 2.0).rad_s_per_tick
+    story = {number: [send("c", "velocities", speed)] for number in range(200, 204)}
+    log = tell(file, story, tmp_path / "run.mcap", seconds=2.5, before=replace_servo)
+    (robot,) = robots
+    sent = [
+        int.from_bytes(data[104 - begin :][:4], "little", signed=True)
+        for _, _, begin, data in all_writes(tuple(robot.ledger.entries), robot.plan.buses[0])
+        if begin <= 104 < begin + len(data)
+    ]
+    assert max(map(abs, sent)) == min(45, after)
+    told = [event.text for event in replayed(log).events if event.code == EventCode.SERVO_LIMITS]
+    texts = [f"goals of velocity are held to Velocity Limit (44) = {raw}, " for raw in (before, after)]
+    texts = ["registers of its servo no longer limit goals" if "1023" in one else one for one in texts]
+    assert len(told) == (1 if before == 1023 else 2)
+    assert all(text in event for text, event in zip(reversed(texts), reversed(told), strict=False))
+
+
+def test_a_servo_that_returns_with_the_same_limits_is_no_second_event(tmp_path):
+    file = tmp_path / "robot.yaml"
+    limits = "limits: {position: [-90 deg, 90 deg]}"
+    file.write_text(
+        ROBOT.format(model="XM430-W350", protocol=2.0, kind="velocity", reference=180, limits=limits)
+    )
+
+    def lose(robot: VirtualRobot) -> None:
+        robot.buses[0].servo(1).poke("velocity_limit", 50)
+        silence(robot, [1], 300, 900)
+
+    log = replayed(tell(file, {}, tmp_path / "run.mcap", seconds=2.5, before=lose))
+    assert any(event.code == EventCode.SERVO_BACK for event in log.events)
+    assert len([event for event in log.events if event.code == EventCode.SERVO_LIMITS]) == 1
 
 
 def test_a_register_binds_the_steps_only_where_the_file_limits_the_speed():

@@ -5,7 +5,8 @@ These are the seams of the loop: a replay changes nothing above them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 
@@ -76,6 +77,9 @@ class RecordedHardware:
         self._outside = len(inputs.plan.loop.sources)  # Sources that are no controllers: they come first
         self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
         self.index = 0  # Of the cycle that is replayed
+        self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
+        """The registers of the servos in the run, from the events until this cycle"""
+        self._limit_events = deque(_read_limits(inputs))
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Fill states and goals with those of the activation."""
@@ -85,6 +89,12 @@ class RecordedHardware:
         self._take_sources(activation)
         for interface in COMMAND_INTERFACES:
             np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
+        self._take_limits(int(self._row(0)["woken_ns"]))
+
+    def _take_limits(self, until_ns: int) -> None:
+        while self._limit_events and self._limit_events[0][0] <= until_ns:
+            _, row, limits = self._limit_events.popleft()
+            self.servo_limits = {**self.servo_limits, row: limits}
 
     def _take_sources(self, row: np.void) -> None:
         """Take what devices and sensors had; what controllers provide is computed again."""
@@ -92,17 +102,6 @@ class RecordedHardware:
         np.copyto(sources.values[:states], row["source_state"][:states])
         np.copyto(sources.valid[:count], row["source_valid"][:count])
         np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
-
-    @property
-    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers of the servos in the run, from the events of its start."""
-        rows = {joint.name: row for row, joint in enumerate(self._inputs.plan.loop.joints)}
-        found: dict[int, Sequence[ServoLimit]] = {}
-        for event in self._inputs.log.events:
-            if event.code == EventCode.SERVO_LIMITS and event.source in rows:
-                with suppress(*UNREADABLE):
-                    found[rows[event.source]] = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
-        return found
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
@@ -117,6 +116,7 @@ class RecordedHardware:
             np.copyto(getattr(self._record.states, name), row[name])
         self._take_sources(row)
         self._clock.move(int(row["read_ns"]))
+        self._take_limits(int(row["updated_ns"]))
 
     def recorded(self) -> np.void:
         """Return the cycle that is replayed as it was recorded."""
@@ -163,6 +163,16 @@ class RecordedHardware:
 
     def release(self) -> None:
         """Do nothing: no servo holds."""
+
+
+def _read_limits(inputs: RecordedInputs) -> Iterator[tuple[int, int, Sequence[ServoLimit]]]:
+    """Yield when the limits of a joint's servo were read, the joint's row, and the limits."""
+    rows = {joint.name: row for row, joint in enumerate(inputs.plan.loop.joints)}
+    for event in inputs.log.events:
+        if event.code == EventCode.SERVO_LIMITS and event.source in rows:
+            with suppress(*UNREADABLE):
+                limits = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
+                yield event.t_ns, rows[event.source], limits
 
 
 class RecordedInbox:

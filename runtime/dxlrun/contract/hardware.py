@@ -23,7 +23,10 @@ class Hardware(Protocol):
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each joint's servos, by row; known once it has started."""
+        """The registers that limit the goals of each joint's servos, by row; known once it has started.
+
+        Another object when they were read again, of a servo that returned.
+        """
         ...
 
     def read(self) -> None:

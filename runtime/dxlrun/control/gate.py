@@ -121,24 +121,26 @@ class Gate:
         self._take_modes()
 
     def take_servo_limits(self, limits: Mapping[int, Sequence[ServoLimit]]) -> None:
-        """Hold goals to the registers of the servos, which were read at the start, too.
+        """Hold goals to the registers of the servos, too, as read at the start and of a servo that returned.
 
-        A servo refuses a goal beyond its register as a whole. One event a joint has its limits as data, for a
-        replay; it is a warning where a register is tighter than the file's limit.
+        A servo refuses a goal beyond its register as a whole. One event for each joint whose limits changed
+        has them as data, for a replay; it is a warning where a register is tighter than the file's limit.
 
         Args:
             limits: by row of the joint.
         """
-        joints = list(self._plan.joints)
+        joints = list(self._limited)
         for row, found in sorted(limits.items()):
-            joint = joints[row] = replace(joints[row], servo_limits=tuple(found))
-            binding = [own for own in found if joint.find_servo_limit(own.interface)]
-            if not binding:
+            before, joint = joints[row], replace(joints[row], servo_limits=tuple(found))
+            joints[row] = joint
+            binding = joint.binding_servo_limits
+            if joint.servo_limits == before.servo_limits or not (binding or before.binding_servo_limits):
                 continue
             warns = any(joint.exceeds_file_limit(own.interface) for own in binding)
             severity = Severity.WARNING if warns else Severity.INFO
             data = msgspec.json.encode(joint.servo_limits)
             text = "; ".join(joint.describe_servo_limit(own) for own in binding)
+            text = text or "registers of its servo no longer limit goals"
             self._events.emit(EventCode.SERVO_LIMITS, severity, joint.name, f"{joint.label}: {text}", data)
         self._limited = tuple(joints)
         for name, values in _speeds_and_efforts(joints).items():

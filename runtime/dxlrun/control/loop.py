@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast, get_args
 
@@ -28,7 +28,7 @@ from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan
+from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan, ServoLimit
 from dxlrun.plan.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 
 
@@ -127,6 +127,8 @@ class Loop:
     """Sensors without which the run ends, with their rows."""
     _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
     _motion: SafeMotion | None = field(default=None, init=False)
+    _servo_limits: Mapping[int, Sequence[ServoLimit]] = field(init=False)
+    """What the gate has of the hardware; compared by identity, as it changes when a servo returns."""
 
     def __post_init__(self) -> None:
         self.schedule = schedule_of(self.plan)
@@ -197,11 +199,15 @@ class Loop:
         self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
         if self.sensors is not None:
             self.sensors.read()
-        self.gate.take_servo_limits(self.hardware.servo_limits)
+        self._take_servo_limits()
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()
         self.manager.switching.start(0)
+
+    def _take_servo_limits(self) -> None:
+        self._servo_limits = self.hardware.servo_limits
+        self.gate.take_servo_limits(self._servo_limits)
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.steering.inbox.answer(number, answer)
@@ -246,6 +252,8 @@ class Loop:
         if self.sensors is not None:
             self.sensors.read()
         read_ns = now_ns()
+        if self.hardware.servo_limits is not self._servo_limits:
+            self._take_servo_limits()
         if record.states.mode.tobytes() != self.gate.modes:
             self.gate.enter_modes()
         if Torque.GIVEN in record.states.torque.tobytes():

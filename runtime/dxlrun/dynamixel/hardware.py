@@ -112,6 +112,7 @@ class DynamixelHardware:
         self._kernel = Kernel(self._lines, shared, self._samples, goals, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
         self._start_up = StartUp(self._lines, self._servos, events)
+        self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -133,17 +134,13 @@ class DynamixelHardware:
             self._full_torque = self._start_up.stage(restore_torque_limits)
             self._first_states()
             self._start_up.watch()
+            self._collect_limits()
             for bus in self._buses:
                 bus.words[LATE_NS] = 0  # servos that write their EEPROM answer late: no cycle does that
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
             raise
-
-    @property
-    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each joint's servo, by row; known once it has started."""
-        return self._start_up.servo_limits
 
     def read(self) -> None:
         """Read every servo once, on all lines at once; of a line that is lost every row is invalid.
@@ -166,6 +163,15 @@ class DynamixelHardware:
                 servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
+
+        if any(servos.goals.limits_changed for servos in self._servos):
+            self._collect_limits()
+
+    def _collect_limits(self) -> None:
+        """Hand the registers that limit the servos' goals to the loop."""
+        self.servo_limits = {row: own for servos in self._servos for row, own in servos.limits.items()}
+        for servos in self._servos:
+            servos.goals.limits_changed = False
 
     def _finish_read(self, code: int) -> None:
         while (answer := self._kernel.finish_read(code)) is Answer.SILENCE:

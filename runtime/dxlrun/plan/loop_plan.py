@@ -57,7 +57,7 @@ LimitedInterface: TypeAlias = Literal["velocity", "effort", "pwm"]
 
 
 class ServoLimit(msgspec.Struct, frozen=True):
-    """A register that limits the goals of a joint's servo, as read at the start."""
+    """A register that limits the goals of a joint's servo, as read at the start or when it returned."""
 
     interface: LimitedInterface
     value: float  # Highest goal without its sign: rad/s or m/s, the unit of the effort, share of the voltage
@@ -143,6 +143,11 @@ class JointPlan(msgspec.Struct, frozen=True):
         """Return the register that is tighter than the file and the manual; None where none is."""
         own = next((one for one in self.servo_limits if one.interface == interface), None)
         return None if own is None or own.value >= self._planned_limit(interface) else own
+
+    @property
+    def binding_servo_limits(self) -> tuple[ServoLimit, ...]:
+        """The registers that are tighter than the file and the manual."""
+        return tuple(own for own in self.servo_limits if self.find_servo_limit(own.interface))
 
     def exceeds_file_limit(self, interface: LimitedInterface) -> bool:
         """Check whether the file's limit allows more than a register of the servo."""

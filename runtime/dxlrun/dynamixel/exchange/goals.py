@@ -61,7 +61,9 @@ class GoalArrays:
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
-        self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
+        self.own_limits: list[Mapping[OwnLimit, int]] = [{} for _ in plan.servos]
+        """Limits that were read of each servo, ticks; a servo refuses a goal beyond them."""
+        self.limits_changed = False  # Since the hardware handed them to the loop
         self.fraction = 1.0  # The part of a servo's limit of effort or PWM that goals may ask for
         self.sync_writes: tuple[SyncWrite, ...] = ()
         """One for each mode and block of goals, in the order in which they are sent; new after a change."""
@@ -84,9 +86,18 @@ class GoalArrays:
             self.renew()
 
     def set_limits(self, index: int, limits: Mapping[OwnLimit, int]) -> None:
-        """Keep the goals of a servo within the limits that were read of it, ticks."""
-        self._limits[index] = {limit.of: value for limit, value in limits.items()}
-        self.renew()
+        """Keep the goals of a servo within the limits that were read of it, ticks.
+
+        A limit that was not read keeps its value.
+        """
+        found = {**self.own_limits[index], **limits}
+        if found != self.own_limits[index]:
+            self.own_limits[index] = found
+            self.limits_changed = True
+            self.renew()
+
+    def _ticks_of_limits(self, index: int) -> Mapping[str, int]:
+        return {limit.of: value for limit, value in self.own_limits[index].items()}
 
     def weaken(self, fraction: float) -> None:
         """Let no goal ask for more effort or PWM than a fraction of the servo's limit."""
@@ -109,7 +120,8 @@ class GoalArrays:
                 tuple(servos[index].row for index in part),
                 tuple(servos[index].servo_id for index in part),
                 tuple(
-                    _cells(servos[index], mode, layout, self._limits[index], self.fraction) for index in part
+                    _cells(servos[index], mode, layout, self._ticks_of_limits(index), self.fraction)
+                    for index in part
                 ),
             )
             for (mode, layouts), members in groups.items()

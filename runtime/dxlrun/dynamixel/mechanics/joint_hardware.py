@@ -186,6 +186,9 @@ class JointHardware:
         self._fade_share = period_ns / FADE_NS
         self._asked: dict[tuple[int, str], _Together] = {}
         """Requests that not all servos of a coupling have answered, by its index and what is requested."""
+        self._read_limits: Mapping[int, Sequence[ServoLimit]] | None = None
+        """Limits of the servos, from which those of the joints were computed"""
+        self._joint_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Start the servos, and let the joints' goals be where they stand.
@@ -201,10 +204,13 @@ class JointHardware:
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
         """The registers that limit the goals of each joint's servos, each of them while the others rest."""
         own = self._hardware.servo_limits
+        if own is self._read_limits:
+            return self._joint_limits
         found = {joint: tuple(own.get(servo, ())) for joint, servo in self._plan.direct}
         for coupling in self._plan.couplings:
             for column, joint in enumerate(coupling.joints):
                 found[joint] = self._limits_of(coupling, column, own)
+        self._read_limits, self._joint_limits = own, found
         return found
 
     def _limits_of(

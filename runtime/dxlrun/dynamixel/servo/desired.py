@@ -145,6 +145,10 @@ class DesiredState:
             self.entered(index, mode)
             life.report(EventCode.MODE, Severity.INFO, index, f"is in {_words(mode)}")
 
+    def read_limits(self, index: int) -> Program[None]:
+        """Read the limits beyond which a servo refuses goals: another one may have taken its place."""
+        self._goals.set_limits(index, (yield from modes.read_limits(self._life.reach(index))))
+
     def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
         """Restore the torque limit of a servo that holds in a mode, unless a policy reduced it."""
         if self._goals.fraction >= 1.0:

@@ -144,6 +144,7 @@ class Offline:
             life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, _OTHER_TURN)
         torqued = yield from rejoin(one, found, mode, self.desired.registers(index), torque=torque)
         if not found.problems:
+            yield from self.desired.read_limits(index)
             yield from self.desired.restore_torque_limit(index, mode, found)
         if not found.problems and (problem := (yield from watchdog.arm(one))):
             found.problems.append(problem)

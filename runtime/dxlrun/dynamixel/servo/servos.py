@@ -5,7 +5,7 @@ Each becomes an event of the state machine in `life.py`, and an event of the log
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
+from dxlrun.dynamixel.servo.modes import servo_limits
 from dxlrun.dynamixel.servo.offline import Offline
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.requests import Requests
@@ -28,6 +29,7 @@ from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import counted
+from dxlrun.plan.loop_plan import ServoLimit
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
 NOISE_EVENT_NS = 1_000_000_000  # A noisy line has at most one event in this time
@@ -93,6 +95,14 @@ class Servos:
         return [self._plan.label(servo) for servo, missed in servos if missed]
 
     # Start and end
+
+    @property
+    def limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers that limit the goals of each servo, by row of its joint."""
+        return {
+            row: servo_limits(self.life.reach(index), self.goals.own_limits[index])
+            for index, row in enumerate(self._rows)
+        }
 
     def engaged(self) -> None:
         """Take every servo for one that holds where it stands, or is limp, as the start-up has read back."""

@@ -32,7 +32,6 @@ from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.loop_plan import ServoLimit
 from dxlrun.plan.transaction import Program, Result
 
 GROUP = 3
@@ -68,8 +67,6 @@ class StartUp:
         self._events = events
         self._late_ns: list[list[int]] = [[] for _ in lines.plans]
         """How much later than by the wire the replies on each bus came."""
-        self.servo_limits: dict[int, tuple[ServoLimit, ...]] = {}
-        """By row of the servo's joint, the registers that limit its goals; read by `look`."""
 
     def look(self, take_over: bool) -> None:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
@@ -80,10 +77,9 @@ class StartUp:
         _refuse(self._late_replies())
         self.stage(settle_bus)
         settled = self.stage(modes.settle_modes)
-        for plan, servos, limits in zip(self._plans, self._servos, settled, strict=True):
-            for index, (servo, own) in enumerate(zip(plan.servos, limits, strict=True)):
+        for servos, limits in zip(self._servos, settled, strict=True):
+            for index, own in enumerate(limits):
                 servos.goals.set_limits(index, own)
-                self.servo_limits[servo.row] = modes.servo_limits(reach(plan, servo), own)
         self._probe_reads()
         self.stage(watchdog.disarm_all)
 

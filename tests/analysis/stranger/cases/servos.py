@@ -70,7 +70,7 @@ def output_left_at_a_tenth(story: Story) -> None:
     story.joint("left_shoulder")["simulation"] |= {"gravity": "0.7 Nm"}
     story.motion = story.swing(left_shoulder="0.75 + 0.3 * sin(1.7 * t)")
     story.never_overloads("left_shoulder")
-    set_before(story, "left_shoulder", torque_limit=110, goal_pwm=90)
+    set_before(story, "left_shoulder", max_torque=110, torque_limit=110, pwm_limit=90, goal_pwm=90)
     lags(story, "left_shoulder", 0.12, 1.6)
 
 
