@@ -117,13 +117,15 @@ KINDS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
 @pytest.mark.parametrize("kind", KINDS, ids=str)
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_servo_with_a_goal_in_its_mode_gets_that_and_no_other_does(kind, data):
+def test_a_servo_with_torque_and_a_goal_in_its_mode_gets_that_and_no_other_does(kind, data):
     model, protocol = kind
     writer = Writer(make_plan((1, 2, 3), model=model, protocol=protocol))
     servos = writer.plan.servos
     modes = [
         data.draw(st.sampled_from([one.mode for one in servo.modes] + [Mode.UNKNOWN])) for servo in servos
     ]
+    torqued = data.draw(st.sets(st.integers(0, 2)))
+    writer.include(torqued)
     ceiling = data.draw(st.lists(st.just(np.nan) | ODD.map(abs), min_size=3, max_size=3))
     writer.goals.values[:] = data.draw(
         st.lists(st.lists(ODD, min_size=3, max_size=3), min_size=4, max_size=4)
@@ -134,7 +136,11 @@ def test_a_servo_with_a_goal_in_its_mode_gets_that_and_no_other_does(kind, data)
     values = writer.goals.values.tolist()
     expected = []
     for one in writer.servos.goals.sync_writes:
-        rows = [at for at, row in enumerate(one.rows) if not math.isnan(values[one.lead][row])]
+        rows = [
+            at
+            for at, row in enumerate(one.rows)
+            if one.members[at] in torqued and not math.isnan(values[one.lead][row])
+        ]
         expected.append(
             {
                 one.ids[at]: block(
@@ -146,8 +152,10 @@ def test_a_servo_with_a_goal_in_its_mode_gets_that_and_no_other_does(kind, data)
     assert writer.sent() == [one for one in expected if one]
     assert {servo_id for one in expected for servo_id in one} == {
         servo.servo_id
-        for servo, mode in zip(servos, modes, strict=True)
-        if mode is not Mode.UNKNOWN and not math.isnan(values[LEADS.get(mode, 0)][servo.row])
+        for index, (servo, mode) in enumerate(zip(servos, modes, strict=True))
+        if index in torqued
+        and mode is not Mode.UNKNOWN
+        and not math.isnan(values[LEADS.get(mode, 0)][servo.row])
     }
 
 

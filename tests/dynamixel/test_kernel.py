@@ -221,6 +221,18 @@ def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
     assert rig.states.position.tolist() == before
 
 
+@pytest.mark.parametrize("step", [2.0, -2.0])
+def test_a_servo_that_jumps_is_not_believed_in_either_direction(step):
+    rig = start_rig(make_plan((1, 2)))
+    rig.cycles(8)
+    assert rig.hardware._by_kernel
+    before = rig.states.position.tolist()
+    turn_by_hand(rig.servo(2), rig.servo(2).position + step)
+    rig.hardware.read()
+    assert rig.states.valid.tolist() == [True, False]
+    assert rig.states.position.tolist() == before
+
+
 def test_line_that_is_gone_gets_no_second_packet_with_goals():
     plans, _ = fuzz.robot("two layouts", 1)
     side = fuzz.Side(plans)

@@ -212,6 +212,33 @@ def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(built, acts, t
     assert [goals(robot, servo)[-1][1] for servo in (3, 9)] == pytest.approx([ended, ended])
 
 
+def test_all_joints_of_a_group_lose_their_torque_with_one_of_its_servos(built, tmp_path):
+    robot = built(1.5, "policies: {groups: {neck: {joints: [pan, tilt], on_lost_servo: limp}}}\n")
+    pan, tilt, yaw = (robot.buses[0].servo(servo_id) for servo_id in (3, 7, 9))
+    had = []
+    robot.buses[0].at(GONE_NS, tilt.silence)
+    robot.buses[0].at(GONE_NS, lambda: had.extend((pan.torque_on, yaw.torque_on)))
+    robot.buses[0].at(GONE_NS + 500_000_000, lambda: had.extend((pan.torque_on, yaw.torque_on)))
+    assert robot.run().reason == "ended"
+    assert had == [True, True, False, True]
+    (told,) = [event.text for event in read_log(tmp_path / "run.mcap").events if "group" in event.text]
+    assert told == "group neck lost a servo: it gets no torque until a client requests it"
+
+
+def test_the_first_reason_to_end_a_run_decides_by_which_policy(built):
+    robot = built(
+        1.5,
+        "policies: {on_lost_servo: [{reduce_torque: 0.5, steps: 2, over: 100 ms}, hold], on_fault: limp,"
+        " groups: {neck: {joints: [tilt], on_lost_servo: stop}}}\n",
+    )
+    for servo_id in (3, 7):
+        robot.buses[0].at(GONE_NS, robot.buses[0].servo(servo_id).silence)
+    result = robot.run()
+    assert (result.reason, result.last) == ("fault", "hold")
+    assert result.detail.startswith("pan missed at least 3 replies in a row; on_lost_servo: ")
+    assert robot.buses[0].servo(9).torque_on
+
+
 MISSED, HEARD = False, True
 
 

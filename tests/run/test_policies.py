@@ -18,6 +18,7 @@ from tests.kit.wire import all_writes
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import StartUpError
+from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 
@@ -202,6 +203,18 @@ def check_pose(robot: VirtualRobot) -> None:
         assert max(steps) < math.radians(60) * (0.02 + LATE_S) + TICK
         assert robot.buses[0].servo(servo).position == pytest.approx(ticks * TICK, abs=0.1)
     assert goals(robot, 9)[-1][1] == goals(robot, 9)[0][1]
+
+
+def test_a_pose_after_a_pause_begins_slowly(built):
+    robot = built(on_exit="[{pose: home, speed: 180 deg/s}, limp]")
+    pause = Command(1, LOOP, "pause", b"", "anna")
+    robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(pause))
+    robot.buses[0].at(2_500_000_000, robot.stop.request)
+    assert robot.run().reason == "stopped"
+    sent = goals(robot, 3)
+    assert sent[-1][1] == HOME[3]
+    steps = [abs(after - now) * TICK for (_, now), (_, after) in itertools.pairwise(sent)]
+    assert max(steps) < SLOW_SPEED * 0.02 + TICK
 
 
 def test_the_end_of_a_run_is_an_exit(built):

@@ -77,6 +77,15 @@ def test_a_torn_sample_is_not_used(ends, place):
     assert reader.read() == 2
 
 
+def test_a_torn_sample_is_read_once_it_is_whole(ends):
+    writer, reader = ends
+    writer.write(1, np.ones(VALUES))
+    writer._places[1][-1] ^= np.uint64(1)
+    assert reader.read() is None
+    writer._places[1][-1] ^= np.uint64(1)
+    assert (reader.read(), reader.sample.tolist()) == (1, [1.0] * VALUES)
+
+
 def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch):
     writer, reader = ends
     seen = []
