@@ -15,6 +15,7 @@ from dxlrun.channels.cycle import Clamp
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
 from dxlrun.testing import VirtualRobot
 
@@ -211,6 +212,38 @@ def test_limits_are_read_again_when_another_servo_took_the_place_of_a_lost_one(
     texts = ["registers of its servo no longer limit goals" if "1023" in one else one for one in texts]
     assert len(told) == (1 if before == 1023 else 2)
     assert all(text in event for text, event in zip(reversed(texts), reversed(told), strict=False))
+
+
+def slow_robot(tmp_path: Path, raw: int) -> Path:
+    """Start a P servo, which refuses a Profile Velocity beyond its Velocity Limit, and move it."""
+    file = tmp_path / "robot.yaml"
+    limits = "limits: {position: [-10 deg, 10 deg], velocity: 1.5 rad/s}"
+    file.write_text(
+        ROBOT.format(model="PM42-010-S260", protocol=2.0, kind="position", reference=0, limits=limits)
+    )
+    story = {20: [send("c", "positions", 0.1)]}
+    return tell(
+        file,
+        story,
+        tmp_path / "run.mcap",
+        seconds=2.0,
+        before=lambda robot: robot.buses[0].servo(1).poke("velocity_limit", raw),
+    )
+
+
+@pytest.mark.parametrize("raw", [470, 120])
+def test_a_velocity_limit_below_the_first_speed_is_reported_and_no_refusal(raw, tmp_path):
+    """The start holds a servo with a goal whose speed is 0.5 rad/s, 477 ticks, at most."""
+    log = replayed(slow_robot(tmp_path, raw))
+    (text,) = (event.text for event in log.events if event.code == EventCode.SERVO_LIMITS)
+    assert f"goals of velocity are held to Velocity Limit (44) = {raw}, " in text
+    assert log.cycles["position"][-1, 0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_velocity_limit_with_which_no_goal_is_taken_is_named_with_what_helps(tmp_path):
+    with pytest.raises(StartUpError, match=r"its Velocity Limit \(44\) is 0: write 1 or more there\n"):
+        slow_robot(tmp_path, 0)
+    slow_robot(tmp_path, 1)
 
 
 def test_a_servo_that_returns_with_the_same_limits_is_no_second_event(tmp_path):

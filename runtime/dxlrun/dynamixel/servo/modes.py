@@ -9,7 +9,7 @@ Angle Limit (6, 8) and Torque Control Mode Enable (70).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import msgspec
 
@@ -22,7 +22,7 @@ from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.torque_limits import SILENT, limits_positions
 from dxlrun.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit
 from dxlrun.plan.loop_plan import LimitedInterface, ServoLimit
-from dxlrun.plan.transaction import Program
+from dxlrun.plan.transaction import Outcome, Program
 
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
@@ -133,10 +133,14 @@ def mode_now(one: Access) -> Program[Mode]:
     return Mode.UNKNOWN if found is None else mode_in(one.servo, found)
 
 
-def read_limits(one: Access) -> Program[dict[OwnLimit, int]]:
-    """Read the limits beyond which a servo refuses goals, ticks; what it does not answer is left out."""
+def read_limits(
+    one: Access, kinds: Collection[str] = ("speed", "effort", "pwm")
+) -> Program[dict[OwnLimit, int]]:
+    """Read the limits beyond which a servo refuses goals, ticks; unanswered ones are omitted."""
     found: dict[OwnLimit, int] = {}
     for limit in one.servo.own_limits:
+        if limit.of not in kinds:
+            continue
         reply = yield from one.read_bytes(limit.address, limit.size)
         if reply.answered:
             found[limit] = reply.word(limit.size)
@@ -182,7 +186,11 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
         unwound = servo.continuous and beyond * servo.rad_per_tick > FARTHEST_INWARD
         if beyond > 1 and (unwound or not inward):
             return Held(servo.outside_limits(present, mode.lower_tick, mode.upper_tick))
-    most_effort = 0
+    slow, most_effort, speed_limits = 0, 0, dict[OwnLimit, int]()
+    if mode.speed is not None and any(layout.position and layout.speed for layout in mode.goals):
+        speed_limits = yield from read_limits(one, ("speed",))
+        slow = round(ENGAGE_SPEED / mode.speed.per_tick)
+        slow = max(1, min(slow, mode.speed.most, *speed_limits.values()))
     if position is not None and len(mode.goals) > 1:
         most_effort, problem = yield from _most_effort(one, mode)
         if problem:
@@ -190,10 +198,13 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
     # the goal comes first: torque on a stale goal would move the joint
     data = b""
     for layout in mode.goals:
-        data = _resting(mode, layout, position, most_effort)
+        data = _resting(mode, layout, position, slow, most_effort)
         reply = yield from one.write_bytes(layout.address, data)
         if not reply.answered:
-            return Held(f"did not acknowledge its goal{one.reason(reply)}")
+            zero = [one.items[limit.name].title for limit, raw in speed_limits.items() if raw == 0]
+            refused = reply.outcome is Outcome.REFUSED
+            hint = f"; its {zero[0]} is 0: write 1 or more there" if zero and refused else ""
+            return Held(f"did not acknowledge its goal{one.reason(reply)}{hint}")
     reply = yield from one.write_bytes(servo.torque_address, b"\x01")
     if not reply.answered:
         return Held(f"did not acknowledge torque enable{one.reason(reply)}")
@@ -206,8 +217,8 @@ def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
 
     Where the goal is its Torque Limit, 0 shows a shutdown, which a goal would undo.
     """
-    limits = yield from read_limits(one)
-    most = next((value for limit, value in limits.items() if limit.of == "effort"), 0)
+    limits = yield from read_limits(one, ("effort",))
+    most = next(iter(limits.values()), 0)
     place = one.servo.torque_limit
     if place is None or not limits_positions(one.servo, mode):
         return most, ""
@@ -217,15 +228,14 @@ def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
     return most, "" if any(reply.parameters) else f"has {place.name} = 0: it shut itself down"
 
 
-def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effort: int) -> bytes:
-    """Return a block of goals that moves nothing: the present position with full effort, else 0."""
+def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, slow: int, most_effort: int) -> bytes:
+    """Return a block of goals that moves nothing: the present position, a slow speed, full effort; else 0."""
     block = bytearray(layout.length)
     goals: list[tuple[Field, int]] = []
     if layout.position is not None and position is not None:
         goals.append((layout.position, position))
-        if layout.speed is not None and mode.speed is not None:
-            slow = max(1, round(ENGAGE_SPEED / mode.speed.per_tick))
-            goals.append((layout.speed, min(slow, mode.speed.most)))
+        if layout.speed is not None and slow:
+            goals.append((layout.speed, slow))
     elif layout.effort is not None and mode.effort is not None:
         # the limit was read of the servo, whose answer may be anything
         goals.append((layout.effort, min(most_effort, mode.effort.most)))
