@@ -17,7 +17,7 @@ from dxlrun.channels.commands import data_of
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.channels.events import RUN_ENDED, EventCode, GoalReport
 from dxlrun.contract.controller import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel
-from dxlrun.control.controllers.goals import KEPT, Goals, GoalStatus
+from dxlrun.control.controllers.goals import KEPT, Commanded, Goals, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
@@ -344,7 +344,7 @@ def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcom
     record.states.torque[:], record.states.valid[:] = torque, True
     events = type("Events", (), {"emit": lambda self, *event: seen.append(event)})()
     joints = (JointPlan("j0", -1.0, 1.0, None),)
-    goal = Goals(record, events, joints, lambda controller: (("j0",), None)).accept("arm", "move", "anna")
+    goal = Goals(record, events, joints, lambda controller: Commanded(("j0",))).accept("arm", "move", "anna")
     goal.end(Outcome.MISSED, "", "j0", 0.2)
     assert goal.outcome == outcome
     assert ("j0 has no torque" in seen[-1][3]) is (outcome == "aborted")
@@ -482,6 +482,22 @@ def test_the_last_positions_of_a_played_motion_are_its_goal(story, asked, veloci
     assert (ended.status, ended.text) == (status, why)
     cycle = story.timed[-1][0]
     assert cycle == (2 if status == "reached" else 52), "it waits for a second"
+
+
+@pytest.mark.parametrize(("commanded", "outcome"), [(0.0, Outcome.REACHED), (0.03, Outcome.MISSED)])
+def test_joint_with_a_velocity_command_is_not_at_rest(commanded, outcome):
+    record = CycleRecord(CycleLayout(("j0",), ("arm",)))
+    record.states.torque[:], record.states.valid[:] = Torque.ON, True
+    record.states.position[:] = record.states.velocity[:] = 0.0
+    events = type("Events", (), {"emit": lambda self, *event: None})()
+    velocities = Commanded(("j0",), velocities=np.array([commanded]))
+    goals = Goals(record, events, (JointPlan("j0", -1.0, 1.0, None),), lambda controller: velocities)
+    goal = goals.accept("arm", "move", "anna")
+    goal.judge(np.array([np.nan]))
+    goals.time_ns = 2_000_000_000
+    goals.judge_running()
+    assert goal.outcome == outcome
+    assert ("j0 is left with a commanded velocity of 1.72 deg/s" in goal.text) == (commanded > 0)
 
 
 def test_a_goal_that_is_judged_is_cancelled_by_its_controller_and_the_runtime(story):

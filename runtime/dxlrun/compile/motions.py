@@ -30,6 +30,7 @@ from dxlrun.compile.samples import (
     QUANTITIES,
     Quantity,
     Sample,
+    SampledTarget,
     formula_samples,
     formula_texts,
     listed_samples,
@@ -94,6 +95,7 @@ def compile_motion(
         last_ns = part.start + lead_ns + samples[-1].t_ns
         if kind not in controller.offer.controller.Goals:
             last_ns = part.start + lead_ns + last_arrival_ns(samples, plans)
+            warn_of_last_velocities(samples, problems)
         goal = ScheduledGoal(last_ns, last_positions(controller.plan.joints, samples))
         commands = (structs.replace(commands[0], goal=goal), *commands[1:])
         end_ns = last_ns + _settle_ns(controller, plans)
@@ -300,14 +302,28 @@ def warn_of_turns(
             )
 
 
+def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> None:
+    """Warn of joints without a position that a motion leaves turning."""
+    last: dict[str, SampledTarget] = {}
+    for sample in samples:
+        last.update(sample.targets)
+    for joint, target in last.items():
+        if target.position is None and target.velocity:
+            problems.warning(
+                target.mark,
+                f"the motion leaves {joint} moving, so it never reaches its goal",
+                f"end with a velocity of 0 for {joint}",
+            )
+
+
 def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:
-    """Return where joints are left, rad or m, None where they name no position; empty: they name none."""
+    """Return where joints are left, rad or m; None where they name no position, but have to come to rest."""
     held: dict[str, float] = {}
     for sample in samples:
         for joint, target in sample.targets.items():
             if target.position is not None:
                 held[joint] = target.position
-    return tuple(held.get(joint) for joint in joints) if held else ()
+    return tuple(held.get(joint) for joint in joints)
 
 
 def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) -> int:

@@ -273,7 +273,7 @@ class ScheduledGoal(msgspec.Struct, frozen=True):
 
     end_ns: int  # End of the motion since the loop's first deadline; from then on the goal is judged
     positions: tuple[float | None, ...] = ()
-    """Goal of each joint of the controller, rad or m, None: it has none; empty: the goal has no positions"""
+    """Goal of each joint of the controller, rad or m, None: it has to be at rest; empty: not even that"""
 
 
 class ScheduledCommand(msgspec.Struct, frozen=True):

@@ -99,10 +99,22 @@ class PlayedMotion(msgspec.Struct):
             self.goal.feedback(min(1.0, passed_ns / end_ns) if end_ns > 0 else 0.0)
 
 
+class Commanded(NamedTuple):
+    """What a controller commands now, directly or through other controllers."""
+
+    joints: tuple[str, ...] = ()
+    positions: Floats | None = None
+    """rad or m, before any limit; None: it commands no positions"""
+    velocities: Floats | None = None
+    """rad/s or m/s; None: it commands no velocities, or as the speeds of its positions"""
+
+
 class _Target(NamedTuple):
-    """Where one joint of a goal was asked to be, and how near is near enough."""
+    """Goal position of one joint, with its tolerances."""
 
     joint: str
+    index: int
+    """Its place among the joints of the controller."""
     row: int
     position: float
     """As it was asked, before any limit, rad or m; NaN: no position."""
@@ -201,10 +213,9 @@ class Goals:
         record: CycleRecord,
         events: EventSink,
         joints: Sequence[JointPlan] = (),
-        commanded: Callable[[str], tuple[Sequence[str], Floats | None]] = lambda controller: ((), None),
+        commanded: Callable[[str], Commanded] = lambda controller: Commanded(),
     ) -> None:
-        """`joints` are the robot's. `commanded` returns by a controller's name the joints that it commands,
-        and the positions that it commands now; None: it commands none."""
+        """`joints` are the robot's. `commanded` returns what a controller commands now, by its name."""
         self.time_ns = 0
         """Controllers' time of this cycle, ns. Without pauses, so none shortens a settling time."""
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
@@ -251,7 +262,7 @@ class Goals:
 
     def commanded_positions(self, controller: str) -> Floats | None:
         """Return a copy of the positions that a controller commands now; None: it commands none."""
-        positions = self._commanded(controller)[1]
+        positions = self._commanded(controller).positions
         return None if positions is None else positions.copy()
 
     def begin_judging(
@@ -263,7 +274,7 @@ class Goals:
         text: str,
     ) -> None:
         """Judge a goal whose motion has ended, from this cycle on; see `controller.Goal.judge`."""
-        names, now_ns = self._commanded(goal.controller)[0], self.time_ns
+        names, now_ns = self._commanded(goal.controller).joints, self.time_ns
         settle_ns = None if tolerances is None else tolerances.settle_ns
         targets, longest_ns = [], 0
         for index, name in enumerate(names):
@@ -280,7 +291,7 @@ class Goals:
             slow = plan.highest_rest_speed if math.isnan(slow) else slow
             if positions is None:
                 slow = UNLIMITED
-            targets.append(_Target(name, row, position, near, slow, plan.linear))
+            targets.append(_Target(name, index, row, position, near, slow, plan.linear))
         settle_ns = longest_ns if settle_ns is None else settle_ns
         if tolerances is not None and tolerances.left_ns is not None:
             settle_ns = min(settle_ns, tolerances.left_ns)
@@ -303,7 +314,7 @@ class Goals:
             joint = targets[rows.index(found[0])].joint
             outcome, reason = Outcome.ABORTED, f"joint {joint} {found[1]}"
         else:
-            joint, error, reason = self._find_worst(targets)
+            joint, error, reason = self._find_worst(targets, self._commanded(goal.controller).velocities)
             if reason and now_ns < judgement.settled_ns:
                 return
             outcome = Outcome.MISSED if reason else Outcome.REACHED
@@ -313,22 +324,30 @@ class Goals:
             text = f"after {(now_ns - goal.accepted_ns) * 1e-9:.3f} s{', ' * bool(reason)}{reason}"
         self._close(goal, outcome, text, joint, error)
 
-    def _find_worst(self, targets: Sequence[_Target]) -> tuple[str, float, str]:
+    def _find_worst(self, targets: Sequence[_Target], velocities: Floats | None) -> tuple[str, float, str]:
         """Return the joint that is farthest off, its distance, and why the goal is not reached; empty: it is.
 
         A joint that is beyond its tolerance comes before one that moves, that before one that is near enough.
+        A joint that `velocities` command to move is not at rest, however slow it is.
         """
         states = self._record.states
         worst: tuple[int, float, str, float, str] = (0, -1.0, "", math.nan, "")
         for target in targets:
             error = abs(states.position.item(target.row) - target.position)
             speed = abs(states.velocity.item(target.row))
+            commanded = 0.0
+            if velocities is not None and math.isnan(target.position):  # else they hold the position
+                commanded = abs(velocities.item(target.index))
             rank, off, reason = 0, 0.0 if math.isnan(error) else error, ""
             if error > target.tolerance:
                 rank, reason = 2, f"joint {target.joint} is {distance_text(error, target.linear)} off"
             elif speed > target.rest_speed:
                 rank, off = 1, speed
                 reason = f"joint {target.joint} still moves at {distance_text(speed, target.linear)}/s"
+            elif commanded > 0 and target.rest_speed < UNLIMITED:
+                rank, off = 1, commanded
+                shown = f"{distance_text(commanded, target.linear)}/s"
+                reason = f"joint {target.joint} is left with a commanded velocity of {shown}"
             if (rank, off) > worst[:2]:
                 name = "" if math.isnan(error) and not reason else target.joint
                 worst = rank, off, name, error, reason
@@ -346,7 +365,7 @@ class Goals:
     ) -> None:
         """End a goal for its controller. A missed goal becomes aborted if a joint is lost or limp; the report
         names that joint."""
-        names = self._commanded(goal.controller)[0] if joints is None else joints
+        names = self._commanded(goal.controller).joints if joints is None else joints
         if outcome is Outcome.MISSED and names:
             rows = [self._joints[name][0] for name in names]
             if (found := self._record.states.unable(rows)) is not None:

@@ -28,7 +28,7 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.goals import RunningGoal
+from dxlrun.control.controllers.goals import Commanded, RunningGoal
 from dxlrun.control.controllers.graph import Plans
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
@@ -295,9 +295,12 @@ class Managed:
         return self._goal
 
     @property
-    def commanded_positions(self) -> Floats | None:
-        """Positions that it commands now, rad or m, before any limit; None: it commands none."""
-        return self._outputs.commands.position if "position" in self.plan.command else None
+    def commanded(self) -> Commanded:
+        """The joints that it commands, and what it commands now, before any limit."""
+        plan, commands = self.plan, self._outputs.commands
+        if "position" in plan.command:
+            return Commanded(plan.joints, positions=commands.position)
+        return Commanded(plan.joints, velocities=commands.velocity if "velocity" in plan.command else None)
 
     def adopt(self, goal: RunningGoal) -> None:
         """Have a goal that the runtime leads for it, by plain commands."""

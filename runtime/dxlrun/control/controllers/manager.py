@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
 from dxlrun.channels.commands import Command, CommandSink, NoCommands, TakenCommand
-from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord, Floats
+from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.kept import KeptStates
 from dxlrun.clock import Clock
 from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts, parted_couplings
-from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
+from dxlrun.control.controllers.goals import Commanded, Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import Plans, commander, update_order
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
@@ -398,12 +398,10 @@ class Manager:
             if motion.goal.outcome is not None:
                 del self._motions[name]
 
-    def _commanded(self, controller: str) -> tuple[tuple[str, ...], Floats | None]:
-        """Return the joints that a controller commands, directly or through others, and the positions that it
-        commands now; None: it commands none."""
+    def _commanded(self, controller: str) -> Commanded:
+        """Return the joints that a controller commands, directly or through others, with its commands."""
         managed = self._named[controller]
-        plan = managed.plan
-        return plan.joints if plan.command else (), managed.commanded_positions
+        return managed.commanded if managed.plan.command else Commanded()
 
     # Loading
 
