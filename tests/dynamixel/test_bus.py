@@ -51,6 +51,15 @@ def test_a_reply_in_two_pieces():
     ]
 
 
+def test_a_longer_reply_in_two_pieces_is_awaited_to_its_last_byte():
+    longer = protocol1.status_packet(7, 0, b"abcdefg")
+    line = ScriptedLine([], [(600_000, longer[:-1]), (690_000, longer[-1:])])
+    (lost, reply), _, _ = talk(line, LINE.read(7, 24, 6), LINE.read(7, 36, 6, spare=1))
+    assert lost.outcome is Outcome.TIMEOUT
+    assert line.written[-1] == protocol1.read(7, 36, 7), "a reply of 6 bytes is owed"
+    assert (reply.outcome, reply.parameters) == (Outcome.OK, b"abcdef")
+
+
 def test_silence():
     ((reply, after), _, _) = talk(line := ScriptedLine([], [(700_000, GOOD)]), READ, READ)
     assert reply.outcome is Outcome.TIMEOUT

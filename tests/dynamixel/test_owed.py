@@ -87,6 +87,14 @@ def test_write_repeated_later_invalidates_older_readings():
     assert owed.confuses(read, LEAST_WINDOW_NS + 2)
 
 
+def test_reading_from_before_a_write_is_no_answer_however_often_it_was_repeated():
+    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
+    owed.miss(read, 1)
+    owed.write(write, 2)
+    owed.miss(read, 3)
+    assert owed.confuses(read, 4)
+
+
 @pytest.mark.parametrize(("between", "confuses"), [(None, False), (ONE.writing(64, b"\1"), True)])
 def test_late_acknowledgement_counts_for_the_repetition_of_its_write(between, confuses):
     owed, write = Owed(), ONE.writing(64, b"\0")

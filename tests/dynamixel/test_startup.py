@@ -3,7 +3,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
+from tests.kit.line_faults import corrupt_next, delay_next, disturb_replies, truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
@@ -11,6 +11,8 @@ from dxlrun.dynamixel.servo.checks import _silence
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.simulation_plan import ServoConfig
+from dxlrun.simulation.bus.line import flipped
+from dxlrun.simulation.bus.simulated_bus import PacketFault
 
 
 def refusal(rig):
@@ -48,6 +50,14 @@ def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torqu
     assert torque == [False] * 8
     assert packets > 8  # all were inspected
     assert rig.torque() == [True] * 8
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_noise_in_one_reply_of_the_start_refuses_no_servo(number):
+    rig = make_rig(make_plan((1,)))
+    disturb_replies(rig.buses[0], 1, {number: PacketFault("noise", lambda reply: flipped(reply, -1, 1))})
+    rig.hardware.start()
+    assert rig.torque() == [True]
 
 
 def test_servos_that_are_all_silent_are_one_sentence_within_two_seconds():

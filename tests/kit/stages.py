@@ -33,9 +33,9 @@ class Goal(RunningGoal):
         self.judged = joints
         super().judge(positions, joints=joints, **more)
 
-    def end(self, outcome: Outcome, text: str = "", *more: Any) -> None:
+    def end(self, outcome: Outcome, text: str = "", *more: Any, **named: Any) -> None:
         assert self.outcome is None, f"ended twice: {self.outcome}, {outcome} {text}"
-        super().end(outcome, text, *more)
+        super().end(outcome, text, *more, **named)
 
     @property
     def ended(self) -> list[tuple[Outcome, str, str, float]]:

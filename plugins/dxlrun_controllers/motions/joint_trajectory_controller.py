@@ -394,11 +394,12 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._measure()
             row = int(self._error.argmax())
         after = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s{', ' * bool(text)}{text}"
-        goal.end(outcome, after, self.context.joints[row], float(self._error[row]), self._moved_joints())
+        joints = self._names_of(self._moved)
+        goal.end(outcome, after, self.context.joints[row], float(self._error[row]), joints)
 
-    def _moved_joints(self) -> list[str]:
+    def _names_of(self, moved: NDArray[np.bool_]) -> list[str]:
         joints = self.context.joints
-        return [joints[each] for each in np.flatnonzero(self._moved).tolist()]
+        return [joints[each] for each in np.flatnonzero(moved).tolist()]
 
     # In a cycle
 
@@ -478,13 +479,15 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             None if math.isnan(self._within.settle_s) else round(self._within.settle_s * 1e9),
             round(max(0.0, left_ns)) if math.isfinite(left_ns) else None,
         )
-        goal.judge(self._trajectory.end, joints=self._moved_joints(), tolerances=tolerances, text=text)
+        joints = self._names_of(self._moved)
+        goal.judge(self._trajectory.end, joints=joints, tolerances=tolerances, text=text)
 
     def _time_out(self, time_ns: int) -> None:
         text = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s, its time-out"
         if self._spliced is not None and self._goal is not None:
             # What is played is still the trajectory before: its end says nothing about this goal.
-            self._goal.end(Outcome.MISSED, f"{text}, before its start")
+            joints = self._names_of(self._spliced[-len(self._moved) :] != 0)
+            self._goal.end(Outcome.MISSED, f"{text}, before its start", joints=joints)
             self._goal = None
         self._hand_over(time_ns, text)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tests.kit.stages import Stage
 
 from dxlrun import Outcome
+from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.motions.joint_trajectory_controller import (
     CLOSING_SPEED,
     DECELERATION,
@@ -383,6 +384,16 @@ def test_a_splice_where_nothing_is_played_begins_at_once_and_one_that_is_too_fas
     assert told.startswith("joint a has 0.5 to go to the first point in 0.1 s, at 9.819 a second")
 
 
+def test_a_splice_after_the_end_of_the_one_before_is_waited_for_and_played():
+    robot = moving()
+    robot.update(0.2)
+    robot.send(0.2, "trajectory", points=one(-0.4, time=0.5), start_in=1.3, splice=True)
+    np.testing.assert_allclose(seen(robot, (1.0, 1.2, 1.49))[:, 0], 1.3)
+    assert outcomes(robot) == []
+    np.testing.assert_allclose(seen(robot, (1.5, 1.75, 2.0))[:, 0], [1.3, 0.45, -0.4])
+    assert robot.goal.ended[0][:2] == (Outcome.REACHED, "after 1.800 s")
+
+
 def test_a_cancel_before_its_start_ends_a_spliced_trajectory():
     robot = moving()
     robot.send(0.2, "trajectory", points=one(-1.0), start_in=0.5, splice=True)
@@ -578,6 +589,18 @@ def test_a_goal_that_times_out_before_its_splice_names_no_joint():
     seen(robot, (0.3, 0.5, 0.52))
     told = "after 0.320 s, its time-out, before its start"
     assert [end[:3] for end in robot.goal.ended] == [(Outcome.MISSED, told, "")]
+
+
+@pytest.mark.parametrize(
+    ("joints", "outcome"), [(["a"], Outcome.MISSED), (["b"], Outcome.ABORTED), (["a", "b"], Outcome.ABORTED)]
+)
+def test_a_goal_that_times_out_before_its_splice_is_aborted_only_for_its_own_limp_joints(joints, outcome):
+    robot = moving(TWO, to=(1.3, 0.0))
+    given = one(*[0.3] * len(joints))
+    robot.send(0.2, "trajectory", splice=True, start_in=0.6, timeout=0.3, joints=joints, points=given)
+    robot.states.torque[1] = Torque.RELEASED
+    seen(robot, (0.3, 0.5, 0.52))
+    assert outcomes(robot) == [outcome]
 
 
 def test_a_speed_off_the_path_is_named_with_the_desired_and_the_allowed_one():

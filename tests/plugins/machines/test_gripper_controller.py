@@ -153,6 +153,17 @@ def test_a_cancel_holds_and_ends_at_rest():
     assert goal.outcome is Outcome.CANCELLED
 
 
+def test_a_cancel_without_a_reply_ends_only_when_one_says_that_it_is_at_rest():
+    robot, goal = gripping()
+    robot.states.valid[0] = False  # the last velocity that came was 0
+    robot.cancel()
+    robot.steps(5)
+    assert goal.outcome is None
+    robot.states.valid[0] = True
+    robot.step()
+    assert goal.outcome is Outcome.CANCELLED
+
+
 def test_a_new_goal_takes_over():
     robot, goal = gripping()
     run(robot, 0.1)

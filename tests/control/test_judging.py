@@ -1,0 +1,98 @@
+"""Goals of several joints: each joint counts by its own tolerance, and only joints of the goal count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.contract.controller import GoalTolerances, Outcome
+from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.plan.loop_plan import JointPlan
+
+PERIOD_NS = 20_000_000
+NAN = np.nan
+
+
+@dataclass
+class Judged:
+    """Two joints at 0 rad, and the judge of their goals, cycle by cycle."""
+
+    settle_ns: tuple[int, int] = (1_000_000_000, 1_000_000_000)
+    events: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        plans = tuple(
+            JointPlan(name, -3.0, 3.0, None, settle_ns=settle_ns)
+            for name, settle_ns in zip(("a", "b"), self.settle_ns, strict=True)
+        )
+        self.record = CycleRecord(CycleLayout(("a", "b"), ("arm",)))
+        self.record.period_ns = PERIOD_NS
+        self.states = self.record.states
+        self.states.motion[:], self.states.valid[:], self.states.torque[:] = 0.0, True, Torque.ON
+        self.goals = Goals(self.record, self, plans, lambda controller: (("a", "b"), None))
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        self.events.append(text)
+
+    def accept(self) -> RunningGoal:
+        return self.goals.accept("arm", "move", "anna")
+
+    def cycles(self, count: int) -> None:
+        for _ in range(count):
+            self.goals.time_ns += PERIOD_NS
+            self.goals.judge_running()
+
+
+@pytest.mark.parametrize("slow", [0, 1])
+def test_a_goal_waits_for_the_joint_that_may_settle_longest(slow):
+    judged = Judged((2_000_000_000, 100_000_000) if slow == 0 else (100_000_000, 2_000_000_000))
+    goal = judged.accept()
+    judged.states.position[slow] = 0.5
+    goal.judge(np.zeros(2))
+    judged.cycles(50)
+    assert goal.outcome is None
+    judged.states.position[slow] = 0.0
+    judged.cycles(1)
+    assert goal.outcome is Outcome.REACHED
+
+
+@pytest.mark.parametrize(("tolerances", "outcome"), [((0.01, 0.5), "reached"), ((0.5, 0.01), "missed")])
+def test_a_joint_is_judged_by_its_own_tolerance_where_the_goal_moves_it_alone(tolerances, outcome):
+    judged = Judged()
+    goal = judged.accept()
+    judged.states.position[:] = 2.0, 0.1
+    within = GoalTolerances(np.array(tolerances), np.full(2, NAN), 0)
+    goal.judge(np.zeros(2), joints=["b"], tolerances=within)
+    assert (goal.outcome, goal.joint) == (outcome, "b")
+
+
+def test_a_lost_reply_at_the_end_of_a_motion_does_not_end_a_goal_without_settling_time():
+    judged = Judged((0, 0))
+    goal = judged.accept()
+    judged.states.valid[1] = False
+    goal.judge(np.zeros(2))
+    judged.cycles(1)
+    assert goal.outcome is None
+    judged.states.valid[1] = True
+    judged.cycles(1)
+    assert goal.outcome is Outcome.REACHED
+
+
+@pytest.mark.parametrize(
+    ("joints", "outcome", "text"),
+    [
+        (["a"], "missed", "goal 1 missed: too slow"),
+        (["a", "b"], "aborted", "goal 1 aborted: joint b has no torque: it was switched off; too slow"),
+        (None, "aborted", "goal 1 aborted: joint b has no torque: it was switched off; too slow"),
+    ],
+)
+def test_a_limp_joint_aborts_only_the_missed_goals_that_move_it(joints, outcome, text):
+    judged = Judged()
+    goal = judged.accept()
+    judged.states.torque[1] = Torque.RELEASED
+    goal.end(Outcome.MISSED, "too slow", "a", 0.2, joints)
+    assert (goal.outcome, judged.events[-1]) == (outcome, text)
