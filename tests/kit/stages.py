@@ -10,7 +10,7 @@ import numpy as np
 
 from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, ServoModel, States
 from dxlrun.channels.cycle import Torque
-from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
 
 
@@ -137,9 +137,8 @@ class Stage:
         self.states.valid[:], self.states.torque[:] = True, Torque.ON
         events = type("Events", (), {"emit": lambda self, *_: None})()
         plans = [JointPlan(joint, -np.inf, np.inf, None) for joint in joints]
-        commanded = joints if self.interfaces.command else ()
-        positions = self.commands.position if "position" in self.interfaces.command else None
-        self.judge = Goals(_Record(self), events, plans, lambda _: (commanded, positions))  # type: ignore[arg-type]  # of a record it reads states and times alone
+        commanded = Commanded.by_interfaces(joints, self.interfaces.command, self.commands)
+        self.judge = Goals(_Record(self), events, plans, lambda _: commanded)  # type: ignore[arg-type]  # of a record it reads states and times alone
         self.controller.on_configure(self.context)
 
     def _publish(self, topic: str = "", message: object = None) -> None:

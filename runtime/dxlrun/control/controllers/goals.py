@@ -8,14 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, Refusal
-from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord, Floats
+from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
@@ -107,6 +107,15 @@ class Commanded(NamedTuple):
     """rad or m, before any limit; None: it commands no positions"""
     velocities: Floats | None = None
     """rad/s or m/s; None: it commands no velocities, or as the speeds of its positions"""
+
+    @classmethod
+    def by_interfaces(cls, joints: tuple[str, ...], interfaces: Sequence[str], commands: Commands) -> Self:
+        """Return what `commands` are for joints whose command interfaces are these."""
+        if not interfaces:
+            return cls()
+        if "position" in interfaces:
+            return cls(joints, positions=commands.position)
+        return cls(joints, velocities=commands.velocity if "velocity" in interfaces else None)
 
 
 class _Target(NamedTuple):

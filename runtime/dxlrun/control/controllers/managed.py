@@ -297,10 +297,7 @@ class Managed:
     @property
     def commanded(self) -> Commanded:
         """The joints that it commands, and what it commands now, before any limit."""
-        plan, commands = self.plan, self._outputs.commands
-        if "position" in plan.command:
-            return Commanded(plan.joints, positions=commands.position)
-        return Commanded(plan.joints, velocities=commands.velocity if "velocity" in plan.command else None)
+        return Commanded.by_interfaces(self.plan.joints, self.plan.command, self._outputs.commands)
 
     def adopt(self, goal: RunningGoal) -> None:
         """Have a goal that the runtime leads for it, by plain commands."""

@@ -400,8 +400,7 @@ class Manager:
 
     def _commanded(self, controller: str) -> Commanded:
         """Return the joints that a controller commands, directly or through others, with its commands."""
-        managed = self._named[controller]
-        return managed.commanded if managed.plan.command else Commanded()
+        return self._named[controller].commanded
 
     # Loading
 
