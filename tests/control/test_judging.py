@@ -10,7 +10,7 @@ import pytest
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.contract.controller import GoalTolerances, Outcome
-from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
 
 PERIOD_NS = 20_000_000
@@ -33,7 +33,7 @@ class Judged:
         self.record.period_ns = PERIOD_NS
         self.states = self.record.states
         self.states.motion[:], self.states.valid[:], self.states.torque[:] = 0.0, True, Torque.ON
-        self.goals = Goals(self.record, self, plans, lambda controller: (("a", "b"), None))
+        self.goals = Goals(self.record, self, plans, lambda controller: Commanded(("a", "b")))
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         self.events.append(text)
