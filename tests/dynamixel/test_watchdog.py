@@ -127,6 +127,16 @@ class TestWhileOthersAreArmed:
         assert rig.states.position == pytest.approx(0.5, abs=0.01)
         assert len(rig.events.of(EventCode.WATCHDOG)) == stopped
 
+    def test_a_servo_alone_on_its_bus_is_not_stopped_by_its_own_lost_answers(self):
+        rig = make_rig(arm((11,)))
+        once_armed(rig, 11, lambda one: [truncate_next(rig.buses[0], one, 0) for _ in range(3)])
+        begin_ns = rig.clock.now_ns()
+        rig.hardware.start()
+        assert rig.clock.now_ns() - begin_ns > 10 * watchdog.UNIT_NS, "its answers are awaited for longer"
+        rig.cycles(100)
+        assert armed(rig) == [10]
+        assert rig.events.of(EventCode.WATCHDOG) == []
+
     def test_a_slow_adapter_stops_none(self):
         rig = make_rig(arm(range(11, 23)))
         for servo_id in range(11, 23):

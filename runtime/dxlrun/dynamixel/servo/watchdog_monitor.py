@@ -27,10 +27,12 @@ class WatchdogMonitor:
         """Arm every servo and read it back, at the end of the start-up.
 
         All of them at once, and once more before each is read: none is stopped because the others take long.
+        A servo that is revived is sent instructions all the time, so it is not stopped by that itself.
         """
         life, plan = self._life, self._life.plan
         self._words[ASKED_NS] = life.now_ns()
         packets = watchdog.to_all(plan, plan.servos, plan.watchdog_ticks)
+        alone = sum(watchdog.has_one(plan, servo) for servo in plan.servos) == 1
         for index, servo in enumerate(plan.servos):
             if not plan.watchdog_ticks or (item := watchdog.item_of(plan, servo)) is None:
                 continue
@@ -39,10 +41,12 @@ class WatchdogMonitor:
             for packet in packets:
                 yield one.line.unanswered(packet)
             back = yield one.reading(item.address, item.size)
-            if not (back.answered and back.word(item.size) == plan.watchdog_ticks) and (
-                problem := (yield from watchdog.revive(one))
-            ):
+            if back.answered and back.word(item.size) == plan.watchdog_ticks:
+                continue
+            if problem := (yield from watchdog.revive(one)):
                 found.problems.append(problem)
+            elif alone:
+                self._words[ASKED_NS] = life.now_ns()
 
     def sent(self, now_ns: int) -> None:
         """Record that the servos are sent something now; revive them if they were silent for too long."""
