@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from dxlrun import LIVE, AngularVelocity, Context, Controller, Duration, Floats, Interfaces
+from dxlrun import (
+    LIVE,
+    AngularVelocity,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Interfaces,
+    Mistake,
+)
 from dxlrun.messages import Header
 from dxlrun_controllers.joints import (
     JointsParameters,
@@ -44,11 +54,14 @@ class FeedForwardParameters(JointsParameters):
     voltage_filter: Duration = 2_000_000_000
     """Time constant of the filter on the measured supply; 0: none."""
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield references that are passed on although they are commanded."""
+        yield from super().mistakes()
         if self.pass_on and self.command_interface == "position":
-            raise ValueError("positions are commanded already; take pass_on out, or command effort or pwm")
-        return self
+            yield (
+                ("pass_on",),
+                "positions are commanded already; take pass_on out, or command effort or pwm",
+            )
 
 
 @dataclass(slots=True)

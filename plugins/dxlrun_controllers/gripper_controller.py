@@ -36,6 +36,7 @@ from dxlrun import (
     Length,
     LinearVelocity,
     Mismatch,
+    Mistake,
     Outcome,
     ParametersModel,
     RobotModel,
@@ -106,17 +107,18 @@ class GripperParameters(ParametersModel):
             found._lengths = frozenset(key for key, value in written if _is_length(value))
         return found
 
-    @model_validator(mode="after")
-    def _one_to_one(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield what keeps the widths from following from the angle."""
+        yield from super().mistakes()
         if len(self.widths) == 1:
-            raise ValueError("one width makes no line; write at least two, such as open and closed")
+            yield ("widths",), "one width makes no line; write at least two, such as open and closed"
+            return
         ordered = sorted(self.widths, key=lambda point: point.angle)
         steps = (
             np.diff([[point.angle, point.width] for point in ordered], axis=0) if ordered else np.ones((1, 2))
         )
         if (steps[:, 0] == 0).any() or not ((steps[:, 1] > 0).all() or (steps[:, 1] < 0).all()):
-            raise ValueError("widths must all grow, or all shrink, with the angle; each angle stands once")
-        return self
+            yield ("widths",), "widths must all grow, or all shrink, with the angle; each angle stands once"
 
 
 _OF_THE_WAY = ("speed", "tolerance", "stall_speed")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Final, Literal, Self, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
+from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter
 
-from dxlrun import Context, Floats, Goal, Outcome, ParametersModel, States
+from dxlrun import Context, Floats, Goal, Mistake, Outcome, ParametersModel, States
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -59,23 +59,31 @@ class JointsParameters(ParametersModel):
     joints: JointNames
     """The joints, in the order in which commands name them."""
 
-    @model_validator(mode="after")
-    def _known_joints(self) -> Self:
-        for name, values in _mappings(self, ""):
-            for joint in values:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield the keys of mappings, and the joints that wrap, that are not among the joints."""
+        yield from super().mistakes()
+        for path, names in _names_of_joints(self, ()):
+            for step, joint in names:
                 if joint not in self.joints:
-                    raise ValueError(
-                        f"{name} names {joint}, which is not one of its joints ({', '.join(self.joints)})"
-                    )
-        return self
+                    yield (*path, step), f"{joint} is {not_one_of(self.joints)}"
 
 
-def _mappings(model: BaseModel, prefix: str) -> Iterator[tuple[str, Mapping[str, object]]]:
+def not_one_of(joints: Sequence[str]) -> str:
+    """Return the end of a sentence about a joint that a controller does not have, and the remedy."""
+    return f"not one of its joints; they are {', '.join(joints)}"
+
+
+def _names_of_joints(
+    model: BaseModel, path: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], Iterable[tuple[str | int, str]]]]:
+    """Yield the paths of the keys that name joints, and the names with their steps below these."""
     for name, value in model:
         if isinstance(value, BaseModel):
-            yield from _mappings(value, f"{prefix}{name}.")
+            yield from _names_of_joints(value, (*path, name))
         elif isinstance(value, Mapping):
-            yield f"{prefix}{name}", value
+            yield (*path, name), ((joint, joint) for joint in value)
+        elif (*path, name) == ("wrap",):
+            yield (*path, name), enumerate(value)
 
 
 def row_of(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dxlrun import (
     LIVE,
@@ -18,6 +19,7 @@ from dxlrun import (
     Duration,
     Floats,
     Interfaces,
+    Mistake,
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
@@ -55,22 +57,25 @@ class LeaderFollowerParameters(ParametersModel):
     timeout: Annotated[Duration, Field(gt=0)] = 100_000_000
     """ns; a leader's state, or a command, that is older is not followed: the joints hold"""
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
-        led = [pair for pair in self.pairs if pair.leader]
-        if led and len(led) < len(self.pairs):
-            alone = next(pair.joint for pair in self.pairs if not pair.leader)
-            raise ValueError(f"{alone} has no leader, other joints have one; give it one, or none to all")
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield pairs without a leader beside others with one, and what is of leaders only."""
+        yield from super().mistakes()
+        led = {pair.leader for pair in self.pairs if pair.leader}
         if not led and self.command_interface == "posvel":
-            raise ValueError("posvel commands the speed of leaders; name them, or take `position`")
-        if not led and any(pair.scale != 1.0 or pair.offset for pair in self.pairs):
-            raise ValueError("scale and offset are for a leader; name it, or take them out")
-        if any(pair.scale == 0.0 for pair in self.pairs):
-            raise ValueError("a scale of 0 follows nothing; write another number, -1 for the other way")
-        own, led_joints = {pair.joint for pair in self.pairs}, {pair.leader for pair in led}
-        if both := sorted(own.intersection(led_joints)):
-            raise ValueError(f"{both[0]} is leader and follower; a joint is one of the two")
-        return self
+            what = "posvel commands the speed of leaders"
+            yield ("command_interface",), f"{what}; name them, or take `position`"
+        for index, pair in enumerate(self.pairs):
+            place = ("pairs", index)
+            if led and not pair.leader:
+                what = f"{pair.joint} has no leader, other joints have one"
+                yield place, f"{what}; give it one, or none to all"
+            if not led and (pair.scale != 1.0 or pair.offset):
+                yield place, "scale and offset are for a leader; name it, or take them out"
+            if pair.scale == 0.0:
+                what = "a scale of 0 follows nothing"
+                yield (*place, "scale"), f"{what}; write another number, -1 for the other way"
+            if pair.joint in led:
+                yield (*place, "joint"), f"{pair.joint} is leader and follower; a joint is one of the two"
 
 
 class LeaderFollower(Controller[LeaderFollowerParameters]):

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal, Self
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from dxlrun import CommandModel, Context, Controller, Duration, Floats, Interfaces
+from dxlrun import (
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Interfaces,
+    Mistake,
+)
 from dxlrun.messages import Header
 from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
 from dxlrun_controllers.joints import (
@@ -44,20 +53,14 @@ class PidParameters(JointsParameters):
 
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield references that the command interface or `wrap` does not fit."""
+        yield from super().mistakes()
         if self.reference == "velocity" and self.command_interface == "position":
-            raise ValueError(
-                "a velocity reference cannot be commanded as positions; command effort, velocity or pwm"
-            )
+            what = "a velocity reference cannot be commanded as positions"
+            yield ("command_interface",), f"{what}; command effort, velocity or pwm"
         if self.reference == "velocity" and self.wrap:
-            raise ValueError("velocities do not wrap; take wrap out, or take the reference position")
-        for joint in self.wrap:
-            if joint not in self.joints:
-                raise ValueError(
-                    f"wrap names {joint}, which is not one of its joints ({', '.join(self.joints)})"
-                )
-        return self
+            yield ("wrap",), "velocities do not wrap; take wrap out, or take the reference position"
 
 
 _KIND: Final = {"position": "positions", "velocity": "velocities"}

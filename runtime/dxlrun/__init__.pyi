@@ -24,6 +24,7 @@ from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
 from dxlrun.contract.sensor import Sensor as Sensor
 from dxlrun.contract.sensor import SensorContext as SensorContext
+from dxlrun.description.form import Mistake as Mistake
 from dxlrun.description.form import ParametersModel as ParametersModel
 from dxlrun.description.joints.motor import MotorLoad as MotorLoad
 from dxlrun.description.joints.motor import MotorModel as MotorModel

@@ -78,7 +78,7 @@ DAMAGES = [
     ("samples: 500", "samples: §1", "motions[1].samples is 1, but must be at least 2; write"),
     ("samples: 500", "samples: 500\n    §smaples: 500", "motions[1] has an unknown key 'smaples'; did you mean samples?"),
     ("controller: arm\n    duration: 30 s", "§controller: arm", "motions[1] has no duration; add `duration: 20 s`"),
-    ("duration: 30 s", "duration: §0 s", "motions[1].duration is the text '0 s', but must be greater than 0; write"),
+    ("duration: 30 s", "duration: §0 s", "motions[1].duration is 0 s, but must be greater than 0; write"),
     ("velocity: cos(t)", "velocity: §[t]", "motions[1].joints.elbow.velocity is a list, but must be text; write"),
     ("{position: 0}", "{position: §true}", "motions[1].joints.swing.position is true, but must be text; put"),
     ("swing: {position: 0}", "§swing: {velocity: 0}", "motions[1].joints.swing has no position; add"),

@@ -81,11 +81,11 @@ def test_every_uncertainty_can_be_written() -> None:
 
 
 MISTAKES = [
-    ("voltage: 12 V", "voltage: §0 V", "voltage is the text '0 V', but must be greater than 0; write for example `voltage: 12 V`"),
+    ("voltage: 12 V", "voltage: §0 V", "voltage is 0 V, but must be greater than 0; write for example `voltage: 12 V`"),
     ("voltage: 12 V", "voltage: §12", "voltage: 12 has no unit; write a voltage with its unit, such as 12 V"),
-    ("resistance: 3.5 ohm", "resistance: §-3.5 ohm", "resistance is the text '-3.5 ohm', but must be greater than 0; write for example `resistance: 3.6 ohm`"),
+    ("resistance: 3.5 ohm", "resistance: §-3.5 ohm", "resistance is -3.5 ohm, but must be greater than 0; write for example `resistance: 3.6 ohm`"),
     ("resistance: 3.5 ohm", "resistance: §3.5 Nm", "resistance: '3.5 Nm' has the unit Nm, which is not one of a resistance; write it as 3.6 ohm"),
-    ("friction: 0.1 Nm", "friction: §-0.1 Nm", "friction is the text '-0.1 Nm', but must be at least 0; write for example `friction: 0.1 Nm`"),
+    ("friction: 0.1 Nm", "friction: §-0.1 Nm", "friction is -0.1 Nm, but must be at least 0; write for example `friction: 0.1 Nm`"),
     ("load_friction: 0.08", "load_friction: §1", "load_friction is 1, but must be less than 1; write for example `load_friction: 0.08`"),
     ("p_gain: 32", "p_gain: §32.5", "p_gain is 32.5, but must be a whole number; write for example `p_gain: 32`"),
     ("delay: 1.5 ms", "delay: §1 s", "delay: no servo needs over 100 ms; check its unit: some milliseconds are usual"),

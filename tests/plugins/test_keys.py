@@ -133,9 +133,9 @@ def test_what_it_reads_and_provides(
 
 WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     "battery_state_broadcaster": (BATTERY, [
-        ({"stop": "10.8 V"}, "stop is below warn"),
+        ({"stop": "10.8 V"}, "stop is not below warn"),
         ({"voltages": []}, "at least 1 item"),
-        ({"voltages": ["power"]}, "power is no state: write OWNER/voltage"),
+        ({"voltages": ["power"]}, "power is not a state; write OWNER/voltage"),
         ({"warn": 10.8}, "warn"),
     ]),
     "diff_drive_controller": (BASE, [
@@ -155,7 +155,7 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     "feed_forward": (TWO, [
         ({"pass_on": True}, "positions are commanded already; take pass_on out"),
         ({"scale": 1.5}, "less than or equal to 1"),
-        ({"scale": {"c": 1.0}}, "scale names c, which is not one of its joints"),
+        ({"scale": {"c": 1.0}}, "c is not one of its joints"),
         ({"most": 0.0}, "greater than 0"),
         ({"friction_speed": "0 rad/s"}, "greater than 0"),
         ({"command_interface": "velocity"}, "position"),
@@ -188,25 +188,25 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     ]),
     "joint_limiter": (LIMITER, [
         ({"limits": {"acceleration": "0 rad/s^2"}}, "greater than 0"),
-        ({"limits": {"acceleration": "8 rad/s^2", "lower": {"c": "0 rad"}}}, "limits.lower names c"),
+        ({"limits": {"acceleration": "8 rad/s^2", "lower": {"c": "0 rad"}}}, "c is not one of its joints"),
     ]),
     "joint_trajectory_controller": (TWO, [
         (OF_EFFORT, "effort needs gains"),
         ({"gains": {"p": 1.0}}, "gains count only for velocity and effort"),
-        ({"tolerances": {"path": {"c": "1 deg"}}}, "tolerances.path names c"),
+        ({"tolerances": {"path": {"c": "1 deg"}}}, "c is not one of its joints"),
         ({"deceleration": "0 rad/s^2"}, "greater than 0"),
         ({"speed": -0.1}, "greater than or equal to 0"),
     ]),
     "keyframe_player": (WAVE, [
         (player(), "at least 1 item"),
         (player(w={"steps": []}), "at least 1 item"),
-        (player(w=page(STEP | {"pose": {"c": "1 rad"}})), "step 1 of motion w names c, not one of"),
-        (player(w=page(STEP | {"torque": {"c": 1.0}})), "names c"),
-        (player(w=page(next="x")), "w is followed by x, which is none of its motions"),
+        (player(w=page(STEP | {"pose": {"c": "1 rad"}})), "c is not one of its joints"),
+        (player(w=page(STEP | {"torque": {"c": 1.0}})), "c is not one of its joints"),
+        (player(w=page(next="x")), "there is no motion x; there are w"),
         (player(w=page(next="x"), x=page(next="w")), "in a circle: w -> x -> w"),
         (player(w=page(STEP | {"time": "1 ms"})), "greater than or equal"),
         (player(w=page(STEP | {"interpolation": "bezier"})), "smooth"),
-        ({"start": "flap"}, "start is flap, which is none of its motions"),
+        ({"start": "flap"}, "there is no motion flap"),
     ]),
     "leader_follower": (LED, [
         ({"pairs": []}, "at least 1 item"),
@@ -218,21 +218,21 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     ]),
     "pid_controller": (PID, [
         ({"gains": {"p": -1.0}}, "greater than or equal to 0"),
-        ({"gains": {"p": {"c": 1.0}}}, r"gains.p names c, which is not one of its joints \(a, b\)"),
-        ({"output_limit": {"c": 1.0}}, "output_limit names c"),
-        ({"wrap": ["c"]}, "wrap names c"),
+        ({"gains": {"p": {"c": 1.0}}}, "c is not one of its joints; they are a, b"),
+        ({"output_limit": {"c": 1.0}}, "c is not one of its joints"),
+        ({"wrap": ["c"]}, "c is not one of its joints"),
         (VELOCITY | {"wrap": ["a"]}, "velocities do not wrap"),
         (VELOCITY | OF_POSITION, "cannot be commanded as positions"),
         ({"gains": {"p": "3 Nm"}}, "valid number"),
     ]),
     "sample_player": (TWO, [
         ({"bounds": {"range": {"a": ["0.2 rad", "0.1 rad"]}}}, r"of a ends at 0\.1 rad, where it begins"),
-        ({"bounds": {"range": {"c": ["0.1 rad", "0.2 rad"]}}}, "c, which is not one of its joints"),
+        ({"bounds": {"range": {"c": ["0.1 rad", "0.2 rad"]}}}, "c is not one of its joints"),
     ]),
     "sensor_broadcaster": ({"message": "Range"}, [
         ({"fields": {"rang": "sonar/range"}}, "Range has no number rang; it has radiation_type"),
         ({"fields": {"range": 1.0}}, "name at least one state"),
-        ({"fields": {"range": "sonar"}}, "sonar is no state"),
+        ({"fields": {"range": "sonar"}}, "sonar is not a state"),
         ({"fields": {"radiation_type": "a/b"}}, "radiation_type of Range is a whole number"),
         ({"fields": {"radiation_type": 0.5, "range": "a/b"}}, "is a whole number"),
         ({"cells": {"a/b": ["1 mm", "1 mm"]}}, "cells make a WrenchStamped, not a Range"),
@@ -241,7 +241,7 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     ]),
     "thermal_governor": (TWO, [
         ({"hysteresis": -1}, "greater than or equal to 0"),
-        ({"limit": {"c": 60}}, "limit names c, which is not one of its joints"),
+        ({"limit": {"c": 60}}, "c is not one of its joints"),
         ({"reach": "0 deg"}, "greater than 0"),
         ({"command_interface": "velocity"}, "position"),
     ]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from enum import Enum, auto, unique
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from dxlrun import (
     Goal,
     GoalTolerances,
     Interfaces,
+    Mistake,
     Outcome,
     ParametersModel,
     SpeedPeak,
@@ -105,19 +106,14 @@ class TrajectoryParameters(JointsParameters):
 
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
-    @model_validator(mode="after")
-    def _gains_where_they_count(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield gains that are missing, or that count for nothing."""
+        yield from super().mistakes()
         tracks = self.command_interface in ("velocity", "effort")
         if tracks and self.gains is None:
-            raise ValueError(f"{self.command_interface} needs gains: add gains: {{p: ..., d: ...}}")
+            yield (), f"{self.command_interface} needs gains; add `gains: {{p: ..., d: ...}}`"
         if self.gains is not None and not tracks:
-            raise ValueError("gains count only for velocity and effort; take them out")
-        for joint in self.wrap:
-            if joint not in self.joints:
-                raise ValueError(
-                    f"wrap names {joint}, which is not one of its joints ({', '.join(self.joints)})"
-                )
-        return self
+            yield ("gains",), "gains count only for velocity and effort; take them out"
 
 
 @unique

@@ -9,11 +9,11 @@ cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dxlrun import (
     LIVE,
@@ -26,6 +26,7 @@ from dxlrun import (
     Goal,
     GoalTolerances,
     Interfaces,
+    Mistake,
     Outcome,
     ParametersModel,
     SpeedPeak,
@@ -38,6 +39,7 @@ from dxlrun_controllers.joints import (
     ends_unheard,
     finite_or,
     hold,
+    not_one_of,
     row_of,
     take_where_heard,
 )
@@ -113,28 +115,37 @@ class KeyframeParameters(ParametersModel):
     start: str | None = None
     """The motion that begins whenever the controller becomes active."""
 
-    @model_validator(mode="after")
-    def _known_names(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield names of motions and joints that there are not, and circles of motions."""
+        yield from super().mistakes()
+        known = f"there are {', '.join(self.motions)}"
         if self.start is not None and self.start not in self.motions:
-            raise ValueError(f"start is {self.start}, which is none of its motions")
+            yield ("start",), f"there is no motion {self.start}; {known}"
         for name, motion in self.motions.items():
-            for number, step in enumerate(motion.steps, 1):
-                if unknown := [joint for joint in (*step.pose, *step.torque) if joint not in self.joints]:
-                    of = f"step {number} of motion {name}"
-                    raise ValueError(
-                        f"{of} names {unknown[0]}, not one of its joints ({', '.join(self.joints)})"
-                    )
-            seen, after = [name], motion.next
-            while after is not None:
-                if after not in self.motions:
-                    raise ValueError(
-                        f"motion {seen[-1]} is followed by {after}, which is none of its motions"
-                    )
-                if after in seen:
-                    raise ValueError(f"motions follow each other in a circle: {' -> '.join([*seen, after])}")
-                seen.append(after)
+            for number, step in enumerate(motion.steps):
+                for key, named in (("pose", step.pose), ("torque", step.torque)):
+                    for joint in named:
+                        if joint not in self.joints:
+                            place = ("motions", name, "steps", number, key, joint)
+                            yield place, f"{joint} is {not_one_of(self.joints)}"
+            if motion.next is not None and motion.next not in self.motions:
+                yield ("motions", name, "next"), f"there is no motion {motion.next}; {known}"
+        for circle in self._circles():
+            way = " -> ".join((*circle, circle[0]))
+            yield ("motions", circle[0], "next"), f"motions follow each other in a circle: {way}; end it"
+
+    def _circles(self) -> Iterator[list[str]]:
+        """Yield the motions of each circle, from its first one in the file."""
+        done: set[str] = set()
+        for name in self.motions:
+            way: list[str] = []
+            after: str | None = name
+            while after in self.motions and after not in done:
+                way.append(after)
+                done.add(after)
                 after = self.motions[after].next
-        return self
+            if after in way:
+                yield way[way.index(after) :]
 
     def chain(self, name: str | None) -> Iterator[str]:
         """Yield a motion and those that follow it, by their names."""

@@ -5,12 +5,13 @@ For measurements: what is commanded is the table and nothing else, whatever the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import Enum, auto, unique
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dxlrun import (
     Angle,
@@ -22,6 +23,7 @@ from dxlrun import (
     Goal,
     GoalTolerances,
     Interfaces,
+    Mistake,
     Outcome,
     ParametersModel,
 )
@@ -63,14 +65,13 @@ class SampleParameters(JointsParameters):
     """What the rows command: one number a joint; of posvel the positions, and behind them the speeds."""
     bounds: Bounds = Bounds()
 
-    @model_validator(mode="after")
-    def _ranges_grow(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield the ranges whose ends are not in order."""
+        yield from super().mistakes()
         for joint, (lower, upper) in self.bounds.range.items():
             if not lower < upper:
-                raise ValueError(
-                    f"the range of {joint} ends at {upper:g} rad, where it begins at {lower:g} rad"
-                )
-        return self
+                what = f"the range of {joint} ends at {upper:g} rad, where it begins at {lower:g} rad"
+                yield ("bounds", "range", joint), f"{what}; write [lower, upper]"
 
     @property
     def width(self) -> int:

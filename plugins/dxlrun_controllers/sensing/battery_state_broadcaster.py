@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Self
+from collections.abc import Iterator
+from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from dxlrun import Context, Controller, Duration, Interfaces, ParametersModel, Voltage
+from dxlrun import (
+    Context,
+    Controller,
+    Duration,
+    Interfaces,
+    Mistake,
+    ParametersModel,
+    Voltage,
+)
 from dxlrun.messages import BatteryState, Header
 
 PUBLISH_NS = 1_000_000_000
@@ -39,14 +48,16 @@ class BatteryParameters(ParametersModel):
     frame: str = ""
     """Name of the frame in the messages."""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield voltages in the wrong order, and names that are not states."""
+        yield from super().mistakes()
         if self.stop >= self.warn:
-            raise ValueError("stop is below warn: the warning comes first")
-        for name in (*self.voltages, *(() if self.current is None else (self.current,))):
+            yield ("stop",), "stop is not below warn; the warning comes first"
+        if self.current is not None and "/" not in self.current:
+            yield ("current",), f"{self.current} is not a state; write OWNER/current"
+        for index, name in enumerate(self.voltages):
             if "/" not in name:
-                raise ValueError(f"{name} is no state: write OWNER/voltage")
-        return self
+                yield ("voltages", index), f"{name} is not a state; write OWNER/voltage"
 
 
 class BatteryStateBroadcaster(Controller[BatteryParameters]):

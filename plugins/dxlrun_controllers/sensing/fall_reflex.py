@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from dxlrun import Angle, Controller, Duration, Interfaces, ParametersModel
+from dxlrun import (
+    Angle,
+    Controller,
+    Duration,
+    Interfaces,
+    Mistake,
+    ParametersModel,
+)
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ORIENTATION
 
 Bounds = Annotated[tuple[Angle, ...], Field(min_length=2, max_length=2)]
@@ -34,12 +42,13 @@ class FallParameters(ParametersModel):
     on_silence: Literal["report", "activate"] = "report"
     """What becomes of an orientation that stays out so long: an event, or the controllers take over too."""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield the angles that are not around 0."""
+        yield from super().mistakes()
         for name, (lower, upper) in (("roll", self.roll), ("pitch", self.pitch)):
             if not lower < 0 < upper:
-                raise ValueError(f"{name} is from an angle below 0 to one above: [-45 deg, 45 deg]")
-        return self
+                what = f"{name} is from an angle below 0 to one above"
+                yield (name,), f"{what}; write for example [-45 deg, 45 deg]"
 
 
 class FallReflex(Controller[FallParameters]):

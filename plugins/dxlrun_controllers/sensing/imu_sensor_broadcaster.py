@@ -8,10 +8,11 @@ dependency for some 80 lines without a loop.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dxlrun import (
     LIVE,
@@ -22,6 +23,7 @@ from dxlrun import (
     Duration,
     Floats,
     Interfaces,
+    Mistake,
     ParametersModel,
 )
 from dxlrun.messages import Header, Imu
@@ -77,13 +79,15 @@ class ImuParameters(ParametersModel):
     """Link of the URDF in whose axes the measurements are."""
     covariance: ImuCovariance = ImuCovariance()
 
-    @model_validator(mode="after")
-    def _filtered(self) -> ImuParameters:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield keys that count only beside another one."""
+        yield from super().mistakes()
         if self.orientation != "madgwick" and (self.magnetometer is not None or self.rest is not None):
-            raise ValueError("magnetometer and rest are for orientation: madgwick")
+            key = "rest" if self.magnetometer is None else "magnetometer"
+            yield (key,), "magnetometer and rest are for orientation: madgwick; write that, or take them out"
         if self.declination and self.magnetometer is None:
-            raise ValueError("declination is of the magnetometer's north: name a magnetometer")
-        return self
+            what = "declination is the angle from the magnetometer's north"
+            yield ("declination",), f"{what}; name a magnetometer, or take it out"
 
 
 class ImuSensorBroadcaster(Controller[ImuParameters]):

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from operator import attrgetter
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from dxlrun import Context, Controller, Duration, Floats, Interfaces, Length, ParametersModel
+from dxlrun import (
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Interfaces,
+    Length,
+    Mistake,
+    ParametersModel,
+)
 from dxlrun.messages import (
     BatteryState,
     FluidPressure,
@@ -53,25 +62,29 @@ class SensorParameters(ParametersModel):
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
     """ns; with an older value nothing is published."""
 
-    @model_validator(mode="after")
-    def _known_fields(self) -> Self:
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield fields that the message does not have, and states that cannot be meant."""
+        yield from super().mistakes()
         if self.cells and self.message != "WrenchStamped":
-            raise ValueError(f"cells make a WrenchStamped, not a {self.message}")
+            yield ("cells",), f"cells make a WrenchStamped, not a {self.message}; take them out"
         kinds = _numbers(self.message)
         for path, value in self.fields.items():
             if path not in kinds:
-                raise ValueError(f"{self.message} has no number {path}; it has {', '.join(kinds)}")
-            if kinds[path] is int and not (isinstance(value, float) and value.is_integer()):
-                raise ValueError(f"{path} of {self.message} is a whole number")
+                yield ("fields", path), f"{self.message} has no number {path}; it has {', '.join(kinds)}"
+            elif kinds[path] is int and not (isinstance(value, float) and value.is_integer()):
+                yield ("fields", path), f"{path} of {self.message} is a whole number; write one"
         states = self.weights
         if not any(states.values()):
-            raise ValueError("fields (or cells) name at least one state")
-        for name in (name for weights in states.values() for name in weights):
-            if "/" not in name:
-                raise ValueError(f"{name} is no state: write OWNER/STATE, such as sonar/range")
-        if self.cells and (twice := [path for path in states if path in self.fields and path in _OF_CELLS]):
-            raise ValueError(f"{twice[0]} follows from the cells: leave it out of the fields")
-        return self
+            yield (), "fields (or cells) name at least one state; write such as {range: sonar/range}"
+        for path, weights in states.items():
+            for name in weights:
+                if "/" not in name:
+                    yield (
+                        ("fields", path),
+                        f"{name} is not a state; write OWNER/STATE, such as sonar/range",
+                    )
+            if self.cells and path in self.fields and path in _OF_CELLS:
+                yield ("fields", path), f"{path} follows from the cells; take it out of the fields"
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:

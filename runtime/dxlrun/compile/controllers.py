@@ -24,7 +24,7 @@ from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
-from dxlrun.description.problems import problems_of
+from dxlrun.description.problems import errors_between_keys, problems_of
 from dxlrun.description.reading import Description
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
@@ -293,8 +293,13 @@ def parameters_of(
     try:
         return model.model_validate(entries[name].parameters)
     except ValidationError as error:
-        beside = type(entries[name]).model_fields.keys() - {"parameters"}
-        file.extend(problems_of(error, file.marks, (f"{kind}s", name), model=model, beside=sorted(beside)))
+        prefix = (f"{kind}s", name)
+        beside = sorted(type(entries[name]).model_fields.keys() - {"parameters"})
+        file.extend(problems_of(error, file.marks, prefix, model=model, beside=beside))
+        between = errors_between_keys(entries[name].parameters, error, model)
+        if between is not None:
+            replaced = {(*prefix, *path) for path in between[1]}
+            file.extend(problems_of(between[0], file.marks, prefix, model=model, unknown=replaced))
     except Exception as error:  # a validator of the model is foreign code
         at_fault(file, kind, name, distribution, raised("check its parameters", error))
     return None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from types import EllipsisType
-from typing import Annotated, TypeVar, cast
+from typing import Annotated, Self, TypeVar, cast
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
@@ -83,7 +84,33 @@ class PlugInEntry(Form):
         return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
 
 
+Mistake = tuple[tuple[str | int, ...], str]
+"""A key's path below its model, such as `("motions", "walk", "next")`, and `what is wrong; how to fix it`."""
+
+
+class Mistakes(ValueError):
+    """All mistakes that a model found between its keys."""
+
+    def __init__(self, found: Sequence[Mistake]) -> None:
+        self.found = tuple(found)
+        super().__init__("\n".join(text for _, text in found))
+
+
 class ParametersModel(BaseModel):
     """Base of a controller's or a sensor's parameters: frozen, unknown keys refused, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield what is wrong between the keys: the path of a key, and `what is wrong; how to fix it`.
+
+        All of them are reported at once, each at its place in the robot file. Override it for checks of
+        several keys, and `yield from super().mistakes()` first.
+        """
+        yield from ()
+
+    @model_validator(mode="after")
+    def _refuse_mistakes(self) -> Self:
+        if found := [*self.mistakes()]:
+            raise Mistakes(found)
+        return self

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Set
+import copy
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from types import UnionType
-from typing import Annotated, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 from dxlrun.description.document import Grown, KeyPath, Marks, plain_value, text_of
+from dxlrun.description.form import Mistakes
+from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
 Form = TypeVar("Form", bound=BaseModel)
@@ -32,12 +35,25 @@ def problems_of(
     is below them are skipped. `most` of pydantic's errors are looked at, None: all.
     """
     found: dict[KeyPath, list[_Error]] = {}
-    for details in error.errors(include_url=False)[:most]:
+    for details in _each_of(error.errors(include_url=False)[:most]):
         one = _Error(details, marks, prefix, model, beside)
         if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
             found.setdefault(one.path, []).append(one)
     problems = [_merged(errors, marks) for errors in found.values()]
     return sorted(problems, key=lambda problem: problem.mark)
+
+
+def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
+    """Yield pydantic's errors, with one for each of the `Mistakes` of a model."""
+    for details in errors:
+        several = details.get("ctx", {}).get("error")
+        if not isinstance(several, Mistakes):
+            yield details
+            continue
+        for path, text in several.found:
+            what, _, fix = text.partition("; ")
+            context = {"what": what, "fix": fix}
+            yield {**details, "type": "dxlrun", "loc": (*details["loc"], *path), "ctx": context}
 
 
 def read_form(grown: Grown, model: type[Form]) -> Form:
@@ -50,6 +66,88 @@ def read_form(grown: Grown, model: type[Form]) -> Form:
     if form is None or problems:
         raise InputError(sorted(problems, key=lambda problem: problem.mark))
     return form
+
+
+_ROUNDS = 3
+"""Repairs that are tried; a repaired value may be refused for another reason."""
+
+
+def errors_between_keys(
+    data: Mapping[str, object], error: ValidationError, model: type[BaseModel]
+) -> tuple[ValidationError, frozenset[KeyPath]] | None:
+    """Return the errors that a model finds between keys once the refused values are replaced by good ones.
+
+    pydantic checks several keys together only where each of them is right by itself. The second part of the
+    result has the paths of the replaced values, about which nothing is to be said.
+
+    Args:
+        data: What the model refused.
+        error: The model's errors.
+        model: The model; its validators may be foreign code.
+
+    Returns:
+        None where there are no such errors, or a refused value cannot be replaced.
+    """
+    repaired, replaced = copy.deepcopy(dict(data)), set[KeyPath]()
+    for _ in range(_ROUNDS):
+        wrong = [each for each in error.errors(include_url=False) if not _is_between_keys(each)]
+        if not wrong:
+            return (error, frozenset(replaced)) if replaced else None
+        for one in (_Error(details, Marks("", {}, {}), model=model) for details in wrong):
+            if not one.meant:
+                continue
+            path = _repair(repaired, one)
+            if path is None:
+                return None
+            replaced.add(path)
+        try:
+            model.model_validate(repaired)
+        except ValidationError as further:
+            error = further
+        except Exception:  # a plug-in's validator; what it raised first is reported
+            return None
+        else:
+            return None
+    return None
+
+
+def _is_between_keys(details: ErrorDetails) -> bool:
+    return isinstance(details["input"], dict) and details["type"] in ("value_error", "dxlrun")
+
+
+def _repair(data: dict[str, object], error: _Error) -> KeyPath | None:
+    """Replace a refused value by a good one, or remove it where its key has a default; return its path."""
+    at: Any = data  # mappings and lists of a file
+    path: KeyPath = ()
+    *above, key = error.location or ("",)
+    for step in above:
+        if step in at if isinstance(at, dict) else isinstance(at, list):  # else it names a union's member
+            at, path = at[step], (*path, step)
+    if isinstance(at, dict) and (error.kind == "extra_forbidden" or _has_default(error)):
+        at.pop(key, None)
+    elif isinstance(at, dict | list) and (good := _good_value(error)) is not None:
+        at[key] = good
+    else:
+        return None
+    return (*path, key)
+
+
+def _has_default(error: _Error) -> bool:
+    owner = None if error.model is None else _follow(error.model, error.location[:-1])
+    info = None if owner is None else owner.model_fields.get(str(error.location[-1]))
+    return info is not None and not info.is_required()
+
+
+def _good_value(error: _Error) -> object:
+    """Return a value that a place takes: its bound, or the example of its quantity; None: none is known."""
+    bound = error.context.get("ge", error.context.get("le"))
+    if isinstance(bound, int | float):
+        units = error.units
+        unit = next(iter(units), "")
+        return f"{bound / units[unit]!r} {unit}" if units else bound
+    notes = () if error.model is None else _notes_at(error.model, error.location)
+    examples = (example_of(note) for note in notes)
+    return next((example for example in examples if example), None)
 
 
 def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
@@ -115,6 +213,12 @@ class _Error:
         """The example of the key's field; None: it has none."""
         return None if self.model is None else _example_at(self.model, self.location)
 
+    @property
+    def units(self) -> Mapping[str, float]:
+        """The units of the value's quantity, each with its size in what the field holds; empty: none."""
+        notes = () if self.model is None else _notes_at(self.model, self.location)
+        return next((units for units in map(units_of, notes) if units), {})
+
 
 def path_text(path: KeyPath) -> str:
     """Return a path as text: `joints.head.limits.position[1]`."""
@@ -140,7 +244,8 @@ def _merged(errors: list[_Error], marks: Marks) -> Problem:
     )
     if expected:
         origin = marks.origins.get(first.path)
-        given = shown(first.input) + (f" (argument {origin})" if origin else "")
+        given = str(first.input) if first.units and first.kind in _BOUNDS else shown(first.input)
+        given += f" (argument {origin})" if origin else ""
         return Problem(mark, f"{first.name} is {given}, but must be {' or '.join(expected)}", _remedy(first))
     what, fix = _sentence(first)
     if (origin := marks.origins.get(first.path)) is not None:
@@ -210,12 +315,14 @@ _REMEDIES: Mapping[str, str] = {
 def _expected(error: _Error) -> str | None:
     """Return what the value must be, for errors that need no other words."""
     if error.kind in _BOUNDS:
-        plain = {key: _bound(value) for key, value in error.context.items()}
+        plain = {key: _bound(value, error) for key, value in error.context.items()}
         return _BOUNDS[error.kind].format(**plain)
     return _TYPES.get(error.kind)
 
 
-def _bound(value: object) -> str:
+def _bound(value: object, error: _Error) -> str:
+    if isinstance(value, int | float) and (units := error.units):
+        return bound_text(value, units, error.input)
     return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
 
 
@@ -330,11 +437,27 @@ def keys_at(
 
 def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
     """Return the model at a location; steps that name a union's member choose it."""
+    at = _without_none(_annotation_at(model, location))
+    return at if isinstance(at, type) and issubclass(at, BaseModel) else None
+
+
+def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> object:
+    """Return the type of the value at a location, as it is annotated."""
     at: object = model
     for step in location:
         at = _inner(at, step)
-    at = _without_none(at)
-    return at if isinstance(at, type) and issubclass(at, BaseModel) else None
+    return at
+
+
+def _notes_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Iterator[object]:
+    """Yield the parts of the `Annotated` type of the value at a location."""
+    at = _annotation_at(model, location)
+    while get_origin(at) in (Annotated, Union, UnionType):
+        if get_origin(at) is Annotated:
+            at, *notes = get_args(at)
+            yield from notes
+        else:
+            at = next(arm for arm in get_args(at) if arm is not type(None))
 
 
 def _inner(at: object, step: str | int) -> object:
@@ -343,7 +466,9 @@ def _inner(at: object, step: str | int) -> object:
         return next((arm for arm in get_args(at) if step in _names(arm)), None)
     if isinstance(at, type) and issubclass(at, BaseModel):
         info = at.model_fields.get(str(step))
-        return None if info is None else info.annotation
+        if info is None:
+            return None
+        return Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
     arguments = get_args(at)
     if get_origin(at) is dict:
         return arguments[1]

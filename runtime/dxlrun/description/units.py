@@ -107,7 +107,7 @@ class Quantity:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Return the schema of a file in which it is written."""
-        text = text_schema(self.examples.split(",")[0].split(" or ")[0], self.units)
+        text = text_schema(example_of(self), self.units)
         return {"anyOf": [handler(schema), text]} if self._bare else text
 
 
@@ -306,6 +306,38 @@ def split(
     if unit not in units:
         raise refuse(f"{text!r} has the unit {unit}, which is not one of {what}", f"write it as {written}")
     return number, unit
+
+
+def units_of(note: object) -> Mapping[str, float]:
+    """Return the units of a field's quantity, each with its size in what the field holds; empty: none.
+
+    Args:
+        note: Part of the field's `Annotated` type.
+    """
+    if isinstance(note, Quantity):
+        return note.units
+    return _DURATION_NS if isinstance(note, BeforeValidator) and note.func is duration else {}
+
+
+def example_of(note: object) -> str:
+    """Return how a field's quantity is written, for example; empty: it is none. `note` as in `units_of`."""
+    if isinstance(note, Quantity):
+        return note.examples.split(",")[0].split(" or ")[0]
+    return "1 s" if units_of(note) else ""
+
+
+def bound_text(bound: float, units: Mapping[str, float], written: object) -> str:
+    """Return a bound of a quantity in the unit of a written value: of 10_000_000 ns beside `5 ms`, `10 ms`.
+
+    Args:
+        bound: In what the field holds: SI, or ns.
+        units: See `units_of`.
+        written: The value as the file has it; where it has no unit, neither has the bound.
+    """
+    match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
+    if match is None or match[2] not in units or not bound:
+        return f"{bound:g}"
+    return f"{bound / units[match[2]]:g} {match[2]}"
 
 
 def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
