@@ -24,7 +24,6 @@ from dxlrun.errors import ProcessFault
 from dxlrun.log.reader import read_log
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation.bus.ledger import read_ledger
@@ -37,6 +36,7 @@ ALLOWED = 0.001
 _STEP = 0.95
 _COMFORT = 0.98
 _INTERRUPTED = 130
+_LEDGER = "ledger.jsonl"
 
 Run = Callable[[Plan], Path]
 """Runs a plan and returns its log; the ledger of simulated buses lies beside it."""
@@ -98,9 +98,10 @@ def runs_to_discard() -> Iterator[Run]:
     with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder:
 
         def run(plan: Plan) -> Path:
-            summary = run_robot(
-                replace(plan, recording=RecordingPlan(folder)), RunOptions(gateway=False), Console(quiet=True)
-            )
+            ledger = Path(folder, _LEDGER)
+            ledger.unlink(missing_ok=True)
+            options = RunOptions(gateway=False, ledger=ledger)
+            summary = run_robot(replace(plan, recording=RecordingPlan(folder)), options, Console(quiet=True))
             if summary.exit_code == _INTERRUPTED:
                 raise KeyboardInterrupt
             if summary.exit_code or summary.log is None:
@@ -123,7 +124,7 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
         )
     cycle_us = (log.cycles["written_ns"] - log.cycles["scheduled_ns"]).astype(float) / 1e3
     overruns = int((log.cycles["skipped"] > 0).sum())
-    ledger, simulated = ledger_of(path), 0
+    ledger, simulated = path.with_name(_LEDGER), 0
     if overruns and ledger.is_file():
         simulated = min(overruns, overruns_by_servos(log, read_ledger(ledger)))
     return Tried(

@@ -30,7 +30,7 @@ def loop_of(directory: Path) -> int:
     """Return the process ID of the loop whose log lies in `directory`, once it has sent goals."""
     for _ in range(3000):
         time.sleep(0.01)
-        paths = list(directory.glob("logs/*.ledger.jsonl"))
+        paths = list(directory.glob("*.ledger.jsonl"))
         if not paths or not any(entry.data[4:5] == b"\x83" for entry in read_ledger(paths[0])):
             continue
         for path in Path("/proc").glob("[0-9]*"):
@@ -48,14 +48,17 @@ def measure(number: signal.Signals, chance: random.Random) -> float:
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name).resolve()
         run = subprocess.Popen(
-            [DXLRUN, TORSO], cwd=directory, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [DXLRUN, TORSO, "--ledger", "seen.ledger.jsonl"],
+            cwd=directory,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         loop = loop_of(directory)
         time.sleep(chance.uniform(0.0, 0.1))
         os.kill(loop, number)
         if run.wait(30) != 1:
             raise SystemExit(f"exit code {run.returncode} instead of 1")
-        ledger = read_ledger(next(directory.glob("logs/*.ledger.jsonl")))
+        ledger = read_ledger(next(directory.glob("*.ledger.jsonl")))
         sent = [entry for entry in ledger if entry.direction == "in"]
         first = next(index for index, entry in enumerate(sent) if entry.data.startswith(LIMP))
         if any(entry.data[4:5] == b"\x83" for entry in sent[first:]):

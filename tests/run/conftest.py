@@ -82,6 +82,8 @@ class Running:
     directory: Path
     mark: str
     """In the environment of every process of this run, also of those whose parent is dead."""
+    seen: Path
+    """What the simulated buses saw."""
 
     def processes(self) -> dict[str, int]:
         """Return the process IDs that live, by module; "dxlrun" is the terminal's."""
@@ -108,8 +110,7 @@ class Running:
         return next(iter((self.directory / "logs").glob(pattern)), None)
 
     def ledger(self) -> tuple[LedgerEntry, ...]:
-        path = self.one("*.ledger.jsonl")
-        return read_ledger(path) if path else ()
+        return read_ledger(self.seen) if self.seen.exists() else ()
 
     def log(self) -> Log:
         path = self.one("*.mcap")
@@ -161,6 +162,9 @@ def start(tmp_path):
         environment |= dict([mark.split("=")])
         command = [*before, str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
         command += [] if gateway else ["--no-gateway"]
+        ledger = tmp_path / f"{len(started)}.ledger.jsonl"
+        if not any(str(argument).startswith(("port:=", "--virtual", "--ledger")) for argument in arguments):
+            command += ["--ledger", str(ledger)]
         close = f"exec >&- 2>&- <&-; exec {shlex.join(command)}"
         process = subprocess.Popen(
             ["/bin/sh", "-c", close] if closed else command,
@@ -170,7 +174,7 @@ def start(tmp_path):
             stdout=output,
             stderr=output,
         )
-        started.append(Running(process, tmp_path, mark))
+        started.append(Running(process, tmp_path, mark, ledger))
         return started[-1]
 
     yield begin

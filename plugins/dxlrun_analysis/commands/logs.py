@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from rich.prompt import Confirm
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag
 from dxlrun.errors import InputError, counted, missing_extra
 from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
@@ -32,6 +34,8 @@ def logs(
     where: Text = None,
     sort: Text = None,
     sql: Text = None,
+    prune: Flag = False,
+    keep: Text = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
@@ -51,7 +55,15 @@ def logs(
         Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
     sql
         Instead of both: a whole SELECT over the table logs.
+    prune
+        Show the oldest logs of runs in the directory beyond --keep, and delete them if the answer is yes.
+    keep
+        How much of the newest logs --prune leaves, such as 10GB.
     """
+    if prune or keep is not None:
+        if not prune or keep is None or (where, sort, sql) != (None, None, None):
+            raise InputError("--prune and --keep belong together, without others: --prune --keep 10GB")
+        return _prune(Path(directory), keep, as_json=as_json)
     _check(directory, where, sort, sql)
     from dxlrun_analysis.season import query, runs
 
@@ -113,6 +125,50 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     uploaded = counted(len(result.uploaded), "log was", "logs were")
     show(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there")
     return 1 if result.others else 0
+
+
+def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
+    """Show which logs are beyond a size, and delete them if the answer is yes."""
+    from rich.filesize import decimal
+
+    from dxlrun.description.units import size
+    from dxlrun.log.stored import delete, oldest_beyond, stored_logs
+
+    if not directory.is_dir():
+        raise InputError(f"there is no directory {directory}; runs leave their logs in logs")
+    try:
+        keep_bytes = size(keep)
+    except ValueError as error:
+        raise InputError(f"--keep {keep}: {error}") from None
+    logs, oldest = stored_logs(directory), oldest_beyond(directory, keep_bytes)
+    names = [str(one.path) for one in oldest]
+    freed, whole = sum(one.bytes for one in oldest), sum(one.bytes for one in logs)
+    if as_json:  # a program deletes by itself what it is told
+        show_json({"directory": str(directory), "bytes": whole, "oldest": names, "oldest_bytes": freed})
+        return 0
+    them = counted(len(logs), "log", "logs")
+    if not oldest:
+        show(f"{directory} has {them}, {decimal(whole)}: nothing to delete")
+        return 0
+    columns = [Column("the oldest", "name"), Column("last written", "name"), Column("size", "name")]
+    rows = [
+        (one.path.name, f"{datetime.fromtimestamp(one.changed_s):%Y-%m-%d %H:%M}", decimal(one.bytes))
+        for one in oldest
+    ]
+    show(Table.of("", columns, rows), f"{directory} has {them}, {decimal(whole)}")
+    if not sys.stdin.isatty():
+        raise InputError("they are deleted when somebody says yes at a terminal; nothing was deleted")
+    question = f"Delete {counted(len(oldest), 'log', 'logs')}, {decimal(freed)}?"
+    if not Confirm.ask(question, default=False):
+        show("nothing was deleted")
+        return 0
+    for one in oldest:
+        try:
+            delete(one)
+        except OSError as error:
+            raise InputError(f"{one.path} cannot be deleted: {error.strerror or error}") from None
+    show(f"deleted {counted(len(oldest), 'log', 'logs')}, {decimal(freed)}")
+    return 0
 
 
 def _found(place: str) -> Folder | Store:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import msgspec
 from rich.console import Console
@@ -14,7 +15,6 @@ from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_log import ledger_of
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation.bus.ledger import read_ledger
@@ -69,13 +69,14 @@ def run_experiment(
 
 
 def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, console: Console) -> None:
-    with stress:
-        summary = run_robot(setup.plan(plan), RunOptions(gateway=False), console)
+    with stress, TemporaryDirectory(prefix="dxlrun-experiment-") as folder:
+        path = Path(folder, "ledger.jsonl")
+        summary = run_robot(setup.plan(plan), RunOptions(gateway=False, ledger=path), console)
         remarks = stress.ended()
+        ledger = read_ledger(path) if path.is_file() else None
     experiment.interrupted = summary.exit_code == _INTERRUPTED
     if summary.log is not None:
-        log, path = read_log(summary.log), ledger_of(Path(summary.log))
-        ledger = read_ledger(path) if path.is_file() else None
+        log = read_log(summary.log)
         found = measure(log, setup, experiment.motion, ledger, (*_refused(log), *remarks))
         if found is not None:
             experiment.measured.append(found)

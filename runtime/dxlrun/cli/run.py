@@ -23,11 +23,14 @@ from dxlrun.output.unblocked import unblocked
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from dxlrun.plan.recording_plan import RecordingPlan
     from dxlrun.plan.robot_plan import Plan
     from dxlrun.run.run_summary import RunSummary
 
 
 _WORDS = {0: "done", 130: "interrupted"}
+_MOST_DELETED = 5
+"""Logs that are named one by one."""
 
 
 @unblocked()
@@ -154,7 +157,46 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     lines = [f"{robot}: {_WORDS.get(verdict.exit_code, 'failed')}: {verdict.line}"]
     lines += [f"  {sentence}" for sentence in verdict.sentences]
     if summary.log is not None:
-        lines.append(f"log: {summary.log} ({counted(summary.messages, 'message', 'messages')})")
+        lines.append(_log_line(Path(summary.log), summary.messages))
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)
+        lines += _disk_lines(Path(summary.log), plan.recording)
     show(*lines, console=console)
     return verdict.exit_code
+
+
+def _log_line(log: Path, messages: int) -> str:
+    from rich.filesize import decimal
+
+    from dxlrun.log.stored import bytes_of
+
+    size = bytes_of(log)
+    return f"log: {log} ({counted(messages, 'message', 'messages')}{f', {decimal(size)}' if size else ''})"
+
+
+def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
+    """Delete the oldest logs if the robot file says so; return what was done, or how much there is."""
+    from rich.filesize import decimal
+
+    from dxlrun.log.stored import MUCH_BYTES, delete, oldest_beyond, stored_logs
+
+    folder = log.parent
+    if recording.keep_bytes is None:
+        size = sum(one.bytes for one in stored_logs(folder))
+        if size <= MUCH_BYTES:
+            return []
+        command = (
+            f"dxlrun logs {folder} --prune --keep {decimal(MUCH_BYTES).replace(' ', '').replace('.0', '')}"
+        )
+        return [f"the logs in {folder} have {decimal(size)}; `{command}` shows the oldest, and asks"]
+    lines, deleted = [], 0
+    for one in oldest_beyond(folder, recording.keep_bytes, [log]):
+        try:
+            delete(one)
+        except OSError as error:
+            lines.append(f"{one.path} is kept: {error.strerror or error}")
+        else:
+            deleted += 1
+            lines.append(f"deleted {one.path} ({decimal(one.bytes)}): recording.keep")
+    if len(lines) > _MOST_DELETED:
+        lines = [f"deleted the {counted(deleted, 'oldest log', 'oldest logs')} in {folder}: recording.keep"]
+    return lines

@@ -1,4 +1,4 @@
-"""Recording: how the log is split, and how long its parts are kept."""
+"""Recording: how the log is split, and how long it is kept."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ def compile_recording(file: RobotFile) -> RecordingPlan:
             "parts of a log would be too small: each has the robot file and the plan inside",
             "write 1 MB or 1 s at least",
         )
-    if written.keep is not None and written.split is None:
+    kept = {} if written.keep is None else dict([written.keep])
+    if "ns" in kept and written.split is None:
         file.error(
             marks.key("recording", "keep"),
             "keep needs parts: a log in one file is kept whole",
-            "write `split: 1 min` beside it, or take keep out",
+            "write `split: 1 min` beside it, or a size, or take keep out",
         )
-    return RecordingPlan(written.directory, amount.get("bytes"), amount.get("ns"), written.keep)
+    return RecordingPlan(
+        written.directory, amount.get("bytes"), amount.get("ns"), kept.get("ns"), kept.get("bytes")
+    )

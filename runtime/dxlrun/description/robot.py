@@ -213,8 +213,11 @@ class Recording(Form):
     split: SizeOrDuration | None = key(
         "Size or duration, 1 MB or 1 s at least, after which a log goes on in another file.", "100 MB", None
     )
-    keep: Duration | None = key(
-        "Files whose newest record is older are deleted while the run goes on; needs split.", "10 min", None
+    keep: SizeOrDuration | None = key(
+        "A size: a run deletes the oldest logs in the directory beyond it at its end. A duration (needs "
+        "split): files whose newest record is older are deleted while the run goes on.",
+        "10 GB",
+        None,
     )
 
 

@@ -434,6 +434,12 @@ Polling = Annotated[
 """ns as Duration, or the word `auto`; `off` is 0."""
 
 
+def size(text: str) -> int:
+    """Return bytes from `100 MB`, `10GB` or `64 MiB`; raises ValueError with an example."""
+    number, unit = split(text, "a size", _SIZE_BYTES, "10 GB")
+    return round(Fraction(number) * _SIZE_BYTES[unit])
+
+
 def _part(value: object) -> object:
     if isinstance(value, tuple):  # as it was read before
         return value

@@ -17,6 +17,8 @@ class RecordingPlan(msgspec.Struct, frozen=True):
     split_ns: int | None = None  # A part that is so old ends
     keep_ns: int | None = None
     """A part whose newest record is older than this is deleted; None: every part is kept."""
+    keep_bytes: int | None = None
+    """At the end of a run the oldest logs of the directory beyond this are deleted; None: all are kept."""
 
     @property
     def in_parts(self) -> bool:

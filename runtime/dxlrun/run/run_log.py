@@ -126,11 +126,6 @@ def new_log(recording: RecordingPlan, robot: str) -> Path:
             return path
 
 
-def ledger_of(log: Path) -> Path:
-    """Return where the simulated buses leave their ledger."""
-    return log.with_name(f"{log.name.removesuffix('.mcap')}.ledger.jsonl")
-
-
 def discard_log(log: Path) -> None:
     """Remove the log of a run that never came to the robot."""
     if log.is_dir():
@@ -140,7 +135,6 @@ def discard_log(log: Path) -> None:
             log.rmdir()
     else:
         log.unlink(missing_ok=True)
-    ledger_of(log).unlink(missing_ok=True)
 
 
 def incomplete_log(error: str) -> str:

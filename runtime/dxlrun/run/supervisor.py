@@ -47,7 +47,7 @@ from dxlrun.run import sensor_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
-from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
+from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
@@ -190,13 +190,11 @@ class _Run:
 
     def start(self) -> Child[GuardianMessage]:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
-        ledger = self.options.ledger
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
-            ledger = ledger or ledger_of(self.log)
         ports: dict[str, str] = {}
         if self.plan.simulated:
-            self.simulation, ports = start_simulated_buses(self.plan, ledger, self.memory)
+            self.simulation, ports = start_simulated_buses(self.plan, self.options.ledger, self.memory)
         for index in range(len(self.plan.loop.sensors)):
             sensor = start_sensor(self.plan, index, self.memory)
             self.sensors.append(_SensorProcess(self.plan, index, self.memory, sensor))

@@ -1,0 +1,130 @@
+"""The disk that logs take: what a run says of it at its end and deletes if told to; `logs --prune`."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.prompt import Confirm
+
+from dxlrun.cli import main
+from dxlrun.cli import run as cli_run
+from dxlrun.cli.run import _disk_lines
+from dxlrun.log import stored
+from dxlrun.plan.recording_plan import RecordingPlan
+
+ROBOT = """\
+name: pan
+loop: {rate: 50}
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
+joints: {pan: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}}
+"""
+
+
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Four logs of 100 bytes, the second in parts, one of this second, and what is no log of a run."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "logs"
+    names = ["a_20260101_000000.mcap", "b_20260102_000000", "a_20260103_000000_2.mcap"]
+    (folder / names[1]).mkdir(parents=True)
+    files = [folder / names[0], folder / names[1] / "part_0000.mcap", folder / names[2]]
+    for day, path in enumerate(files):
+        path.write_bytes(bytes(100))
+        os.utime(path, (1_000_000 + day, 1_000_000 + day))
+    (folder / "a_20260104_000000.mcap").write_bytes(bytes(100))
+    for other in ("thesis.mcap", "a_20260101_000000.txt"):
+        (folder / other).write_bytes(bytes(100))
+    (folder / "link_20260101_000000.mcap").symlink_to(folder / "thesis.mcap")
+    return folder
+
+
+def test_the_oldest_logs_of_runs_go_first_and_one_that_may_be_written_stays(logs: Path) -> None:
+    assert [one.bytes for one in stored.stored_logs(logs)] == [100] * 4
+
+    def names(keep: int) -> list[str]:
+        return [one.path.name for one in stored.oldest_beyond(logs, keep)]
+
+    assert names(400) == []
+    assert names(399) == ["a_20260101_000000.mcap"]
+    assert names(200) == ["a_20260101_000000.mcap", "b_20260102_000000"]
+    assert len(names(0)) == 3
+    for one in stored.oldest_beyond(logs, 0):
+        stored.delete(one)
+    assert sorted(path.name for path in logs.iterdir()) == [
+        "a_20260101_000000.txt",
+        "a_20260104_000000.mcap",
+        "link_20260101_000000.mcap",
+        "thesis.mcap",
+    ]
+    assert stored.stored_logs(logs / "none") == ()
+
+
+def test_a_run_deletes_only_what_its_robot_file_says(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    last = logs / "a_20260103_000000_2.mcap"
+    assert _disk_lines(last, RecordingPlan()) == []
+    assert len(stored.stored_logs(logs)) == 4
+    monkeypatch.setattr(stored, "MUCH_BYTES", 300)
+    (line,) = _disk_lines(last, RecordingPlan())
+    assert line.startswith(f"the logs in {logs} have 400 bytes; `dxlrun logs {logs} --prune --keep ")
+    assert len(stored.stored_logs(logs)) == 4
+    lines = _disk_lines(last, RecordingPlan(keep_bytes=150))
+    assert [line.split()[1] for line in lines] == [
+        str(logs / "a_20260101_000000.mcap"),
+        str(logs / "b_20260102_000000"),
+    ]
+    assert last.exists()
+    monkeypatch.setattr(cli_run, "_MOST_DELETED", 0)
+    os.utime(last, (time.time() - 60,) * 2)
+    lines = _disk_lines(logs / "a_20260104_000000.mcap", RecordingPlan(keep_bytes=0))
+    assert lines == [f"deleted the 1 oldest log in {logs}: recording.keep"]
+
+
+def test_a_run_names_the_size_of_its_log_and_keeps_what_its_robot_file_says(
+    logs: Path, dxlrun: Callable
+) -> None:
+    Path("kept.yaml").write_text(f"{ROBOT}recording: {{keep: 1 kB}}\n")
+    said = dxlrun("kept.yaml", "--virtual", "--duration", "0.1")
+    assert said.code == 0, said.err
+    assert " messages, " in said.out
+    assert " kB)" in said.out
+    assert said.out.count("deleted logs/") == 3
+    assert (logs / "thesis.mcap").exists()
+
+
+def test_pruning_shows_asks_and_deletes_only_after_a_yes(
+    logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["logs", "logs", "--prune", "--keep", "0.1kB", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["oldest"]) == 3
+    assert main(["logs", "logs", "--prune", "--keep", "0.1kB"]) == 2
+    assert "nothing was deleted" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    for answer, left in ((False, 4), (True, 1)):
+        monkeypatch.setattr(Confirm, "ask", lambda *_, answer=answer, **__: answer)
+        assert main(["logs", "logs", "--prune", "--keep", "0.1kB"]) == 0
+        assert len(stored.stored_logs(logs)) == left
+    assert main(["logs", "logs", "--prune", "--keep", "1 GB"]) == 0
+    assert "nothing to delete" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--prune"], "--prune and --keep belong together"),
+        (["--keep", "1GB"], "--prune and --keep belong together"),
+        (["--prune", "--keep", "1GB", "--sort", "log"], "--prune and --keep belong together"),
+        (["--prune", "--keep", "5"], "--keep 5: '5' has no unit; write a size"),
+        (["--prune", "--keep", "5 s"], "which is not one of a size"),
+    ],
+)
+def test_pruning_with_wrong_words_deletes_nothing(
+    logs: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    assert main(["logs", str(logs), *words]) == 2
+    assert sentence in capsys.readouterr().err
+    assert len(stored.stored_logs(logs)) == 4
