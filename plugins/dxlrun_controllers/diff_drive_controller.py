@@ -163,9 +163,9 @@ class Ramp:
 class DiffDriveController(Controller[DiffDriveParameters]):
     """Turns a twist into velocities of wheels, within limits, and the wheels' angles into a pose.
 
-    The pose begins at 0 with the run, and is kept while the controller is inactive. While a wheel does not
-    answer it stands still; the way of the wheels in a short silence is made up for with the next reply; that
-    of a longer one, in which a servo may have lost its turns, is left out and reported.
+    The pose begins at 0 with the run, and is kept while the controller is inactive. While a wheel is lost the
+    base is held, and the pose stands still; the way of the wheels in a short silence is made up for with the
+    next reply; that of a longer one, in which a servo may have lost its turns, is left out and reported.
     """
 
     Parameters = DiffDriveParameters
@@ -280,34 +280,34 @@ class DiffDriveController(Controller[DiffDriveParameters]):
 
     def _follow(self, time_ns: int, dt: float) -> None:
         """Move the pose by what happened since the update before."""
-        states, source = self.context.states, self.parameters.odometry
-        if source == "command":
+        states = self.context.states
+        if self.parameters.odometry == "command":
             self._twist = self._linear.velocity, self._angular.velocity
             self._pose.move(self._twist[0] * dt, self._twist[1] * dt)
+        elif np.count_nonzero(states.valid) == states.valid.size:
+            self._measure(time_ns)
         else:
-            if np.count_nonzero(states.valid) < states.valid.size:
-                self._hold(time_ns)
+            self._hold(time_ns)
+            if not states.has_lost:
                 return
-            age_ns = self._angles.age_ns(time_ns)
-            elapsed_ns = self._angles.take(states, time_ns)
-            self._twist = self._rims(states.velocity)
-            if elapsed_ns is not None:
-                linear, angular = self._twist
-                self._pose.move(
-                    *(
-                        self._rims(self._angles.turned)
-                        if source == "position"
-                        else (linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9)
-                    )
-                )
-            elif age_ns >= 0:
-                self.context.say(
-                    f"odometry goes on without the way of {age_ns * 1e-9:.2f} s without all replies"
-                )
-            self._holding = False
+            self._twist = 0.0, 0.0  # the base is held
         if time_ns >= self._publish_ns:
             self._publish_ns = max(self._publish_ns + self._interval_ns, time_ns - self._interval_ns)
             self._publish()
+
+    def _measure(self, time_ns: int) -> None:
+        """Move the pose by the wheels' way since their last replies."""
+        states = self.context.states
+        age_ns = self._angles.age_ns(time_ns)
+        elapsed_ns = self._angles.take(states, time_ns)
+        self._twist = linear, angular = self._rims(states.velocity)
+        if elapsed_ns is not None:
+            by_position = self.parameters.odometry == "position"
+            moved = linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9
+            self._pose.move(*(self._rims(self._angles.turned) if by_position else moved))
+        elif age_ns >= 0:
+            self.context.say(f"odometry goes on without the way of {age_ns * 1e-9:.2f} s without all replies")
+        self._holding = False
 
     def _hold(self, time_ns: int) -> None:
         """Report, once, that wheels are silent for so long that their way is lost."""

@@ -126,7 +126,6 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._in_step.fill(False)
         self._unknown = True
         self._commanded_ns = -1
-        self._updated_ns = time_ns
         self._following = self._reported = False
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
@@ -136,10 +135,9 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command where the leaders are: of a joint that is not in step, a step on the way there."""
-        if time_ns - self._updated_ns > period_ns:  # a true period is shorter: it was held meanwhile
+        if self.context.states.has_lost:
             hold(self.context)
             self._in_step.fill(False)
-        self._updated_ns = time_ns
         if self._unknown:
             self._unknown = take_where_heard(self.context.commands.position, self.context.states)
         age_s = self._age_s(time_ns)

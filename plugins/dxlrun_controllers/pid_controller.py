@@ -105,6 +105,7 @@ class PidController(Controller[PidParameters]):
     - A joint without a new measurement keeps its last command, see `Pid`, with `position` its last
       correction of the reference; one that was never measured gets
       none of its own (0; no position).
+    - While a joint is lost, the others are held where the last reference was, or at rest.
 
     Behaves like pid_controller of ros2_controllers (control.ros.org, pid_controller) where that has the
     same; it is also the joint_position_controller.
@@ -182,6 +183,7 @@ class PidController(Controller[PidParameters]):
         """Hold the joints where they are; what was commanded before stays the output, but for the mode."""
         goals, pid = self.context.goals, self._pid
         self._setpoint.fill(np.nan if self._by_position else 0.0)
+        self._reference.fill(np.nan)
         self._state_ns = time_ns
         self._slope.reset()
         self._refer()
@@ -223,7 +225,9 @@ class PidController(Controller[PidParameters]):
         pid, reference = self._pid, self._reference
         pid.upper = np.minimum(self._upper - reference, self._most)
         pid.lower = np.maximum(self._lower - reference, -self._most)
-        correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
+        correction = pid.output
+        if not self.context.states.has_lost:  # its goals are held then: an integral would only wind up
+            correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
         # a joint without a measurement keeps its correction, not the reference of then
         np.add(reference, correction, out=self._output, where=np.isfinite(reference))
 
@@ -236,7 +240,11 @@ class PidController(Controller[PidParameters]):
         self._chained = ~free
         if self._by_position:
             np.copyto(setpoint, self._measurement, where=np.isnan(setpoint) & states.valid)
-        np.copyto(self._reference, np.where(free, setpoint, self._commanded))
+        wanted = np.where(free, setpoint, self._commanded)
+        if states.has_lost:  # the joints are held where the last reference was
+            held = self._reference if self._by_position else np.zeros_like(wanted)
+            np.copyto(wanted, held, where=free & np.isfinite(held))
+        np.copyto(self._reference, wanted)
         np.subtract(self._reference, self._measurement, out=error)
         self._measured = np.isfinite(error) & states.valid
         np.add(error, np.rint(error / (2 * np.pi)) * (-2 * np.pi), out=error, where=self._wrap)

@@ -263,12 +263,36 @@ def test_a_goal_that_waits_can_be_replaced_and_ends_once(story):
     assert story.statuses == [(1, "accepted"), (1, "preempted"), (2, "accepted"), (2, "reached")]
 
 
-@pytest.mark.parametrize("torque", [Torque.OFF, Torque.RELEASED, Torque.LOST, Torque.REBOOTING])
+@pytest.mark.parametrize("torque", [Torque.OFF, Torque.RELEASED, Torque.REBOOTING])
 @pytest.mark.parametrize(("row", "status"), [(0, "aborted"), (1, "reached")], ids=["its own", "another's"])
 def test_a_goal_of_a_joint_that_goes_nowhere_is_aborted(story, torque, row, status):
     story.run(5, {2: [story.moves(1), story.torque(torque, row=row)]})
     assert story.statuses == [(1, "accepted"), (1, status)]
     assert story.reports[-1][1].joint == ("j0" if status == "aborted" else "")
+
+
+@pytest.mark.parametrize("back", [True, False])
+def test_a_lost_joint_may_come_back_until_its_settling_time_is_over(story, back):
+    at = {2: [story.moves(1), story.torque(Torque.LOST)]} | ({40: story.torque(Torque.ON)} if back else {})
+    story.run(80, at)
+    assert story.timed == [(2, "accepted"), (40, "reached") if back else (52, "aborted")]
+    if not back:
+        assert story.reports[-1][1].text == "after 1.000 s, joint j0 does not answer"
+
+
+def test_a_joint_that_was_lost_settles_from_its_return_on(story):
+    at = {
+        2: [story.moves(1), story.torque(Torque.LOST)],
+        40: story.torque(Torque.DOUBT),
+        70: story.torque(Torque.ON),
+    }
+    story.run(90, at)
+    assert story.timed == [(2, "accepted"), (70, "reached")]
+
+
+def test_the_end_of_a_run_names_a_lost_joint_of_an_unfinished_goal(story):
+    story.run(8, {2: story.moves(50), 4: story.torque(Torque.LOST)})
+    assert story.reports[-1][1].text == "joint j0 does not answer; the run ended"
 
 
 def test_a_goal_is_not_streamed(story):

@@ -368,12 +368,12 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(steered):
     assert len(steered.events.of(EventCode.CONTROLLER_LOADED)) == 2
 
 
-def test_a_controller_that_is_loaded_while_its_servo_is_lost_waits_for_it(steered):
+def test_a_controller_that_is_loaded_while_its_servo_is_lost_is_held(steered):
     manager = steered.build().manager
-    manager.wait_for({0})
+    manager.hold_lost({0})
     for name, joint in (("extra", "j0"), ("other", "j1")):
         assert isinstance(manager.load(plan_of(name, type="left", joints=(joint,))), int)
-    assert [manager._named[name].waiting for name in ("extra", "other")] == [True, False]
+    assert [manager._named[name].held for name in ("extra", "other")] == [True, False]
 
 
 def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again():

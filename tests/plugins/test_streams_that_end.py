@@ -1,4 +1,6 @@
-"""Every standard controller when its stream of commands ends: its topics continue, its joints are held.
+"""Every standard controller when its stream of commands ends, or one of its joints is lost.
+
+Its topics continue, and its joints are held.
 
 Judged by the topics in the log and by the shafts of the simulated servos. A new standard controller needs an
 entry.
@@ -15,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.stories import Clients, send
+from tests.kit.stories import Clients, send, silence
 
 from dxlrun import Controller
-from dxlrun.log.reader import open_log
+from dxlrun.log.reader import LogReader, open_log
 from dxlrun.testing import simulated_robot
 from dxlrun_controllers.plugin import dxlrun_controllers
 
@@ -31,6 +33,11 @@ LEASE_S = 0.1
 LEASE_OVER_S = LAST * PERIOD_S + LEASE_S
 STILL_S = END * PERIOD_S - 0.5
 """Time from which the joints rest; a law with feedback has settled."""
+LOST_S = 1.2, 2.4
+"""In the stream."""
+NOTICED_S = 0.5
+"""A servo is lost after 50 ms; then the other one comes to rest."""
+FORCES = ("joint_group_effort_controller", "joint_group_pwm_controller")
 TICK = 2 * np.pi / 4096
 Fields = Callable[[float], dict[str, Any]]
 
@@ -143,8 +150,18 @@ def robot_file(folder: Path, kind: str, entry: Entry) -> Path:
     return path
 
 
-def run(folder: Path, kind: str, entry: Entry) -> tuple[Path, list[tuple[float, ...]]]:
-    """Run a stream that ends; return the log, and time and shafts every 10 ms."""
+def run(
+    folder: Path,
+    kind: str,
+    entry: Entry,
+    *,
+    lease_s: float = LEASE_S,
+    lost_s: tuple[float, float] | None = None,
+) -> tuple[Path, list[tuple[float, ...]]]:
+    """Run a stream that ends; return the log, and time and shafts every 10 ms.
+
+    `lost_s`: from when and until when the elbow does not answer.
+    """
     log = folder / "log.mcap"
     robot = simulated_robot(robot_file(folder, kind, entry), duration_s=END * PERIOD_S, log=log)
     to = "own" if entry.kind else "mover"
@@ -156,7 +173,7 @@ def run(folder: Path, kind: str, entry: Entry) -> tuple[Path, list[tuple[float, 
         command = entry.kind or "positions"
         fields = receiver.Commands[command].model_validate(entry.fields((cycle - FIRST) * PERIOD_S))
         numbers = receiver.prepare(command, fields, parameters)
-        asked[cycle] = [send(to, command, *numbers, lease_ns=round(LEASE_S * 1e9))]
+        asked[cycle] = [send(to, command, *numbers, lease_ns=round(lease_s * 1e9))]
     Clients(robot, asked)
     seen: list[tuple[float, ...]] = []
     bus = robot.buses[0]
@@ -168,9 +185,21 @@ def run(folder: Path, kind: str, entry: Entry) -> tuple[Path, list[tuple[float, 
                 (robot.record.cycle * PERIOD_S, *(bus.servo(one).position for one in (1, 2)))
             ),
         )
+    if lost_s is not None:
+        silence(robot, [2], *(1000 * at for at in lost_s))
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", ""), result
     return log, seen
+
+
+def assert_topics_continue(log: LogReader, kind: str, entry: Entry, gap_s: float = 0.0) -> None:
+    found = controller_of(kind)
+    topics = [f"/own/{topic}" for topic in found.topics(found.Parameters.model_validate(entry.keys))]
+    for topic in (*topics, *found.publishes):
+        times = log.columns(topic)["t_ns"] * 1e-9
+        interval = np.median(np.diff(times))
+        assert np.diff(times).max() < max(1.5 * interval, gap_s), topic
+        assert END * PERIOD_S - (times[-1] - times[0]) < 1.5 * interval, topic
 
 
 def test_every_standard_controller_has_an_entry():
@@ -188,14 +217,7 @@ def test_every_standard_controller_has_an_entry():
 def test_topics_outlive_a_stream_and_its_joints_are_held(tmp_path, kind, entry):
     path, shafts = run(tmp_path, kind, entry)
     log = open_log(path)
-    found = controller_of(kind)
-    topics = [f"/own/{topic}" for topic in found.topics(found.Parameters.model_validate(entry.keys))]
-    topics += found.publishes
-    for topic in topics:
-        times = log.columns(topic)["t_ns"] * 1e-9
-        interval = np.median(np.diff(times))
-        assert np.diff(times).max() < 1.5 * interval, topic
-        assert END * PERIOD_S - (times[-1] - times[0]) < 1.5 * interval, topic
+    assert_topics_continue(log, kind, entry)
     time, positions = np.array(shafts)[:, 0], np.array(shafts)[:, 1:]
     before, ended = (positions[time >= at][0] for at in (FIRST * PERIOD_S, LEASE_OVER_S))
     assert abs(ended - before).max() > 0.05, "the stream moved nothing"
@@ -205,3 +227,16 @@ def test_topics_outlive_a_stream_and_its_joints_are_held(tmp_path, kind, entry):
         speed = log.columns("/own/odometry", "twist.twist.linear.x")["twist.twist.linear.x"]
         assert speed.max() > 0.09
         assert abs(speed[-1]) < 1e-3
+
+
+@pytest.mark.parametrize(("kind", "entry"), CASES)
+def test_topics_outlive_a_lost_joint_and_the_other_one_is_held(tmp_path, kind, entry):
+    """Efforts and PWM continue, as without them what they hold would fall."""
+    path, shafts = run(tmp_path, kind, entry, lease_s=0.0, lost_s=LOST_S)
+    assert_topics_continue(open_log(path), kind, entry, gap_s=0.1)  # no odometry until a servo counts as lost
+    time, shoulder = np.array(shafts)[:, 0], np.array(shafts)[:, 1]
+    before = np.ptp(shoulder[time < LOST_S[0]])
+    assert before > 0.05, "the stream moved nothing"
+    if "elbow" in str(entry.keys) and kind not in FORCES:
+        held = (time > LOST_S[0] + NOTICED_S) & (time < LOST_S[1])
+        assert np.ptp(shoulder[held]) <= 2 * TICK

@@ -57,8 +57,8 @@ class Pid:
       that leads away from the limit, so the output leaves the limit as soon as the rest of the law does. It
       needs no time constant, as back-calculation does, and cannot make the integral overshoot.
     - h is, for each joint, the time since its last measurement. A joint without one keeps its last output:
-      one lost packet must not let an arm fall. The runtime withdraws the commands of a joint that stays
-      silent (lost: 3 replies and 50 ms).
+      one lost packet must not let an arm fall. The runtime passes on none of a joint that stays silent
+      (lost: 3 replies and 50 ms).
     """
 
     def __init__(self, joints: int) -> None:

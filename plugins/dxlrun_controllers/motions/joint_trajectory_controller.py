@@ -65,8 +65,6 @@ from dxlrun_controllers.motions.trajectory_command import (
 SPEED_SLOPE: Final = 2.0
 """1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
 FEEDBACK_NS: Final = 100_000_000
-_LEFT: Final = 3
-"""Periods without an update: a joint was lost, and all joints are held at their goals since."""
 _STILL: Final = 1e-3
 """A speed of the trajectory so near to 0 is none: its time stands still."""
 
@@ -181,7 +179,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._moves = self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
-        self._start_ns = self._base_ns = self._stop_ns = self._feedback_ns = self._now_ns = 0
+        self._start_ns = self._base_ns = self._stop_ns = self._feedback_ns = 0
         self._timeout_ns = np.inf
         self._base_s = self._splice_s = 0.0
         self._speed = self._rate = parameters.speed
@@ -208,6 +206,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._closing = np.minimum(speed, CLOSING_SPEED)
         self._interface = parameters.command_interface
         self._tracking: Tracking | None = None
+        self._tracked = SplineSample(count)
+        """What it follows: the desired state, at rest while a joint is lost."""
         if parameters.gains is not None:
             tracked: Literal["velocity", "effort"] = "velocity" if self._interface == "velocity" else "effort"
             self._tracking = Tracking(context, tracked, parameters.derivative_filter * 1e-9)
@@ -234,6 +234,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
                 commands.velocity.fill(0.0)
         else:
             self._desired.rest_at(states.position)
+            self._tracked.rest_at(states.position)
             self._tracking.begin(self._desired)
         self._unknown = True
 
@@ -326,16 +327,18 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def _know_begin(self, time_ns: int) -> None:
         """Set the state from which something new begins now."""
-        if self._anchor_ns is not None and time_ns - self._now_ns > _LEFT * self.context.period_ns:
-            self._anchor_ns, self._phase = None, _Phase.RESTING
-            self._tracks.rest()
-            held = self.context.goals if self._tracking is None else self.context.states
-            self._desired.rest_at(finite_or(held.position, self._desired.position))
         if not self._tracks.playing:
             self._rate = 1.0 if not self._still.all() and self._speed <= _STILL else self._speed
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
             self._base_ns, self._base_s = time_ns, 0.0
         self._know_where(time_ns)
+
+    def _leave_stream(self) -> None:
+        """Forget the chunks that were streamed: the runtime holds the joints at their goals."""
+        self._anchor_ns, self._phase = None, _Phase.RESTING
+        self._tracks.rest()
+        held = self.context.goals if self._tracking is None else self.context.states
+        self._desired.rest_at(finite_or(held.position, self._desired.position))
 
     def _know_where(self, time_ns: int) -> None:
         """Set the desired state of now."""
@@ -401,7 +404,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the trajectory's state at `time_ns`; hold when there is none."""
-        self._now_ns = time_ns
+        if self._anchor_ns is not None and self.context.states.has_lost:
+            self._leave_stream()
         if self._spliced is not None:
             self._splice(self._spliced, time_ns)
         elapsed = 0.0 if self._still.all() else self._sample(time_ns)
@@ -509,7 +513,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _command(self, period_ns: int) -> None:
         commands, desired = self.context.commands, self._desired
         if self._tracking is not None:
-            self._tracking.update(desired, period_ns * 1e-9)
+            self._tracked.rows[1:] = 0.0
+            if not self.context.states.has_lost:  # else efforts carry the joints where they were
+                np.copyto(self._tracked.rows, desired.rows)
+            self._tracking.update(self._tracked, period_ns * 1e-9)
             return
         np.copyto(commands.position, desired.position)
         if self._interface != "posvel":

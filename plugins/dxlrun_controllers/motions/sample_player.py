@@ -272,6 +272,8 @@ class SamplePlayer(Controller[SampleParameters]):
         """Return the first joint that is beyond a bound, and how; None: none is."""
         states, valid = self.context.states, self.context.states.valid
         lower, upper, most, effort = self._lower, self._upper, self._strongest, np.abs(states.effort)
+        if not self._by_position and states.has_lost:  # positions are held by the runtime
+            return states.unable(range(valid.size))
         if (beyond := ((states.position < lower) | (states.position > self._upper)) & valid).any():
             row = int(beyond.argmax())
             bounds = f"{lower[row]:.4g} to {upper[row]:.4g} rad"

@@ -137,6 +137,11 @@ class States:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
             object.__setattr__(self, name, row)
 
+    @property
+    def has_lost(self) -> bool:
+        """True while one of these joints is lost: nothing is commanded to it, and the others are held."""
+        return Torque.LOST in self.torque.tobytes()
+
     def unable(self, rows: Iterable[int]) -> tuple[int, str] | None:
         """Return the first joint, of these rows, that goes nowhere, and why; None: there is none."""
         for row in rows:

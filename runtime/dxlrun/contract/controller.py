@@ -430,7 +430,8 @@ class Controller(ABC, Generic[P]):
         """Write `context.commands` from `context.states`.
 
         `time_ns`: time of this cycle since the loop started. `period_ns`: since this controller's last
-        update, the true one, capped.
+        update, the true one, capped. While a joint is lost (`states.has_lost`) positions and velocities are
+        held, and nothing is commanded to that joint; efforts and PWM of the others continue.
         """
 
     def on_deactivate(self, time_ns: int) -> None:

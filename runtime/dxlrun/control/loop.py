@@ -307,7 +307,7 @@ class Loop:
             names = ", ".join(self.plan.joints[row].name for row in rows)
             self._give_up(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
         if not ending:
-            self.gate.ease_in(self.manager.wait_for(self._lost.rows))
+            self.gate.ease_in(self.manager.hold_lost(self._lost.rows))
 
     def _look_at_needed_sensors(self) -> None:
         """End the run when a sensor brought nothing new for its timeout; by the record, as in a replay."""

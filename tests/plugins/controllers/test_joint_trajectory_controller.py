@@ -158,7 +158,7 @@ def test_a_goal_may_be_reached_within_its_time():
     ("answers", "outcome", "told", "error"),
     [
         (True, Outcome.MISSED, "joint a is 57.30 deg off", 1.0),
-        (False, Outcome.ABORTED, "joint a has not answered", np.nan),
+        (False, Outcome.ABORTED, "joint a has not answered; it is 57.30 deg off", 1.0),
     ],
 )
 def test_a_missed_goal_says_by_how_much(answers, outcome, told, error):
@@ -493,7 +493,12 @@ def test_after_the_joints_were_held_a_chunk_begins_where_they_are():
     robot = started(ONE | POSVEL, into=LOWER)
     chunk(robot, 0.0, [1.0, 9.0], [1.3, 9.3])
     held = robot.update(0.5)
-    chunk(robot, 2.0, [2.5, 3.0], [0.0, 0.0], now=2.2)  # as no chunk came it was not updated for 1.5 s
+    robot.states.torque[0] = Torque.LOST
+    for time_s in (1.0, 1.5):
+        robot.update(time_s, follow=False)
+        robot.sent.position[:] = held
+    robot.states.torque[0] = Torque.ON
+    chunk(robot, 2.0, [2.5, 3.0], [0.0, 0.0], now=2.2)
     np.testing.assert_allclose(robot.update(2.0), held)
     assert robot.commands.velocity[0] == 0.0
     np.testing.assert_allclose(robot.update(3.0), 0.0, atol=1e-9)

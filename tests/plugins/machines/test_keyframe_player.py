@@ -318,7 +318,8 @@ def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted():
     assert (goal.outcome, goal.judged) == (Outcome.REACHED, ["a"])
     goal = robot.ask("play", motion="alone")
     play(robot, 1.0, follow=False)
-    assert (goal.outcome, goal.text) == (Outcome.ABORTED, "played alone, without b for want of torque")
+    told = "joint b has no torque: it was switched off; played alone, without b for want of torque"
+    assert (goal.outcome, goal.text) == (Outcome.ABORTED, told)
 
 
 def test_a_joint_that_gets_torque_at_rest_stays_where_it_was_led():

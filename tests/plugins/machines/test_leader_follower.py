@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.stages import standing
 
+from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.leader_follower import LeaderFollower
 
 PAIR = {"pairs": [{"joint": "f", "leader": "l"}], "speed": "1 rad/s"}
@@ -92,14 +93,18 @@ def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(silence)
     assert robot.said[1] == "no reply of leader l for 0.30 s, holding"
 
 
-def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent():
+def test_after_a_lost_joint_is_back_it_starts_softly_from_what_was_sent():
     robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 0.0)
     robot.step()
-    robot.sent.position[:] = 0.3  # a returned servo was brought elsewhere
     lead(robot, 1.0)
-    robot.step(periods=50)
-    assert robot.commands.position[0] == pytest.approx(0.3 + 5 * 0.02)
+    robot.states.torque[0] = Torque.LOST
+    for _ in range(50):
+        robot.sent.position[:] = 0.3  # a returned servo was brought elsewhere
+        robot.step()
+    robot.states.torque[0] = Torque.ON
+    robot.step()
+    assert robot.commands.position[0] == pytest.approx(0.3 + 2 * 0.02)
 
 
 def test_positions_are_followed_as_long_as_they_come():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, Refusal
-from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats
+from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats, Torque
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
@@ -29,7 +29,7 @@ GOALS_TOPIC = "/goals"
 KEPT = 256
 """Of so many goals that ended it is known how."""
 _LONGEST_TEXT = 500
-_WARNED = (Outcome.MISSED, Outcome.ABORTED)
+_UNREACHED = (Outcome.MISSED, Outcome.ABORTED)
 CERTAIN_NS = 500_000_000
 """How long `reached` waits for replies and torque that are in doubt; at least LOST_CYCLES periods. [i]"""
 
@@ -139,6 +139,10 @@ class _Judgement(NamedTuple):
 
     targets: tuple[_Target, ...]
     text: str
+    settle_ns: int
+    """How long a joint may take to come within its tolerance."""
+    back_ns: int
+    """Last time at which a lost joint may be back, ns of the controllers' time; it settles from then on."""
     settled_ns: int
     """Last time at which a joint may still come within its tolerance, ns of the controllers' time."""
     certain_ns: int
@@ -283,7 +287,7 @@ class Goals:
         text: str,
     ) -> None:
         """Judge a goal whose motion has ended, from this cycle on; see `controller.Goal.judge`."""
-        names, now_ns = self._commanded(goal.controller).joints, self.time_ns
+        names = self._commanded(goal.controller).joints
         settle_ns = None if tolerances is None else tolerances.settle_ns
         targets, longest_ns = [], 0
         for index, name in enumerate(names):
@@ -304,24 +308,36 @@ class Goals:
         settle_ns = longest_ns if settle_ns is None else settle_ns
         if tolerances is not None and tolerances.left_ns is not None:
             settle_ns = min(settle_ns, tolerances.left_ns)
-        settled_ns = now_ns + settle_ns
-        certain_ns = now_ns + max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
-        goal.judgement = _Judgement(tuple(targets), text, settled_ns, max(settled_ns, certain_ns))
+        settled_ns, certain_ns = self._settling(settle_ns)
+        goal.judgement = _Judgement(tuple(targets), text, settle_ns, certain_ns, settled_ns, certain_ns)
         self._judge(goal, goal.judgement)
+
+    def _settling(self, settle_ns: int) -> tuple[int, int]:
+        """Return until when joints may settle from now on, and until when states may be in doubt."""
+        settled_ns = self.time_ns + settle_ns
+        return settled_ns, max(
+            settled_ns, self.time_ns + max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
+        )
 
     def _judge(self, goal: RunningGoal, judgement: _Judgement) -> None:
         """End a goal as its joints' states decide; a goal that may still be reached continues."""
         states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.time_ns
         rows = [target.row for target in targets]
-        unable = states.unable(rows)
+        lost = [row for row in rows if states.torque.item(row) == Torque.LOST]
+        unable = states.unable([row for row in rows if row not in lost])
+        if lost and unable is None and now_ns < judgement.back_ns:
+            settled_ns, certain_ns = self._settling(judgement.settle_ns)
+            goal.judgement = judgement._replace(settled_ns=settled_ns, certain_ns=certain_ns)
+            return
+        unable = unable or states.unable(lost)
         doubtful = None if unable is not None else states.doubtful(rows)
         if doubtful is not None and now_ns < judgement.certain_ns:
             return
         found = unable or doubtful
         outcome, joint, error = Outcome.REACHED, "", math.nan
         if found is not None:
-            joint = targets[rows.index(found[0])].joint
-            outcome, reason = Outcome.ABORTED, f"joint {joint} {found[1]}"
+            outcome, joint = Outcome.ABORTED, targets[rows.index(found[0])].joint
+            error, reason = self._describe_unable(judgement, joint, found[1])
         else:
             joint, error, reason = self._find_worst(targets, self._commanded(goal.controller).velocities)
             if reason and now_ns < judgement.settled_ns:
@@ -373,16 +389,28 @@ class Goals:
         joints: Sequence[str] | None,
     ) -> None:
         """End a goal for its controller. A missed goal becomes aborted if a joint is lost or limp; the report
-        names that joint."""
+        of an aborted one names that joint."""
         names = self._commanded(goal.controller).joints if joints is None else joints
-        if outcome is Outcome.MISSED and names:
+        if outcome in _UNREACHED and names:
             rows = [self._joints[name][0] for name in names]
             if (found := self._record.states.unable(rows)) is not None:
                 unable, why = names[rows.index(found[0])], found[1]
-                error = error if unable == joint else math.nan
-                outcome, joint = Outcome.ABORTED, unable
-                text = f"joint {joint} {why}{'; ' * bool(text)}{text}"
+                known = error if unable == joint else math.nan
+                error, named = self._describe_unable(goal.judgement, unable, why)
+                error = known if math.isnan(error) else error
+                outcome, joint, given = Outcome.ABORTED, unable, f"joint {unable} {why}"
+                text = text.replace(given, named) if given in text else f"{named}{'; ' * bool(text)}{text}"
         self._close(goal, outcome, text, joint, error)
+
+    def _describe_unable(self, judgement: _Judgement | None, joint: str, why: str) -> tuple[float, str]:
+        """Return how far a joint that goes nowhere is off its goal, NaN before the motion has ended, and why
+        the goal is not reached."""
+        row, plan = self._joints[joint]
+        targets = () if judgement is None else judgement.targets
+        position = next((target.position for target in targets if target.row == row), math.nan)
+        error = abs(self._record.states.position.item(row) - position)
+        off = "" if math.isnan(error) else f"; it is {distance_text(error, plan.linear)} off"
+        return error, f"joint {plan.label} {why}{off}"
 
     def _close(self, goal: RunningGoal, outcome: Outcome, text: str, joint: str, error: float) -> None:
         goal.outcome, goal.judgement = outcome, None
@@ -395,7 +423,7 @@ class Goals:
         del self.running[goal.number]
         self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
         sentence = f"goal {goal.number} {outcome}{f': {goal.text}' if goal.text else ''}"
-        severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
+        severity = Severity.WARNING if outcome in _UNREACHED else Severity.INFO
         self._report(goal, EventCode.GOAL_ENDED, severity, outcome.value, sentence)
 
     def judge_running(self) -> None:

@@ -127,13 +127,12 @@ class Managed:
         self.state = State.INACTIVE
         self.failed = False
         """True when it broke its contract."""
-        self.waiting = False
-        """True while one of the joints that it claims is lost."""
+        self.held = False
+        """True while a joint is lost that it commands, directly or through others. It is updated all the
+        same."""
         self.withheld = False
         """True while its commands are kept from the robot: its stream of commands ended, and it has no
         `on_hold`. It is updated all the same."""
-        self.runs = False
-        """True when it is updated in the cycles in which it is due."""
         self.uppers: tuple[Managed, ...] = ()
         """Those that command its references while they are active."""
         self.due_cycle = 0
@@ -232,7 +231,6 @@ class Managed:
         else:
             self.until_ns = 0
             self._record.active &= ~self._bit
-        self.runs = self.state is State.ACTIVE and not self.waiting
 
     @property
     def active(self) -> bool:
@@ -351,18 +349,31 @@ class Managed:
         if (goal := self.goal) is not None and not goal.cancelling:
             self.cancel(goal, time_ns)
 
-    def wait_for(self, lost: Collection[int], below: bool = False) -> bool:
-        """Hold its joints as long as one that it claims is lost, of these rows, or one below it waits.
+    def hold_lost(self, lost: Collection[int], *, below: bool) -> bool:
+        """Hold its joints while it commands a lost one, of these rows, or a controller below it is held.
 
         Returns whether that changed anything for the robot.
         """
-        waiting = bool(self._outputs.parts) and (below or any(row in lost for row in self.rows.tolist()))
-        changed = waiting != self.waiting
-        self.waiting = waiting
-        self.runs = self.state is State.ACTIVE and not waiting
-        if waiting and self.active:
-            self._outputs.withdraw()
+        commands = not self._outputs.is_empty
+        held = commands and (below or any(row in lost for row in self.rows.tolist()))
+        changed = held != self.held
+        self.held = held
+        if held and self.active:  # its own rate may be low
+            self._merge()
         return changed and self.active
+
+    def _merge(self) -> None:
+        """Write its commands into the robot's, or what holds the joints while one of them is lost.
+
+        A controller that is commanded by another one follows references that are held, so its own commands go
+        on: a PID law keeps the joints where they are.
+        """
+        if self.withheld:
+            return
+        if self.held and not any(upper.active for upper in self.uppers):
+            self._outputs.hold()
+        else:
+            self._outputs.merge()
 
     def change_period(self, period_ns: int) -> None:
         """Keep its own rate in another period of the loop."""
@@ -382,9 +393,7 @@ class Managed:
         outputs = self._outputs
         if outputs.own.tobytes() != outputs.taken:
             outputs.check()
-        if not self.withheld:
-            for own, merged, place in outputs.parts:
-                merged[place] = own
+        self._merge()
         if self.provided is not None:
             self.provided.take()
 

@@ -79,7 +79,7 @@ class Manager:
         self._requests: list[Request] = []
         """What controllers request of the run in this cycle."""
         self._next = 0  # of the plan's commands
-        self._lost: Collection[int] = ()
+        self._lost: list[int] = []  # rows of the joints that are lost
         self._goals = Goals(record, events, plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """What is played by commands, by controller."""
@@ -111,18 +111,11 @@ class Manager:
         held by the gate; the others are updated all the same.
         """
         self._goals.time_ns = time_ns
-        if self.switching.groups:
-            self.switching.admit(time_ns)
-        if self._next < len(self._plan.commands):
-            self._hand_over(time_ns)
-        if self._goals.running:
-            self._goals.judge_running()
-        if self._motions:
-            self._play_on(time_ns)
+        self._dispatch_due(time_ns)
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         for left in range(len(self._order), -1, -1):  # one that entered by a request may have one of its own
             for managed in self._order:
-                if managed.runs and cycle >= managed.due_cycle:
+                if managed.state is State.ACTIVE and cycle >= managed.due_cycle:
                     begin_ns = now_ns()
                     try:
                         managed.update(cycle, time_ns)
@@ -133,8 +126,21 @@ class Manager:
             if not (left and self._requests):
                 break
             self._execute_requests(time_ns)
+        if self._lost:
+            self._record.commands.values[:, self._lost] = np.nan
         if self._keeping.controllers:
             self._keeping.step()
+
+    def _dispatch_due(self, time_ns: int) -> None:
+        """Activate what waited for modes, hand over what is due, and judge goals, before the updates."""
+        if self.switching.groups:
+            self.switching.admit(time_ns)
+        if self._next < len(self._plan.commands):
+            self._hand_over(time_ns)
+        if self._goals.running:
+            self._goals.judge_running()
+        if self._motions:
+            self._play_on(time_ns)
 
     def _execute_requests(self, time_ns: int) -> None:
         """Let controllers take over as others have requested it; endings of the run behind that."""
@@ -291,27 +297,30 @@ class Manager:
         if (managed := self._named.get(controller)) is not None:
             self._attempt(managed, time_ns, managed.hold, time_ns)
 
-    def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
-        """Hold every controller that claims a lost joint, of these rows, as long as it is lost, and those
-        above it.
+    def hold_lost(self, lost: Collection[int]) -> tuple[int, ...]:
+        """Hold the controllers that command a lost joint, of these rows, and those above them.
 
-        Returns the rows of those that are commanded again. One that is activated meanwhile waits too.
+        They are updated, and their other joints stay where they are. So does one that is activated while a
+        joint is lost. Nothing is commanded to the lost joints themselves.
+
+        Returns:
+            The rows of the controllers that are not held any more.
         """
-        self._lost = lost
+        self._lost = sorted(lost)
         resumed: list[int] = []
         for managed in reversed(self._order):  # those below first
-            if not managed.wait_for(lost, self._waits_below(managed)):
+            if not managed.hold_lost(self._lost, below=self._holds_below(managed)):
                 continue
             text, severity = "resumes: all its joints answer again", Severity.INFO
-            if managed.waiting:
+            if managed.held:
                 text, severity = "is held until all its joints answer again", Severity.WARNING
             else:
                 resumed += managed.rows.tolist()
             self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
         return tuple(resumed)
 
-    def _waits_below(self, managed: Managed) -> bool:
-        return any(self._named[lower].waiting for lower in managed.plan.into)
+    def _holds_below(self, managed: Managed) -> bool:
+        return any(self._named[lower].held for lower in managed.plan.into)
 
     # Goals and motions
 
@@ -415,7 +424,7 @@ class Manager:
             managed = self._configured(place, plan)
         except (ControllerFault, PlugInError) as error:
             return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": str(error)})
-        managed.wait_for(self._lost, self._waits_below(managed))
+        managed.hold_lost(self._lost, below=self._holds_below(managed))
         self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
         self._sort()

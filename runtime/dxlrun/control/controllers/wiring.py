@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +140,25 @@ def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
         yield from ((name, begin + index) for index, name in enumerate(names))
 
 
+_CARRYING = ("effort", "pwm")
+"""Interfaces that carry a joint's load: without their commands it falls."""
+
+
+class _Part(NamedTuple):
+    """One interface of a controller's commands."""
+
+    own: Floats
+    """Of the controller's array."""
+    merged: Floats
+    """The robot's array that it goes to."""
+    place: Columns
+    """Its rows there."""
+    goes_on: bool = True
+    """It is written while the joints are held, too."""
+    held: float | None = None
+    """What is written instead of another one while the joints are held; None: the last command stays."""
+
+
 class Outputs:
     """What a controller commands: its own arrays, where they go, and what of them was ever finite.
 
@@ -158,8 +177,7 @@ class Outputs:
         self.devices: Floats = own[devices:]
         self.taken = b""
         """The bytes of `own` that were checked last."""
-        self.parts: list[tuple[Floats, Floats, Columns]] = []
-        """What goes into the robot's arrays: of `own`, where to, and its rows there."""
+        self._parts: list[_Part] = []
         self._owner = plan.name
         self._names = [""] * own.size
         """What its elements command: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
@@ -170,10 +188,11 @@ class Outputs:
             begin = COMMAND_INTERFACES.index(interface) * count
             if plan.into:
                 names = [_reference(plan, joint, interface, layout) for joint in plan.joints]
-                self._send(begin, names, record.reference, _places(names, layout.references))
+                places = _places(names, layout.references)
+                self._send(begin, names, record.reference, places, interface)
             else:
                 names = [f"{joint}/{interface}" for joint in plan.joints]
-                self._send(begin, names, getattr(record.commands, interface), rows)
+                self._send(begin, names, getattr(record.commands, interface), rows, interface)
         if missing := [name for name in plan.device_commands if name not in layout.device_commands]:
             raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
         places = _places(plan.device_commands, layout.device_commands)
@@ -181,11 +200,24 @@ class Outputs:
         self._claimed = np.array([name != "" for name in self._names], dtype=np.bool_)
         self._finite, self._seen, self._wrong = np.zeros((3, own.size), dtype=np.bool_)
 
-    def _send(self, begin: int, names: Sequence[str], merged: Floats, rows: NDArray[np.intp]) -> None:
+    def _send(
+        self, begin: int, names: Sequence[str], merged: Floats, rows: NDArray[np.intp], interface: str = ""
+    ) -> None:
         if names:
             end = begin + len(names)
             self._names[begin:end] = names
-            self.parts.append((self.own[begin:end], merged, _columns(rows)))
+            goes_on = not interface or interface in _CARRYING
+            held: float | None = np.nan
+            if self._rows is None:
+                # Without a reference the one below would hold the measured position: a joint that sags below
+                # its reference would sag as far again.
+                held = {"position": None, "velocity": 0.0}.get(interface)
+            self._parts.append(_Part(self.own[begin:end], merged, _columns(rows), goes_on, held))
+
+    @property
+    def is_empty(self) -> bool:
+        """True when it commands nothing."""
+        return not self._parts
 
     def forget(self) -> None:
         """Begin anew: nothing was commanded yet."""
@@ -212,9 +244,25 @@ class Outputs:
         np.logical_or(seen, self._finite, seen)
         self.taken = own.tobytes()
 
+    def merge(self) -> None:
+        """Write it into the robot's arrays."""
+        for own, merged, place, _, _ in self._parts:
+            merged[place] = own
+
+    def hold(self) -> None:
+        """Let the joints stay where they are: a position stays as it was, a velocity becomes 0.
+
+        Efforts and PWM go on, as they carry the joints' load, and so do commands of devices.
+        """
+        for own, merged, place, goes_on, held in self._parts:
+            if goes_on:
+                merged[place] = own
+            elif held is not None:
+                merged[place] = held
+
     def withdraw(self) -> None:
         """Take it out of the robot's commands."""
-        for _, merged, place in self.parts:
+        for _, merged, place, _, _ in self._parts:
             merged[place] = np.nan
 
 
