@@ -163,7 +163,8 @@ def start(tmp_path):
         command = [*before, str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
         command += [] if gateway else ["--no-gateway"]
         ledger = tmp_path / f"{len(started)}.ledger.jsonl"
-        if not any(str(argument).startswith(("port:=", "--virtual", "--ledger")) for argument in arguments):
+        real = any(":=/" in str(argument) for argument in arguments)  # a port that another process serves
+        if not real and not {"--virtual", "--ledger"} & {*arguments}:
             command += ["--ledger", str(ledger)]
         close = f"exec >&- 2>&- <&-; exec {shlex.join(command)}"
         process = subprocess.Popen(

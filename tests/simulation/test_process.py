@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Any
 
 import pytest
@@ -72,6 +73,30 @@ def test_hosts_may_come_and_go(start):
         with opened(running.ports["main"]) as port:
             os.write(port, PING_1)
             assert receive(port, 6) == PONG_1
+    assert running.hang_up() == 0
+
+
+def test_no_process_has_the_port_of_a_host_that_looks_for_others(start):
+    """As programs do that end whoever has the port they want, by `lsof` or `fuser -k`."""
+    running = start()
+
+    def holders() -> list[int]:
+        found = []
+        for descriptor in Path("/proc").glob("[0-9]*/fd/*"):
+            with contextlib.suppress(OSError):
+                if os.readlink(descriptor) == running.ports["main"]:
+                    found.append(int(descriptor.parts[2]))
+        return found
+
+    assert holders() == []
+    with opened(running.ports["main"]) as port:
+        assert holders() == [os.getpid()]
+        os.write(port, PING_1)
+        assert receive(port, 6) == PONG_1
+    spent = Path(f"/proc/{running.child.pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    time.sleep(1)
+    later = Path(f"/proc/{running.child.pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    assert sum(map(int, later)) - sum(map(int, spent)) < 50  # ticks of 10 ms: nothing turns without a host
     assert running.hang_up() == 0
 
 

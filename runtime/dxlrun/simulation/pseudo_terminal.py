@@ -18,10 +18,12 @@ _SETTINGS = struct.Struct("4I20s2I")
 """struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
 _ROOM = bytes(_SETTINGS.size)
 _CBAUD, _BOTHER = 0o010017, 0o010000
+_CHUNK = 4096
+"""Bytes of one read; fewer are all that there are."""
 
 
 class PseudoTerminal:
-    """The master's end; a slave's descriptor stays open here, so that hosts may come and go.
+    """The master's end. Hosts may come and go; no slave is open here, as programs look for who else has it.
 
     A terminal without a rate of its own has that of the bus; a host that sets another one sends at that rate,
     and servos at the old one receive nothing.
@@ -34,9 +36,10 @@ class PseudoTerminal:
     def __init__(self, bus: SimulatedBus, link: DeviceLink | None = None) -> None:
         self.bus = bus
         self._link = link
-        self._master, self._slave = self._new_pair()
+        self._master, self._name = self._new_pair()
         self._settings = b""  # Settings of the terminal when the host last wrote
         self._taken = b""  # What the host wrote and the bus was not handed yet
+        self.may_have_more = False  # The newest chunk was full
         self._times_unplugged = bus.times_unplugged
         self.plugged = True  # False: the host saw it go, and no device is there
         self._publish()
@@ -44,7 +47,7 @@ class PseudoTerminal:
     @property
     def path(self) -> str:
         """Path of the device that a host opens, empty while the adapter is unplugged."""
-        return os.ttyname(self._slave) if self.plugged else ""
+        return self._name if self.plugged else ""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when the host has written."""
@@ -61,9 +64,9 @@ class PseudoTerminal:
         self._taken = b""
         if self._times_unplugged != self.bus.times_unplugged:
             self._times_unplugged = self.bus.times_unplugged
-            old = self._master, self._slave
-            self._master, self._slave = self._new_pair()  # while the old name is still taken
-            _close(old)
+            old = self._master
+            self._master, self._name = self._new_pair()  # while the old name is still taken
+            os.close(old)
             self._unpublish()
         self.plugged = self.bus.plugged
         if self.plugged:
@@ -74,16 +77,19 @@ class PseudoTerminal:
         return True
 
     def read(self) -> None:
-        """Take what the host has written."""
-        with suppress(BlockingIOError):
-            self._taken += os.read(self._master, 4096)
+        """Take what the host has written, a chunk at most."""
+        data = b""
+        with suppress(OSError):  # there is nothing, or no host
+            data = os.read(self._master, _CHUNK)
+        self._taken += data
+        self.may_have_more = len(data) == _CHUNK
 
     def receive(self, now_ns: int) -> None:
         """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier."""
         data, self._taken = self._taken, b""
         if not data:
             return
-        settings = _settings(self._slave)
+        settings = _settings(self._master)
         if settings != self._settings:  # the host's rate can only be another one then
             self._settings = settings
             rate = _rate(settings)
@@ -105,15 +111,18 @@ class PseudoTerminal:
 
     def close(self) -> None:
         """Take the terminal and its link away."""
-        _close((self._master, self._slave))
+        os.close(self._master)
         self._unpublish()
 
-    def _new_pair(self) -> tuple[int, int]:
+    def _new_pair(self) -> tuple[int, str]:
+        """Return the descriptor of the master and the path of the slave, whose settings stay."""
         master, slave = os.openpty()
         tty.setraw(slave)
         _set_rate(slave, self.bus.baud_rate)
         os.set_blocking(master, False)
-        return master, slave
+        name = os.ttyname(slave)
+        os.close(slave)
+        return master, name
 
     def _publish(self) -> None:
         if self._link is not None:
@@ -150,11 +159,6 @@ class DeviceLink:
             if self._target is not None and os.readlink(self._path) == self._target:
                 self._path.unlink()
         self._target = None
-
-
-def _close(pair: tuple[int, int]) -> None:
-    for descriptor in pair:
-        os.close(descriptor)
 
 
 def _settings(terminal: int) -> bytes:

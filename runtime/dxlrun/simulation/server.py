@@ -36,6 +36,9 @@ GATHER_NS = 250_000
 """Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
 hand-over costs the processor, and the host's, more than a reply."""
 
+_WRITTEN = select.EPOLLIN | select.EPOLLET
+"""Reports once what a host has written; without a host a terminal is at its end all the time."""
+
 IDLE_NS = 300_000  # So long the mechanics of a few steps may take
 
 _GOAL_MODES = (3, 4, 5)
@@ -114,16 +117,16 @@ class Server:
                 due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
                 if due_ns is not None and due_ns <= now_ns:
                     self._deliver(terminal, now_ns)
-        for _ in self._terminals:
-            if not ready:
-                break
+        rounds = len(self._terminals)  # a host that drives all buses writes to them in one go
+        while ready:
             for number, _ in ready:
                 if number in self._by_descriptor:
                     self._by_descriptor[number].read()
             now_ns = time.monotonic_ns()  # no host gets a reply before it wrote, though other lines take long
             for number, _ in ready:
                 self._read_ready(number, wake, now_ns)
-            ready = self._waiting.poll(0)  # a host that drives all buses writes to them in one go
+            rounds -= 1
+            ready = self._waiting.poll(0) if rounds else []  # what is reported is reported once
         self._ledger.flush_if_due(now_ns)
 
     def _work_in_idle_time(self, now_ns: int) -> int | None:
@@ -133,7 +136,7 @@ class Server:
         if self._held:
             for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
                 del self._held[number]
-                self._waiting.register(number, select.EPOLLIN)
+                self._waiting.register(number, _WRITTEN)
             times += self._held.values()
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
@@ -179,6 +182,8 @@ class Server:
         if bus.host_free_ns - MOST_BACKLOG_NS > now_ns:
             self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
             self._waiting.unregister(number)
+        elif terminal.may_have_more:
+            self._waiting.modify(number, _WRITTEN)  # reports what is there once more
 
     def _plug(self) -> None:
         """Wait for the terminals that are there now."""
@@ -188,7 +193,7 @@ class Server:
         self._held.clear()
         self._by_descriptor = {each.fileno(): each for each in self._terminals if each.plugged}
         for number in self._by_descriptor:
-            self._waiting.register(number, select.EPOLLIN)
+            self._waiting.register(number, _WRITTEN)
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}
