@@ -33,7 +33,7 @@ def lost_lines(totals: RunTotals) -> Iterable[Finding]:
     """Report each line that was lost."""
     for group in severe_of(totals.events, EventCode.PORT_LOST):
         times = "" if group.count == 1 else f" {group.count} times"
-        line = last_line(group)
+        line = sentence_of(group)
         sentence = f"Bus {group.source} was lost{times}: {line}" + ("" if line.endswith("?") else ".")
         yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
 
@@ -258,7 +258,9 @@ def implausible(totals: RunTotals) -> Iterable[Finding]:
     for group in totals.events:
         movers = totals.plan.movers.get(group.source, ())
         if group.code == EventCode.IMPLAUSIBLE and movers and not named & {group.source, movers[0].bus.name}:
-            sentence = f"{last_line(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
+            sentence = (
+                f"{sentence_of(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
+            )
             fix = "Turn it by hand without torque, and watch its position."
             yield cause("position_jumped", group.source, sentence, fix, 4.0)
 
@@ -321,6 +323,7 @@ def _name(servo: ServoTraffic) -> str:
     return f"{kind} {servo.servo_id} ({servo.joint or servo.bus})"
 
 
-def last_line(group: EventGroup) -> str:
-    """Return the last line of an event's text: of a traceback what was raised."""
-    return group.text.strip().splitlines()[-1] if group.text.strip() else group.name
+def sentence_of(group: EventGroup) -> str:
+    """Return an event's text in a line: all problems of a start, of a traceback what was raised."""
+    lines = group.text.strip().splitlines() or [group.name]
+    return "; ".join(lines) if group.code == EventCode.SETUP else lines[-1]

@@ -38,11 +38,11 @@ from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.lost import (
     implausible,
     invalid_states,
-    last_line,
     lost_devices,
     lost_lines,
     lost_servos,
     missing_replies,
+    sentence_of,
     servo_errors,
     severe_of,
     whole_buses,
@@ -153,7 +153,7 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
     if not account.records:
         none = "The log has no cycle of the loop" if totals.damage else "The loop never ran a cycle"
         refused = severe_of(totals.events, EventCode.SETUP)
-        why = f": {last_line(refused[0])}" if refused else ""
+        why = f": {sentence_of(refused[0])}" if refused else ""
         yield Finding("never_ran", "loop", f"{none}{why}.", rank=Rank.NEVER_RAN)
         return
     share = account.skipped / account.elapsed
@@ -272,7 +272,7 @@ def _events(totals: RunTotals) -> Iterable[Finding]:
         count = sum(group.count for group in severe)
         first = min(severe, key=lambda group: group.t_ns)
         number = "One error was" if count == 1 else f"{count} errors were"
-        sentence = f"{number} logged; the first, of {first.source}: {last_line(first)}"
+        sentence = f"{number} logged; the first, of {first.source}: {sentence_of(first)}"
         yield Finding("errors_logged", first.source, sentence, rank=Rank.ERROR)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tests.kit.moved_joints import FAULT, LOAD, SWING, TICK, TIME, Floats, Joint, behind, findings, only
+from tests.kit.stories import send, tell
 
 from dxlrun.channels.cycle import Torque
+from dxlrun.log.reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Series
@@ -17,7 +20,15 @@ from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.page.canvas import Canvas
 from dxlrun_analysis.page.findings import finding_plots
+from dxlrun_analysis.report import analyze
 
+WHEEL = """\
+name: wheel
+buses: {main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
+loop: {rate: 50}
+joints: {w: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, continuous: true}}
+controllers: {c: {type: joint_group_velocity_controller, joints: [w]}}
+"""
 FROZEN = np.where(FAULT, behind(SWING)[250], behind(SWING))
 
 
@@ -276,3 +287,12 @@ def test_a_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -
 )
 def test_what_a_joint_may_do_is_no_jump(joint: Joint) -> None:
     assert "position_jumped" not in {finding.code for finding in findings(joint, Joint(), Joint())}
+
+
+def test_a_wheel_whose_position_wraps_is_not_accused_of_a_slipping_gear(tmp_path: Path) -> None:
+    """An AX-12A counts 300 degrees of a turn (e-Manual AX-12A, Present Position (36))."""
+    file = tmp_path / "robot.yaml"
+    file.write_text(WHEEL)
+    log = read_log(tell(file, {20: [send("c", "velocities", 3.0)]}, tmp_path / "run.mcap", seconds=5.0))
+    assert np.abs(np.diff(log.cycles["position"][:, 0])).max() > 5.0, "it wrapped"
+    assert "position_jumped" not in {one.code for one in analyze(log).verdict.findings}

@@ -141,7 +141,14 @@ def test_a_battery_that_gets_empty_does_not_sag_under_load() -> None:
 def test_a_voltage_that_most_servos_report_is_that_of_their_bus() -> None:
     ((code, subject, sentence),) = findings(volts(None, 4.0), errors=[1, 1, 1, 0])
     assert (code, subject) == ("undervoltage", "main")
-    assert "The voltage of bus main is out of its limits of 9.5 to 16.0 V: 8.0 to 8.0 V." in sentence
+    assert "The voltage of bus main is out of its limits of 9.5 to 16.0 V: 8.0 V." in sentence
+
+
+def test_a_reported_voltage_error_without_a_reading_beyond_the_limits_names_no_contradiction() -> None:
+    ((code, subject, sentence),) = findings(volts(), errors=[0, 1, 0, 0])
+    assert (code, subject) == ("undervoltage", "j1")
+    assert "out of its limits" not in sentence
+    assert "is within the limits of 9.5 to 16.0 V: 12.0 V. A dip or a peak between" in sentence
 
 
 @pytest.mark.parametrize(("heat", "code"), [(200.0, "temperature_sensor"), (75.0, "hot_joint")])

@@ -15,7 +15,7 @@ import pytest
 from msgspec import structs
 from tests.kit.made_logs import loop_of, made_log
 
-from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.cycle import CycleLayout, Torque
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.plan.loop_plan import JointPlan
@@ -160,6 +160,16 @@ def test_a_way_begins_where_the_joint_stands_when_it_gets_a_goal(make: Make) -> 
     assert way[23:] == pytest.approx(np.minimum(0.4 + np.arange(77) * DT * 0.5, 1.0))
     nothing = only(make(np.full(20, np.nan), positions[:20]))
     assert (nothing.rms_rad, nothing.worst_rad, nothing.lag_ms, nothing.rest_rad) == (None, None, None, None)
+
+
+def test_a_joint_that_is_given_torque_goes_to_no_goal_from_before(make: Make) -> None:
+    """A reboot took it back by two turns, and its goal with it."""
+    goals = stepped(100, 40, -4 * math.pi)
+    log = make(goals, goals, speed=0.5)
+    log.cycles["torque"] = Torque.ON
+    log.cycles["torque"][40:60] = Torque.OFF
+    log.cycles["torque"][60] = Torque.GIVEN
+    assert reachable(log, 0)[62:] == pytest.approx(np.full(38, -4 * math.pi))
 
 
 def test_a_speed_of_0_is_the_slowest_and_not_none(make: Make) -> None:

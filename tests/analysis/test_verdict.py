@@ -475,11 +475,13 @@ def test_a_servo_that_is_lost_alone_is_told_with_its_angle() -> None:
 
 
 def test_why_the_start_was_refused_is_said_first() -> None:
-    refused = EventGroup(EventCode.SETUP, Severity.ERROR, "loop", 1, MS, "elbow has angle limits 1850..2246")
+    text = "knee is at 70.0 deg\nelbow has angle limits 1850..2246"
+    refused = EventGroup(EventCode.SETUP, Severity.ERROR, "loop", 1, MS, text)
     found = judge(
         replace(totals(events=(refused,)), periods=Periods(0, 0, 0, 0, True, 50.0, 0.0, ()))
     ).findings
-    assert found[1].sentence == "The loop never ran a cycle: elbow has angle limits 1850..2246."
+    why = "knee is at 70.0 deg; elbow has angle limits 1850..2246"
+    assert found[1].sentence == f"The loop never ran a cycle: {why}."
 
 
 @pytest.mark.parametrize(("cycles", "said"), [(40, 1), (10, 0)])

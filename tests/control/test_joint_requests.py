@@ -113,6 +113,16 @@ def test_a_controller_is_not_activated_on_a_limp_joint(story, torque):
     assert story.refusals[1 + at_once] == "j2 has no torque; `dxlrun torque on j2` gives it"
 
 
+def test_a_limp_joint_outside_its_limits_is_moved_inside_before_it_can_get_torque(story):
+    def stand_outside():
+        story.record.goals.position[2] = 4.0  # where the hardware of this test has it then
+
+    limp = story.shows(2, torque=Torque.OFF)
+    story.run(5, {1: [limp, stand_outside, story.switches(["other"])]})
+    hint = "move j2 inside the limits by hand, then `dxlrun torque on j2` gives it"
+    assert story.answer() == (Code.JOINT_LIMP, {**LIMP, "hint": hint})
+
+
 def test_a_controller_is_activated_when_the_joint_has_torque_again(story):
     switch = story.switches(["other"])
     off = [story.done(), story.shows(2, torque=Torque.RELEASED)]

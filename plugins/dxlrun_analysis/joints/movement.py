@@ -48,7 +48,7 @@ class _Jumps:
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
         top = joint.logged.top_speed
-        turned: Floats | float = math.inf if top is None else _TOO_FAST * top * seconds
+        turned: Floats | float = math.inf if top is None or joint.wraps else _TOO_FAST * top * seconds
         jumps = (moved > np.maximum(MOVED_RAD * joint.share, turned)) & (seconds < _JUMP_S)
         if jumps.any():
             self.first_ns = self.first_ns or int(at_ns[1:][jumps][0])

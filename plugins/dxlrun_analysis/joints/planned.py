@@ -43,6 +43,7 @@ class PlannedJoint:
     share: float = 1.0  # m of a linear joint for each rad of its servo; 1 of one that turns
     softness: float = 1.0  # So many times lower than its model's is the gain in the robot file, from 1 to 3
     alike: str = ""  # Models and registers: joints that have the same ones follow alike
+    wraps: bool = False  # Its position goes from one end of its range to the other in a wheel's turn
     logged: JointPlan = UNKNOWN_JOINT
     errors: tuple[HardwareErrors, ...] = ()  # Of the models of its servos, each once
 
@@ -84,11 +85,18 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share for one in mine) if joint.linear else 1.0,
                 max(_softness(one) for one in mine),
                 ", ".join(sorted(f"{one.servo.model} {one.servo.registers}" for one in mine)),
+                joint.continuous and any(_counts_one_turn(one) for one in mine),
                 joint,
                 tuple({one.servo.model: table.errors for one in mine if (table := _table(one))}.values()),
             )
         )
     return tuple(found)
+
+
+def _counts_one_turn(one: Mover) -> bool:
+    """Check whether a position has too few bytes for turns; as `ServoPlan.wraps`."""
+    table = _table(one)
+    return table is not None and table.items["present_position"].size < 4
 
 
 def _table(one: Mover) -> ControlTable | None:

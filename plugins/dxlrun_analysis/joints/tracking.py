@@ -88,6 +88,8 @@ class _Way:
 
 def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _Sent:
     goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
+    # with new torque the joint holds where it is: what it did not reach before is no longer its goal
+    goal[cycles["torque"][:, row] == Torque.GIVEN] = np.nan
     position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
     commanded = np.abs(cycles["goal_velocity"][:, row])
     speed = np.where(np.isfinite(commanded), np.maximum(commanded, limits.slowest), math.inf)

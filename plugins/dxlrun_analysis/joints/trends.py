@@ -215,13 +215,11 @@ class Trends:
                 min(joint.highest_volts for joint in joints),
             )
             where = f"bus {bus}" if 2 * len(names) > len(members) > 1 else ", ".join(names)
-            known = np.isfinite(lowest[reported]).any()
+            measured = lowest[reported].min(), highest[reported].max()
             yield cause(
                 "undervoltage",
                 names[0] if alone else bus,
-                f"The voltage of {where} is out of its limits"
-                + (f" of {low:.1f} to {high:.1f} V" if math.isfinite(high - low) else "")
-                + (f": {lowest[reported].min():.1f} to {highest[reported].max():.1f} V." if known else "."),
+                _describe_voltage(where, (low, high), measured),
                 "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
                 4.0,
             )
@@ -261,6 +259,21 @@ class Trends:
             "Check its plug and the cable that leads to it alone: contacts with a high resistance.",
             4.0,
         )
+
+
+def _describe_voltage(where: str, limits: tuple[float, float], measured: tuple[float, float]) -> str:
+    """Describe the voltage of servos that reported an error of it; `measured`: lowest and highest."""
+    (low, high), (lowest, highest) = limits, measured
+    bounds = f" of {low:.1f} to {high:.1f} V" if math.isfinite(high - low) else ""
+    volts = f"{lowest:.1f} V" if f"{lowest:.1f}" == f"{highest:.1f}" else f"{lowest:.1f} to {highest:.1f} V"
+    if not math.isfinite(lowest):
+        return f"The voltage of {where} is out of its limits{bounds}."
+    if bounds and low <= lowest and highest <= high:
+        return (
+            f"An input voltage error of {where} was reported, but each voltage that was read is within the "
+            f"limits{bounds}: {volts}. A dip or a peak between two readings is not seen."
+        )
+    return f"The voltage of {where} is out of its limits{bounds}: {volts}."
 
 
 def _how_it_falls(samples: list[_Sample]) -> str:

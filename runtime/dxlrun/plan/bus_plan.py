@@ -183,6 +183,11 @@ class ServoPlan(msgspec.Struct, frozen=True):
         """What the joint moves in a tick of the position, rad or m."""
         return self.rad_per_tick * self.ratio
 
+    @property
+    def wraps(self) -> bool:
+        """True where the position goes from one end of its range to the other in a wheel's turn."""
+        return self.continuous and self.state.position.size < 4
+
     def joint_position(self, raw: int) -> float:
         """Return the joint's position, rad or m, of a present or goal position in ticks.
 

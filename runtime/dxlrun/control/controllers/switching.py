@@ -214,18 +214,28 @@ class Switching:
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
         """Refuse controllers for joints without torque: they would command what cannot move."""
         limp: dict[str, str] = {}
+        limp_rows: list[int] = []
         names: list[str] = []
         for managed in (self.named[name] for name in entering):
             torqued = self._torqued(managed)
             if managed.plan.commands_servos and not (managed.plan.partial and torqued):
                 rows = [row for row in managed.rows.tolist() if row not in torqued]
+                limp_rows += [row for row in rows if row not in limp_rows]
                 limp.update((self._joints[row].name, self._joints[row].label) for row in rows)
                 names += [managed.plan.name] if rows else []
         if not limp:
             return None
         named = list(limp) if len(limp) <= MOST_NAMED else names  # a controller stands for its joints
         hint = f"`dxlrun torque on {' '.join(named)}` gives it"
+        outside = [self._joints[row].name for row in limp_rows if self._is_outside(row)]
+        if outside:
+            hint = f"move {' and '.join(outside)} inside the limits by hand, then {hint}"
         return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
+
+    def _is_outside(self, row: int) -> bool:
+        """Check whether a joint is where it gets no torque."""
+        joint, position = self._joints[row], float(self._states.position[row])
+        return joint.bounded and (position < joint.lower or position > joint.upper)
 
     # Modes
 

@@ -76,7 +76,7 @@ class CyclicReads:
         """Groups whose fast reads stayed incomplete, so that they are read plainly now; to be reported."""
         self.begun = False  # True from the parser's first read of a cycle to `end`
         self._plan = plan
-        self._samples = samples
+        self.samples = samples
         self._line = plan_line(plan)
         self._owed = owed
         self._planned_at = 0  # version of `owed` that the cycle was planned with
@@ -140,7 +140,7 @@ class CyclicReads:
         for request in self.cycle.queue:
             if member in request.indices:
                 before = request.indices[: request.indices.index(member)]
-                arrived = self._samples.arrived
+                arrived = self.samples.arrived
                 return not arrived(member) and all(arrived(one) for one in before)
         return False
 
@@ -233,7 +233,7 @@ class CyclicReads:
     def begin(self, done: int = 0) -> None:
         """Begin the parser's part of a cycle, behind the reads that the kernel has done."""
         if not done:
-            self._samples.clear()
+            self.samples.clear()
         self.begun = self._patient = True
         self._position = done
 
@@ -254,7 +254,7 @@ class CyclicReads:
     def status(self, index: int, reply: Reply) -> None:
         """Keep the state of one servo of the current read."""
         servo = self.cycle.queue[self._position].indices[index]
-        self._samples.take(servo, reply.parameters, reply.last_ns)
+        self.samples.take(servo, reply.parameters, reply.last_ns)
         self.errors[servo] = reply.error
 
     def _count_loss(self, request: Request, outcome: Outcome) -> None:
@@ -266,7 +266,7 @@ class CyclicReads:
                 self.given_up.append(request.group)
         garbled = outcome is not Outcome.TIMEOUT
         for servo in request.indices:
-            if not self._samples.arrived(servo):
+            if not self.samples.arrived(servo):
                 self.garbled[servo] = garbled
                 garbled = False  # the bytes are those of the first one; nothing is known of those behind it
 

@@ -57,6 +57,8 @@ class Samples:
         """Time at which the newest plausible reply arrived; -1 while none ever did."""
         self.shown_ns = self.at_ns.copy()
         """The same as of the end of the cycle before: the time of the sample that the states show."""
+        self.recounted_ns = np.full(len(servos), -2, dtype=np.int64)
+        """Time of the last sample before a servo began to count its turns again; -2: it did not."""
         self.doubted = np.zeros(len(servos), dtype=np.bool_)
         """True where the reply of this cycle is not believed."""
         self.jumps = Jumps(plans, events)
@@ -100,7 +102,8 @@ class Samples:
         steps = self.values[0] - self.states.position[self.rows]
         for index in self.jumps.suspects(steps, self.fresh):
             elapsed_ns = int(self.at_ns[index] - self.shown_ns[index])
-            if not self.jumps.can_be(index, float(steps[index]), elapsed_ns, now_ns):
+            counts_on = self.shown_ns[index] > self.recounted_ns[index]
+            if counts_on and not self.jumps.can_be(index, float(steps[index]), elapsed_ns, now_ns):
                 self.doubted[index] = True
                 self.at_ns[index] = self.shown_ns[index]
         self.devices.judge(now_ns)
@@ -115,6 +118,7 @@ class BusSamples:
         blocks = slice(first_block, first_block + len(plan.members) - len(plan.servos))
         self._samples = samples
         self._number = number
+        self._here = here
         self.fresh = samples.fresh[here]
         """True where an intact reply arrived in this cycle; shape (servos of the bus,)."""
         self.blocks_fresh = samples.devices.fresh[blocks]
@@ -128,6 +132,10 @@ class BusSamples:
         """Begin a cycle: nothing has arrived."""
         self.fresh[:] = False
         self.blocks_fresh[:] = False
+
+    def restart_count(self, servo: int) -> None:
+        """Believe the next position of a servo, however far it is: a reboot took it back into one turn."""
+        self._samples.recounted_ns[self._here][servo] = self.at_ns[servo]
 
     def arrived(self, member: int) -> bool:
         """Check whether an intact reply of a member of the plan arrived in this cycle."""
@@ -151,7 +159,7 @@ class Jumps:
         self._events = events
         both = [(plan, servo) for plan in plans for servo in plan.servos]
         self._servos = [servo for _, servo in both]
-        speeds = [np.inf if _wraps(servo) else _most_speed(plan, servo) for plan, servo in both]
+        speeds = [np.inf if servo.wraps else _most_speed(plan, servo) for plan, servo in both]
         ratios = np.array([servo.ratio for _, servo in both], dtype=np.float64)
         self._fastest = np.array(speeds, dtype=np.float64) * ratios
         self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD * ratios
@@ -198,8 +206,3 @@ def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:
     limit = control_table(servo.model, plan.protocol).items.get("velocity_limit")
     ticks = servo.max_speed_tick if limit is None else min(servo.max_speed_tick, limit.maximum)
     return ticks * servo.rad_s_per_tick
-
-
-def _wraps(servo: ServoPlan) -> bool:
-    """Check whether a position may go from one end of its range to the other in a wheel's turn."""
-    return servo.continuous and servo.state.position.size < 4

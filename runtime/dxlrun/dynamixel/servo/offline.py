@@ -31,10 +31,6 @@ FIRST_PROBE_NS = 200_000_000
 REBOOT_NS = 3_000_000_000
 """How long a servo that a client rebooted may take until it is in order again [i]."""
 _GARBLED = "answers garbled or twice: do two servos have its ID? If not, check its cable"
-_OTHER_TURN = (
-    "lost count of its turns when it rebooted, so its goal would be turns away: it gets no torque again in "
-    "this mode; start the run anew"
-)
 
 
 class Offline:
@@ -116,7 +112,8 @@ class Offline:
                 found.log(life.events)
                 self._take_back(index, loss, torqued, mode)
                 return
-            problem = f"answers again, but cannot take part: {'; '.join(found.problems)}"
+            problems = (each.removeprefix(f"{one} ") for each in found.problems)
+            problem = f"answers again, but cannot take part: it {'; it '.join(problems)}"
             self._answer(index, loss, problem)
         if problem and problem != loss.problem:
             loss.problem = problem
@@ -141,7 +138,14 @@ class Offline:
         torque, mode = self._may_get_torque(index), self.desired.mode(index)
         if torque and servo.continuous and servo.mode_plan(mode).goals[-1].position is not None:
             torque = False
-            life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, _OTHER_TURN)
+            loss = life.losses.get(index)
+            if loss is not None and not loss.limp_reported:
+                loss.limp_reported = True
+                text = (
+                    "lost count of its turns when it rebooted, so it stays limp where it is and counts from "
+                    f"there; `dxlrun torque on {servo.joint}` gives it torque"
+                )
+                life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
         torqued = yield from rejoin(one, found, mode, self.desired.registers(index), torque=torque)
         if not found.problems:
             yield from self.desired.read_limits(index)
@@ -171,6 +175,8 @@ class Offline:
         else:
             life.on(index, ServoEvent.TORQUE_GIVEN)
             how = "holding where it is"
+        if loss.rebooted and life.plan.servos[index].continuous:
+            life.reads.samples.restart_count(index)
         self.desired.returned(index, mode)
         life.report(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
         if loss.released:

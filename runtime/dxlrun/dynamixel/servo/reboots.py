@@ -148,10 +148,11 @@ class Reboots:
                 life.report(EventCode.SERVO_REBOOTED, Severity.INFO, index, "started anew, as requested")
                 return
         text = "started anew: it was without power, or something rebooted it"
-        life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
         if self._counts[index].add(life.now_ns()):
-            text = "rebooted twice within a minute: it gets no torque again by itself; check its supply"
-            life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+            text += (
+                "; it rebooted twice within a minute, so no policy gives it torque again: check its supply"
+            )
+        life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
 
     def exhausted(self, index: int) -> bool:
         """Return whether a servo rebooted so often that no policy gives it torque any more."""
