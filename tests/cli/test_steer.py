@@ -178,7 +178,10 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
     assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
     said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
     assert said.code == 2
-    assert "Temperature Limit (11) is in the EEPROM, which no servo writes while it holds torque" in said.err
+    assert (
+        "Temperature Limit (11) is in the EEPROM, which cannot be written while the servo has torque"
+        in said.err
+    )
 
 
 def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:

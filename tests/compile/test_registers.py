@@ -127,7 +127,7 @@ def test_what_is_declarable_is_declared_on_every_model():
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("temperature_limit", "is in the EEPROM"), ("status_return_level", "is not to be changed"), ("goal_pwm", "controllers command it")],
+    [("temperature_limit", "is in the EEPROM"), ("status_return_level", "cannot be changed"), ("goal_pwm", "controllers command it")],
 )  # fmt: skip
 def test_a_client_may_change_only_ram_of_its_own(name, said):
     table = control_table("XM430-W350", 2.0)

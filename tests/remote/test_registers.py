@@ -65,7 +65,7 @@ def test_a_servos_failure_is_the_answer(arm):
         (GAIN, {"value": 20_000}, 422, "pan: Position P Gain (84) of an XM430-W350 is 0..16383, not 20000"),
         (GAIN, {"value": "5 V"}, 422, "pan: Position P Gain (84) has no unit, but is '5 V'"),
         ("/joints/pan/registers/profile_acceleration", {"value": "5 V"}, 422, "profile_acceleration of pan: '5 V' has the unit V"),
-        ("/joints/pan/registers/goal_position", {"value": 1}, 422, "is not to be changed: controllers command it; write another item"),
+        ("/joints/pan/registers/goal_position", {"value": 1}, 422, "cannot be changed: controllers command it; write another item"),
         ("/joints/pan/registers/present_position", {"value": 1}, 422, "can only be read; write another item"),
         ("/joints/pan/registers/torque_enable", {"value": 0}, 422, "dxlrun switches the torque"),
         ("/joints/pan/registers/bus_watchdog", {"value": 0}, 422, "dxlrun arms it"),

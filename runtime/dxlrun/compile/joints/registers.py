@@ -18,8 +18,8 @@ from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
 _ADDRESS = ("dxlrun finds the servo by it", "take it out; `dxlrun servo` changes it")
-_SECOND_ID = ("a servo that hears a second ID obeys the goals of another", "take it out")
-_TICK = ("it changes what a tick is", "take it out")
+_SECOND_ID = ("a servo with a second ID executes the goals of another one", "take it out")
+_TICK = ("it changes the size of a tick", "take it out")
 _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "id": _ADDRESS,
@@ -42,11 +42,11 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "current": ("it is measured", "take it out"),
         "torque_limit": (
             "policies reduce it, and a start restores it",
-            "declare max_torque, which it begins as",
+            "declare max_torque, its value after power-on",
         ),
         "bus_watchdog": ("dxlrun arms it", "take it out; the bus' key `bus_watchdog` is its time"),
-        "lock": ("nothing in the EEPROM could be written until power-off", "take it out"),
-        "hybrid_save": ("it stores values at a moment of its own", "take it out"),
+        "lock": ("it closes the EEPROM until power-off", "take it out"),
+        "hybrid_save": ("it stores RAM values in the EEPROM", "take it out"),
         "electronic_gearratio_numerator": _TICK,
         "electronic_gearratio_denominator": _TICK,
     }
@@ -79,7 +79,7 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     if item is None:
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
     if reason := own_reason(table, item):
-        raise UnfitRegister(f"{item.title} is not to be declared: {reason[0]}", reason[1])
+        raise UnfitRegister(f"{item.title} cannot be declared: {reason[0]}", reason[1])
     found = any_value(table, name, value)
     _check_meaning(item, found.value)
     return found
@@ -111,17 +111,17 @@ def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterV
     if item is not None and item.access == "R":
         raise UnfitRegister(f"{item.title} can only be read", "write another item")
     if item is not None and (reason := own_reason(table, item)):
-        raise UnfitRegister(f"{item.title} is not to be changed: {reason[0]}", "write another item")
+        raise UnfitRegister(f"{item.title} cannot be changed: {reason[0]}", "write another item")
     found = register_value(table, name, value)
     item = table.items[name]
     if found.eeprom:
         raise UnfitRegister(
-            f"{item.title} is in the EEPROM, which no servo writes while it holds torque",
+            f"{item.title} is in the EEPROM, which cannot be written while the servo has torque",
             "declare it under `registers` in the robot file, which the next start writes",
         )
     if item.deviation is not None and item.deviation.may_refuse:
         raise UnfitRegister(
-            f"{item.title} is not to be changed: another value {item.deviation.effect}", "leave it as it is"
+            f"{item.title} cannot be changed: another value {item.deviation.effect}", "leave it as it is"
         )
     return found
 
@@ -135,7 +135,7 @@ def declarable(table: ControlTable) -> tuple[str, ...]:
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
     """Return why an item belongs to dxlrun and what to do instead; None where it does not."""
     if item.name.startswith("indirect_"):
-        return "a reboot makes it mean something else", "take it out"
+        return "a reboot resets it", "take it out"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
             "both angle limits choose the mode, which dxlrun sets",
@@ -170,7 +170,7 @@ def compile_registers(
     if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
         file.warning(
             servo.mark(file.marks, "registers", "return_delay_time"),
-            f"{name} declares a return delay of {delay * 2} us, but bus {servo.bus} is reckoned with "
+            f"{name} declares a return delay of {delay * 2} us, but bus {servo.bus} is planned with "
             f"{bus.return_delay_time / 1000:g} us",
             f"write `return_delay_time: {delay * 2} us` at the bus if all its servos have it",
         )
@@ -217,7 +217,7 @@ def _raw(item: ControlItem, value: int | str) -> int:
         raise UnfitRegister(f"{item.title} has no unit, but is {value!r}", "write a whole number")
     ticks = quantity(value, item.unit) / item.scale
     if not math.isfinite(ticks):
-        raise UnfitRegister(f"{value} is too much for {item.title}", f"it takes {_range(item)}")
+        raise UnfitRegister(f"{value} is out of the range of {item.title}", f"write {_range(item)}")
     return round(ticks)
 
 
