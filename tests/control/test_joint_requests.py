@@ -123,6 +123,13 @@ def test_a_limp_joint_outside_its_limits_is_moved_inside_before_it_can_get_torqu
     assert story.answer() == (Code.JOINT_LIMP, {**LIMP, "hint": hint})
 
 
+def test_a_controller_is_not_activated_while_one_of_its_joints_is_limp(story):
+    story.script("both", HOLD, joints=("j1", "j2"), active=False)
+    story.run(5, {1: story.shows(2, torque=Torque.OFF), 2: story.switches(["both"], ["arm"])})
+    assert story.answer() == (Code.JOINT_LIMP, LIMP)
+    assert story.active(4) == ["arm"]
+
+
 def test_a_controller_is_activated_when_the_joint_has_torque_again(story):
     switch = story.switches(["other"])
     off = [story.done(), story.shows(2, torque=Torque.RELEASED)]

@@ -105,6 +105,15 @@ def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story
     assert not story.refused()
 
 
+def test_a_switch_continues_without_a_waiting_controller_that_is_deactivated(story):
+    story.script("left", HOLDS, joints=("j0",), command=("velocity",), **SPARE)
+    both, one = story.switches(["left", "press"], ["arm"]), story.switches([], ["press"])
+    story.through(16, {2: both, 4: one})
+    assert [type(given) for _, given in story.answered] == [Waiting, Done, Done]
+    assert story.active(-1) == ["left"]
+    assert isinstance(story.inbox.answers[1], Done)
+
+
 def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story):
     then = [story.switches(["press"]), story.switches(["wheels"]), story.posts("wheels", "x")]
     story.through(6, {2: story.switches(["wheels"], ["arm"]), 4: then}, slow=10)

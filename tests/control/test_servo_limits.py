@@ -153,6 +153,16 @@ def test_a_goal_within_a_register_is_not_reported(case, tmp_path):
     ] == []
 
 
+@pytest.mark.parametrize(("share", "held"), [(0.75, True), (0.45, False)])
+def test_a_velocity_register_limits_a_geared_joint_at_the_speed_of_its_output(share, held, tmp_path):
+    limits = "gear_ratio: 2, limits: {position: [-10 deg, 10 deg]}"
+    log, sent = run(CASES[2], tmp_path, share, limits)
+    assert (max(map(abs, sent)) == 50) is held
+    assert (log.cycles["clamped"][:, 0] & Clamp.VELOCITY).any() == held
+    told = [event.text for event in log.events if "clamped by register" in event.text]
+    assert told == ["a, controller c: clamped by register Velocity Limit (44) = 50, 34.3 deg/s"] * held
+
+
 @pytest.mark.parametrize(
     ("limits", "severity"),
     [("limits: {effort: 0.5 A}", Severity.WARNING), ("limits: {effort: 0.04 A}", None), ("", Severity.INFO)],
@@ -264,7 +274,8 @@ def test_a_servo_that_returns_with_the_same_limits_is_no_second_event(tmp_path):
 
 def test_a_register_binds_the_steps_only_where_the_file_limits_the_speed():
     slow = ServoLimit("velocity", 2.0, "Velocity Limit (44) = 83, 114 deg/s")
-    for velocity, step in ((None, None), (4.0, 2.0), (1.0, 1.0)):
+    # a plan has the top speed of the servo where the file has no limit
+    for velocity, step in ((None, None), (8.0, 8.0), (4.0, 2.0), (1.0, 1.0)):
         joint = JointPlan("j0", -1, 1, velocity, top_speed=8.0, servo_limits=(slow,))
         assert joint.step_speed == (step or float("inf"))
         assert joint.highest_speed == min(2.0, velocity or 2.0)

@@ -7,6 +7,7 @@ from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, p
 
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.commands import LOOP
+from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.errors import PlugInError
@@ -279,6 +280,18 @@ def test_a_stream_that_ends_without_a_word_is_held_until_the_next_command(steere
     assert steered.events.of(EventCode.STALE_COMMAND) == [held]
     assert np.isnan(steered.sink.cycles[7]["position"]).tolist() == [True, False]
     assert steered.active(7) == ["left", "right"]
+
+
+def test_commands_of_a_stream_that_ended_stay_withheld_when_a_joint_regains_torque(steered):
+    def shows(torque):
+        return lambda: steered.record.states.torque.__setitem__(0, torque)
+
+    stream, command = steered.posts("left", "position", b"", PERIOD_NS), steered.posts("left", "position")
+    steered.run(15, {1: stream, 6: shows(Torque.GIVEN), 7: shows(Torque.ON), 11: command})
+    assert steered.steps("left", "activate") == [-1, 6, 11]
+    sent = [cycle["position"][0] for cycle in steered.sink.cycles]
+    assert np.isnan(sent[3:11]).all()
+    assert sent[11:] == [0.1] * 4
 
 
 class Holding(Scripted):

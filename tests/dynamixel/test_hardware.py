@@ -326,12 +326,13 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same():
     assert "waits for idle time" in text
 
 
-def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
+@pytest.mark.parametrize("step", [0.05, -0.05])
+def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started, step):
     started.restless = 0.006
     servo = started.servo(5)
     servo.silence()
     for _ in range(20):
-        started.goals.position[2] += 0.05  # each step is small, and the servo sees none of them
+        started.goals.position[2] += step  # each is small, and the servo sees none of them
         started.cycle()
     servo.silence(False)
     for _ in range(80):
@@ -362,6 +363,18 @@ def test_a_changed_error_byte_is_told_in_the_manuals_words(started):
     assert "overheating" in event[1]
     assert "ID 6 on bus main" in event[1]
     assert started.states.valid[3]
+
+
+@pytest.mark.parametrize(("error", "shown"), [(0x02, 0), (0x08, 0), (0x04, 0x04), (0x06, 0x04), (0x20, 0x20)])
+def test_the_states_have_only_the_hardware_errors_of_an_error_byte(started, error, shown):
+    def report(reply):
+        return protocol1.status_packet(6, error, reply[5:-1])
+
+    started.cycle()
+    started.buses[0].alter_next(6, "an error", report)
+    started.cycle()
+    assert started.states.hardware_error[3] == shown
+    assert len(started.events.of(EventCode.SERVO_ERROR)) == 1
 
 
 def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start():

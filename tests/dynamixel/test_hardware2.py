@@ -161,6 +161,18 @@ def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     assert started.into_bus()[begun:].count(protocol2.read(14, 70, 1)) == 1
 
 
+def test_a_hardware_error_that_comes_back_is_reported_again(started):
+    started.cycle()
+    shown = []
+    for error in (0x20, 0, 0x20):
+        started.servo(14).poke("hardware_error_status", error)
+        started.cycles(4)
+        shown.append(int(started.states.hardware_error[3]))
+    assert shown == [0x20, 0, 0x20]
+    told = [text for text in started.events.texts(EventCode.SERVO_ERROR) if "overload error" in text]
+    assert len(told) == 2
+
+
 @pytest.mark.parametrize("late_ms", [20.1, 20.3, 20.6, 20.9, 40.3, 40.6])
 def test_late_replies_of_three_silent_servos_are_never_taken_as_current(late_ms):
     """Three losses of one group in one cycle: the next request must still differ from the one before."""

@@ -352,6 +352,34 @@ def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off():
     assert arm.shown[1] is Torque.RELEASED
 
 
+def test_a_lost_servo_without_torque_stays_limp_after_torque_off_though_it_reboots():
+    arm = Arm(returning=True).start()
+    arm.servo.trigger_overload()
+    arm.follow(10)
+    assert arm.shown[1] is Torque.OFF
+    arm.servo.silence()
+    arm.rig.cycles(30)
+    assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
+    begun = len(arm.rig.into_bus())
+    arm.servo.reboot()
+    arm.servo.silence(False)
+    arm.follow(200)
+    assert arm.shown[1] is Torque.RELEASED
+    assert (12, 1) not in arm.torque_bytes(begun)
+    assert arm.rig.torque() == [True, False, True]
+
+
+def test_a_limp_servo_that_refuses_a_mode_gets_no_torque():
+    arm = Arm(1.0).let_go()
+    begun = len(arm.rig.into_bus())
+    arm.servo.poke("lock", 1)
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
+    arm.follow(40)
+    assert any("was not written" in text for text in arm.rig.events.texts(EventCode.MODE))
+    assert (12, 1) not in arm.torque_bytes(begun)
+    assert arm.rig.torque() == [True, False, True]
+
+
 def test_requests_on_a_line_that_is_gone_are_answered():
     arm = Arm().start()
     assert arm.told(arm.switch(False, row=0)) == ""

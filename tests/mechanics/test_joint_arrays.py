@@ -169,6 +169,19 @@ def test_servos_of_a_wrist_arrive_together_at_the_speed_of_its_slowest_joint(arr
     assert np.isnan(arrays.servo_goals.velocity[-2:]).all()  # as fast as the servos can
 
 
+@pytest.mark.parametrize("pitch", [-0.8, 0.8])
+@pytest.mark.parametrize("roll", [-0.05, 0.05])
+def test_the_slowest_joint_of_a_wrist_decides_its_speed_in_either_direction(
+    arrays: JointArrays, pitch: float, roll: float
+) -> None:
+    arrays.read()
+    arrays.goals.position[[PITCH, ROLL]] = pitch, roll
+    arrays.goals.velocity[[PITCH, ROLL]] = 1.0, 0.25
+    arrays.write()  # pitch takes 0.8 s
+    expected = abs(pitch + roll) / 0.8, abs(pitch - roll) / 0.8
+    assert arrays.servo_goals.velocity[-2:] == pytest.approx(expected)
+
+
 def test_a_servo_of_a_wrist_that_need_not_move_is_slow_and_not_as_fast_as_it_can(arrays: JointArrays) -> None:
     arrays.read()
     arrays.goals.position[[PITCH, ROLL]] = 0.3

@@ -193,6 +193,22 @@ def test_no_joint_with_a_limp_servo_gets_torque_outside_its_limits(
     assert "outside its limits -60.0 deg..60.0 deg" in answer
 
 
+@pytest.mark.parametrize(
+    ("pitch", "roll", "outside"),
+    [(0.0, 1.2, "roll"), (0.0, -1.2, "roll"), (0.9, 0.0, "pitch"), (0.7, 0.7, "")],
+)
+def test_no_joint_of_a_limp_wrist_may_be_outside_its_limits(
+    joints: Joints, pitch: float, roll: float, outside: str
+) -> None:
+    wrist = [4, 5]
+    joints.torque[wrist] = Torque.RELEASED
+    joints.arrays.servo_states.position[wrist] = pitch + roll, pitch - roll
+    joints.arrays.read()
+    joints.hardware.switch_torque(PITCH, True, joints.answers.append)
+    assert bool(joints.servos.switched) == (not outside)
+    assert [answer.split(" (")[0] for answer in joints.answers] == [outside] * bool(outside)
+
+
 def test_servos_that_are_given_torque_apart_keep_their_places_and_then_agree(joints: Joints) -> None:
     arrays = joints.arrays
     arrays.servo_states.position[HIP_SERVOS] = 0.20, 0.24
