@@ -9,7 +9,7 @@ from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
-from dxlrun.description.devices import Device, DeviceSimulation
+from dxlrun.description.devices import Device, DeviceSimulation, SensorEntry
 from dxlrun.description.form import Form
 from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
 from dxlrun.description.joints.mechanics import (
@@ -36,7 +36,6 @@ from dxlrun.description.robot import (
     Simulation,
     TorqueStep,
 )
-from dxlrun.description.sensors import SensorEntry
 
 PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)

@@ -113,7 +113,7 @@ WRONG = [
     ("POST", "/rate", b'{"rate": 1' + b"0" * 400 + b"}", 422, "invalid", "write for example"),
     ("POST", "/rate", {}, 422, "invalid", "missing required field `rate`"),
     ("DELETE", "/controllers/lefty", None, 404, "unknown_controller", "did you mean left?"),
-    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is no name"),
+    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is not a name"),
     ("POST", "/controllers", LOAD | {"name": 5}, 422, "invalid", "must be text"),
     ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
     ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "there is a controller left already"),

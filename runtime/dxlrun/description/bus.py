@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
 SIMULATED = "sim"  # The port of a simulated bus
@@ -70,7 +70,7 @@ class BusSimulation(Form):
 class SlowRegisters(Form):
     """What is read of the servos of a bus now and then, between the cycles."""
 
-    items: Annotated[tuple[Name, ...], Field(strict=False)] | None = key(
+    items: Annotated[tuple[ItemName, ...], Field(strict=False)] | None = key(
         "Items by the names of the control table; without: temperature and voltage.",
         "[present_temperature]",
         None,

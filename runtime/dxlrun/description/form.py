@@ -25,8 +25,28 @@ def refuse(what: str, fix: str) -> PydanticCustomError:
 def _name(value: str) -> str:
     # names become topics of the log and interfaces `<joint>/<interface>`
     if not _NAME.fullmatch(value):
-        raise refuse(f"{value!r} is no name", "start with a letter, and use letters, digits and _ only")
+        raise refuse(
+            f"{value!r} is not a name", _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
+        )
     return value
+
+
+def _item_name(value: str) -> str:
+    if not _NAME.fullmatch(value) or value != folded(value):
+        raise refuse(f"{value!r} is not the name of an item", _name_fix(folded(value)))
+    return value
+
+
+def _name_fix(name: str) -> str:
+    if _NAME.fullmatch(name):
+        return f"write {name}"
+    return "start with a letter, and use letters, digits and _ only"
+
+
+def folded(name: str) -> str:
+    """Return a name in lower case, with `_` between its words: position_p_gain for `Position P Gain`."""
+    parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
+    return re.sub(r"[^a-z0-9]+", "_", parts.lower()).strip("_")
 
 
 Name = Annotated[
@@ -35,6 +55,12 @@ Name = Annotated[
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
 ]
 """Letters, digits and _, first a letter."""
+ItemName = Annotated[
+    str,
+    AfterValidator(_item_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
+]
+"""Name of an item of a control table: position_p_gain."""
 
 
 class Form(BaseModel):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
+from contextlib import suppress
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -12,6 +13,7 @@ from pydantic_core import ErrorDetails
 
 from dxlrun.description.document import Grown, KeyPath, Marks, plain_value, text_of
 from dxlrun.description.form import Mistakes
+from dxlrun.description.mistakes.words import Context, Remedy
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
@@ -39,8 +41,45 @@ def problems_of(
         one = _Error(details, marks, prefix, model, beside)
         if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
             found.setdefault(one.path, []).append(one)
-    problems = [_merged(errors, marks) for errors in found.values()]
+    problems = [_merged(errors, marks) for errors in _explain_unknown_keys(found, marks)]
     return sorted(problems, key=lambda problem: problem.mark)
+
+
+def _explain_unknown_keys(found: Mapping[KeyPath, list[_Error]], marks: Marks) -> Iterator[list[_Error]]:
+    """Yield the errors of each place; unknown keys get their remedies, a pair of them is one error.
+
+    A missing key is not an error where an unknown one means it.
+    """
+    parents: dict[KeyPath, dict[str, _Error]] = {}
+    for path, errors in found.items():
+        if errors[0].kind == "extra_forbidden":
+            parents.setdefault(path[:-1], {})[str(path[-1])] = errors[0]
+    settled: set[KeyPath] = set()
+    for parent, errors_of in parents.items():
+        for remedy in _remedies_at(parent, errors_of, marks):
+            first, *others = (errors_of[key] for key in remedy.keys)
+            first.remedy = remedy
+            settled.update(one.path for one in others)
+            settled.add((*parent, remedy.means))
+    for path, errors in found.items():
+        if path not in settled or (errors[0].kind == "extra_forbidden" and errors[0].remedy is not None):
+            yield errors
+
+
+def _remedies_at(parent: KeyPath, unknown: Mapping[str, _Error], marks: Marks) -> list[Remedy]:
+    first = next(iter(unknown.values()))
+    form = None if first.model is None else _follow(first.model, first.location[:-1])
+    if first.model is None or form is None:
+        return []
+    sections: dict[str, list[str]] = {}
+    for path in marks.keys:
+        if len(path) <= 2:
+            sections.setdefault(str(path[0]), []).extend(map(str, path[1:]))
+    known, refused = keys_at(first.model, first.location[:-1])
+    known = (*known, *first.beside) if len(first.location) == 1 else known
+    values = {key: error.input for key, error in unknown.items() if key not in refused}
+    present = [str(path[-1]) for path in marks.keys if path[:-1] == parent]
+    return [*Context(first.model, form, parent, known, present, sections).remedies(values)]
 
 
 def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
@@ -117,18 +156,20 @@ def _is_between_keys(details: ErrorDetails) -> bool:
 
 def _repair(data: dict[str, object], error: _Error) -> KeyPath | None:
     """Replace a refused value by a good one, or remove it where its key has a default; return its path."""
-    at: Any = data  # mappings and lists of a file
+    at: Any = data
     path: KeyPath = ()
     *above, key = error.location or ("",)
     for step in above:
-        if step in at if isinstance(at, dict) else isinstance(at, list):  # else it names a union's member
+        with suppress(KeyError, TypeError):  # a step that names a union's member is not in the data
             at, path = at[step], (*path, step)
     if isinstance(at, dict) and (error.kind == "extra_forbidden" or _has_default(error)):
         at.pop(key, None)
-    elif isinstance(at, dict | list) and (good := _good_value(error)) is not None:
-        at[key] = good
-    else:
+        return (*path, key)
+    good = _good_value(error)
+    if good is None or not isinstance(at, dict | list):
         return None
+    container: Any = at
+    container[key] = good
     return (*path, key)
 
 
@@ -191,6 +232,7 @@ class _Error:
         path = _in_file(location[:-1] if self.missing else location, marks, prefix)
         self.path: KeyPath = (*path, location[-1]) if self.missing else path
         self.at_key = of_key or self.missing or self.kind == "extra_forbidden"
+        self.remedy: Remedy | None = None
 
     @property
     def meant(self) -> bool:
@@ -329,6 +371,8 @@ def _bound(value: object, error: _Error) -> str:
 def _remedy(error: _Error) -> str:
     """Return how to fix a value of a wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
+    if expected == "a mapping" and (fix := _indentation(error)):
+        return fix
     if error.kind in ("literal_error", "enum"):
         return "write it so"
     written = plain_value(error.input) if isinstance(error.input, str) else None
@@ -337,6 +381,17 @@ def _remedy(error: _Error) -> str:
     if expected == _TEXT and isinstance(error.input, bool | int | float):
         return f'put it in quotes: "{text_of(error.input)}"'
     return _example(error) or _REMEDIES.get(expected, "correct it")
+
+
+def _indentation(error: _Error) -> str:
+    """Return how to indent what should be a mapping; empty: its indentation is right, as far as is known."""
+    form = None if error.model is None else _follow(error.model, error.location)
+    if form is not None and error.path and error.path[-1] in form.model_fields:
+        return f"{error.path[-1]} is a key of an entry: indent it below the entry's name"
+    if isinstance(error.input, list) and error.input and all(isinstance(one, dict) for one in error.input):
+        names = [one.get("name", "NAME") for one in error.input]
+        return f"write `{names[0]}: {{...}}` for each entry, without `-` before it"
+    return ""
 
 
 def _example(error: _Error) -> str:
@@ -366,6 +421,10 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
         known = (*known, *error.beside)
     if key in refused:
         return f"{path_text(error.path)} is not possible", refused[key]
+    if error.remedy is not None:
+        keys = error.remedy.keys
+        named = f"an unknown key {key!r}" if len(keys) == 1 else f"unknown keys {keys[0]!r} and {keys[1]!r}"
+        return f"{parent} has {named}", error.remedy.fix
     otherwise = f"take it out; known keys: {', '.join(known)}" if known else "take it out"
     return f"{parent} has an unknown key {key!r}", suggestion(key, known, otherwise)
 

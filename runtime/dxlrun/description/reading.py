@@ -14,8 +14,9 @@ from pydantic import ValidationError
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks, refusal
 from dxlrun.description.including import KEY, Source, merged, read_sources
-from dxlrun.description.joints.groups import with_groups
+from dxlrun.description.joints.groups import moved, with_groups
 from dxlrun.description.joints.joints import kind_of_joint, misfits
+from dxlrun.description.mistakes.words import sections_meant
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem, told_once
@@ -79,7 +80,7 @@ def survey_robot(
     grown = merged(source.grown(run.fill) for source in sources)
     for replacement in replacements:
         grown = _with(grown, replacement)
-    grown = with_groups(grown)
+    grown = with_groups(_with_own_sections(grown))
     problems = [*run.problems, *grown.problems]
     data = grown.data
     for key in Robot.read_before:
@@ -124,6 +125,24 @@ def _refuse_other_files(source: Source) -> None:
         if key in data:
             problem = f"this is a {called} file, and no robot"
             raise refusal(marks.key(key), problem, fix.format(path=source.path))
+
+
+def _with_own_sections(grown: Grown) -> Grown:
+    """Return a document whose sections have our names; each that had another one is a problem."""
+    meant = sections_meant(Robot, {k: v for k, v in grown.data.items() if k not in Robot.read_before})
+    if not meant:
+        return grown
+    problems = tuple(
+        Problem(
+            grown.marks.key(key),
+            f"the file has an unknown key {key!r}",
+            f"it is called `{ours}` here: rename it",
+        )
+        for key, ours in meant.items()
+    )
+    data = {meant.get(key, key): value for key, value in grown.data.items()}
+    placed = moved(grown, {(key,): [(ours,)] for key, ours in meant.items()})
+    return replace(placed, data=data, problems=(*grown.problems, *problems))
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:
@@ -185,6 +204,12 @@ def prune(data: dict[str, object], wrong: Iterable[KeyPath], guess: Guess) -> fr
     is wrong, or where nothing can be guessed.
     """
     left_out: set[KeyPath] = set()
+    joints = data.get("joints")
+    transmitted = {  # before their wrong keys are gone: by its keys a joint shows that it has a servo
+        name
+        for name, entry in (joints.items() if isinstance(joints, dict) else ())
+        if isinstance(entry, dict) and kind_of_joint(entry) == "<transmission>"
+    }
     for path in wrong:
         if path:
             left_out |= _take_out(data, path, guess)
@@ -195,8 +220,8 @@ def prune(data: dict[str, object], wrong: Iterable[KeyPath], guess: Guess) -> fr
         loop.setdefault("rate", _RATES[guess])
     for section, guesses in _ENTRIES.items():
         entries = data.get(section)
-        for entry in entries.values() if isinstance(entries, dict) else ():
-            if isinstance(entry, dict) and (section != "joints" or kind_of_joint(entry) != "<transmission>"):
+        for name, entry in entries.items() if isinstance(entries, dict) else ():
+            if isinstance(entry, dict) and (section != "joints" or name not in transmitted):
                 for key, value in guesses[guess].items():
                     if key != "id" or "servos" not in entry:
                         entry.setdefault(key, value)

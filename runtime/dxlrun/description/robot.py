@@ -16,13 +16,12 @@ from pydantic import (
 
 from dxlrun.description import units
 from dxlrun.description.bus import Bus
-from dxlrun.description.devices import Device
+from dxlrun.description.devices import Device, SensorEntry
 from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse
 from dxlrun.description.joints.joints import JointEntry
 from dxlrun.description.joints.mechanics import (
     Transmission,
 )
-from dxlrun.description.sensors import SensorEntry
 from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,

@@ -24,7 +24,7 @@ NAMING = ("joints", "pose", "torque")
 
 Groups = Mapping[str, tuple[str, ...]]  # The joints that the name of a group stands for
 NO_GROUPS: Groups = {}
-_Moves = dict[KeyPath, list[KeyPath]]
+Moves = dict[KeyPath, list[KeyPath]]
 """Where the parts of a document are put, each at as many places as it is needed."""
 _Value = TypeVar("_Value")
 
@@ -50,7 +50,7 @@ def put_in(grown: Grown, groups: Groups) -> Grown:
     places = _Places(grown.marks, groups)
     data = places.value(grown.data, ())
     assert isinstance(data, dict)  # noqa: S101 (the top of a document is a mapping)
-    return replace(_moved(grown, places.moves), data=data, problems=(*grown.problems, *places.problems))
+    return replace(moved(grown, places.moves), data=data, problems=(*grown.problems, *places.problems))
 
 
 def without_groups(data: dict[str, object], groups: Groups) -> dict[str, object]:
@@ -64,7 +64,7 @@ class _Places:
     def __init__(self, marks: Marks, groups: Groups) -> None:
         self._marks = marks
         self._groups = groups
-        self.moves: _Moves = {}
+        self.moves: Moves = {}
         self.problems: list[Problem] = []
 
     def value(self, value: object, path: KeyPath) -> object:
@@ -190,13 +190,13 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
         joint: [key for key in given if joint not in transmitted or key not in KEYS_OF_SERVOS]
         for joint in joints
     }
-    moves: _Moves = {
+    moves: Moves = {
         (*source, key): [("joints", joint, key) for joint in joints if key in keys[joint]] for key in given
     }
     data: dict[str, object] = {
         "joints": {joint: {key: given[key] for key in keys[joint]} for joint in joints}
     }
-    return replace(_moved(grown, moves, others=False), data=data, problems=())
+    return replace(moved(grown, moves, others=False), data=data, problems=())
 
 
 def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterator[Problem]:
@@ -240,7 +240,7 @@ def _without_defaults(grown: Grown, groups: Groups) -> Grown:
     return replace(grown, data=data)
 
 
-def _moved(grown: Grown, moves: _Moves, *, others: bool = True) -> Grown:
+def moved(grown: Grown, moves: Moves, *, others: bool = True) -> Grown:
     """Return a document whose marks are moved as its parts are, with or without those of other parts."""
 
     def placed(table: Mapping[KeyPath, _Value]) -> dict[KeyPath, _Value]:

@@ -12,7 +12,7 @@ from typing import Annotated, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
@@ -25,6 +25,7 @@ from dxlrun.description.joints.mechanics import (
     SharedTolerance,
     TravelPerTurn,
 )
+from dxlrun.description.mistakes.words import words_for
 from dxlrun.description.units import (
     Angle,
     Duration,
@@ -135,7 +136,7 @@ class ServoJoint(BareJoint):
     travel_per_turn: TravelPerTurn | None = key(
         "How far the joint moves in one turn of the servo; makes it a linear joint.", "94.2 mm", None
     )
-    registers: dict[Name, Register] = key(
+    registers: dict[ItemName, Register] = key(
         "What its servo's control table shall hold: written at the start where it differs.",
         "{position_p_gain: 800, return_delay_time: 0 us}",
         {},
@@ -192,7 +193,10 @@ def kind_of_joint(joint: object) -> str:
     if isinstance(joint, dict):
         if "servos" in joint:
             return "<several servos>"
-        return "<one servo>" if _OF_A_SERVO.intersection(joint) else "<transmission>"
+        surplus = joint.keys() - BareJoint.model_fields.keys()
+        if surplus and (surplus & _OF_A_SERVO or surplus & words_for("BareJoint", _OF_A_SERVO)):
+            return "<one servo>"
+        return "<transmission>"
     if isinstance(joint, SharedJoint):
         return "<several servos>"
     return "<one servo>" if isinstance(joint, Joint) or not isinstance(joint, BareJoint) else "<transmission>"

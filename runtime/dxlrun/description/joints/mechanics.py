@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic_core import CoreSchema
 
 from dxlrun.description import units
-from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.description.form import Form, ItemName, Name, key, refuse
 from dxlrun.description.units import (
     Acceleration,
     Angle,
@@ -162,7 +162,7 @@ class OneOfServos(Form):
     direction: Direction | None = key(
         "1: the joint's angle grows as the servo's does, -1: against it; none: the joint's.", "-1", None
     )
-    registers: dict[Name, Register] | None = key(
+    registers: dict[ItemName, Register] | None = key(
         "What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None
     )
     motor: MotorFile | None = key("Its motor file; none: the joint's.", "hip.motor.yaml", None)
@@ -179,7 +179,7 @@ class TransmissionServo(Form):
     )
     direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
     gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
-    registers: dict[Name, Register] = key(
+    registers: dict[ItemName, Register] = key(
         "What its control table shall hold: written at the start where it differs.",
         "{position_p_gain: 800}",
         {},

@@ -1,0 +1,1 @@
+"""Mistakes of newcomers: words of other systems, files of other programs, brackets that are not closed."""

@@ -1,0 +1,104 @@
+"""Forms: which keys and entries a document may have, and where, read from its pydantic models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from types import UnionType
+from typing import Annotated, Union, cast, get_args, get_origin
+
+from pydantic import BaseModel, TypeAdapter
+
+from dxlrun.description.form import PlugInEntry
+
+Place = tuple[str, ...]
+"""A key below a form: `("limits", "position")`; NAME stands for the name of an entry."""
+NAME = "NAME"
+
+
+def example_at(form: type[BaseModel], place: Place) -> str:
+    """Return how a key's value is written, for example; empty: it has no example."""
+    *above, key = place
+    for step in above:
+        form = next(_forms(_annotation(form, step)), form)
+    info = form.model_fields.get(key)
+    return str(info.examples[0]) if info is not None and info.examples else ""
+
+
+def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
+    """Return the places of a document where a key may have a value."""
+    return [
+        place for place, annotation in _all_places(root) if place[-1] == key and _takes(annotation, value)
+    ]
+
+
+def section_of(root: type[BaseModel], value: object) -> str:
+    """Return the section whose entries have the keys of a mapping; empty: it is not an entry of any."""
+    best, most = "", 1
+    if not isinstance(value, dict):
+        return best
+    for name in root.model_fields:
+        for form in _forms(entries_of(root, name)):
+            own = [key for key in value if key in form.model_fields and key != "parameters"]
+            free = issubclass(form, PlugInEntry)  # it takes any other keys, and has a type
+            score = len(own) + 2 * ("type" in own) if free else 2 * len(own) - len(value)
+            if score > most:
+                best, most = name, score
+    return best
+
+
+def entries_of(form: type[BaseModel], key: str) -> object:
+    """Return the type of the entries of a key whose value is a mapping by names; None: it has none."""
+    return _entries(_annotation(form, key))
+
+
+def _annotation(form: type[BaseModel], key: str) -> object:
+    info = form.model_fields.get(key)
+    if info is None:
+        return None
+    return Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
+
+
+def _entries(annotation: object) -> object:
+    while get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    return get_args(annotation)[1] if get_origin(annotation) is dict else None
+
+
+def _forms(annotation: object) -> Iterator[type[BaseModel]]:
+    """Yield the forms that a value may have; those of the items of a list or mapping are not its own."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif get_origin(annotation) is Annotated:
+        yield from _forms(get_args(annotation)[0])
+    elif get_origin(annotation) in (Union, UnionType):
+        for arm in get_args(annotation):
+            yield from _forms(arm)
+
+
+@cache
+def _all_places(root: type[BaseModel]) -> tuple[tuple[Place, object], ...]:
+    """Return every key of a document with its type, those of few steps first."""
+    found: dict[Place, object] = {}
+
+    def visit(form: type[BaseModel], above: Place) -> None:
+        for name in form.model_fields:
+            if name == "parameters" and issubclass(form, PlugInEntry):
+                continue
+            annotation, place = _annotation(form, name), (*above, name)
+            found.setdefault(place, annotation)
+            for inner in _forms(annotation):
+                visit(inner, place)
+            for inner in _forms(_entries(annotation)):
+                visit(inner, (*place, NAME))
+
+    visit(root, ())
+    return tuple(sorted(found.items(), key=lambda item: len(item[0])))
+
+
+def _takes(annotation: object, value: object) -> bool:
+    try:
+        TypeAdapter(cast("type[object]", annotation)).validate_python(value)
+    except ValueError:  # what pydantic raises for a value that is refused
+        return False
+    return True

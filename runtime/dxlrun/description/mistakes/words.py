@@ -1,0 +1,319 @@
+"""Unknown keys: words of other systems for keys of ours, keys at the wrong place, entries indented wrongly.
+
+The words are in `words.toml`. Which keys exist where, and which entries have which, follows from the forms.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import BaseModel
+
+from dxlrun.description.form import folded
+from dxlrun.description.mistakes.forms import NAME, Place, example_at, places_of, section_of
+from dxlrun.errors import near
+
+_REMARKS = {"comment", "comments", "description", "note", "notes", "remark", "remarks", "author", "version"}
+_LONGEST = 80  # Characters of a value that is repeated
+_LARGEST_ANGLE = 720  # deg; a larger number counts ticks of a servo
+_PARTS_OF_JOINT = {"Limits": "limits", "GoalTolerance": "tolerance", "SharedTolerance": "tolerance"}
+_SERVO_FORMS = ("OneOfServos", "TransmissionServo")  # They have keys of a joint
+
+
+_NEEDLESS = {
+    "mode": "take it out: the mode of a servo follows from what the joint's controller commands",
+    "revolute": "take it out: a joint that is not linear turns",
+    "continuous": "write `continuous: true`",
+    "prismatic": "write `travel_per_turn: 94.2 mm`, how far it moves in a turn of the servo",
+    "fixed": "take the joint out: one without a servo is in the URDF only",
+    "position": "take it out: the mode of a servo follows from what the joint's controller commands",
+}
+"""Values of keys that a joint does not have, and what to do instead."""
+
+
+class Remedy(NamedTuple):
+    """What to do about one unknown key, or about two that are one key of ours."""
+
+    keys: tuple[str, ...]
+    fix: str
+    means: str = ""
+    """The key of the form that is meant: that it is missing need not be said."""
+
+
+class _Meaning(NamedTuple):
+    """A key of ours that a word means, and how the word's value is converted: a key of `_CONVERSIONS`."""
+
+    place: Place
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """The form that has unknown keys, and what the file has around them."""
+
+    root: type[BaseModel]
+    """Form of the whole document."""
+    form: type[BaseModel]
+    path: tuple[str | int, ...]
+    """Where the form is in the document."""
+    known: Collection[str]
+    """All keys that are possible there."""
+    present: Collection[str]
+    """All keys that the file has there."""
+    sections: Mapping[str, Collection[str]]
+    """The names of the entries in each section of the file."""
+
+    def remedies(self, unknown: Mapping[str, object]) -> Iterator[Remedy]:
+        """Yield what to do about unknown keys with their values, as far as their meaning is known."""
+        meant = {key: meaning for key in unknown if (meaning := self._meaning(key)) is not None}
+        limits = {meaning.kind: key for key, meaning in meant.items() if meaning.kind in ("lower", "upper")}
+        if limits:
+            keys = tuple(key for key in unknown if key in limits.values())
+            yield Remedy(keys, self._limits(limits, unknown), meant[keys[0]].place[0])
+        for key, value in unknown.items():
+            if key in limits.values():
+                continue
+            section = section_of(self.root, value)
+            if section:
+                where = f"like {self.path[1]}" if section in self.path[:1] else f"below `{section}:`"
+                yield Remedy((key,), f"it has the keys of an entry of {section}: indent it {where}")
+            elif (meaning := meant.get(key)) is not None:
+                yield Remedy((key,), self._renamed(meaning, key, value), meaning.place[0])
+            elif fix := self._misplaced(key, value):
+                yield Remedy((key,), fix)
+
+    def _meaning(self, key: str) -> _Meaning | None:
+        """Return what a key means; None where it is not a known word, or the form has no such key.
+
+        The words of a joint are those of its parts, too: `lower` means the same in a joint as in its limits.
+        """
+        word, name = folded(key), self.form.__name__
+        for base in self.form.__mro__:
+            meaning = _table().get(base.__name__, {}).get(word)
+            if meaning is not None and meaning.place[0] in self.known:
+                return meaning
+        meaning = _table()["BareJoint"].get(word)
+        if meaning is None:
+            return None
+        if meaning.place[0] == _PARTS_OF_JOINT.get(name, ""):
+            return _Meaning(meaning.place[1:], meaning.kind)
+        return meaning if name in _SERVO_FORMS and meaning.place[0] in self.known else None
+
+    def _limits(self, limits: Mapping[str, str], unknown: Mapping[str, object]) -> str:
+        """Return how a lower and an upper limit are written, either of which may be missing."""
+        values = [unknown.get(limits.get(side, "")) for side in ("lower", "upper")]
+        of_urdf = not {"lower", "upper"}.isdisjoint(limits.values())
+        linear = "travel_per_turn" in self.present
+        written = _limits_text([*values], of_urdf=of_urdf, linear=linear)
+        said = "limits are angles, not ticks: write for example" if written is None else "write"
+        text, condition = written or ("[-90 deg, 90 deg]", "")
+        return f"{said} `{self._at(('limits', 'position'), text)}`{condition}"
+
+    def _at(self, place: Place, text: str) -> str:
+        """Return a key with its value as it is written in the form: `limits: {velocity: 2 rad/s}`."""
+        here = place[1:] if place[0] == _PARTS_OF_JOINT.get(self.form.__name__, "") else place
+        return _in_mappings(here[:-1], f"{here[-1]}: {text}")
+
+    def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
+        """Return how a word and its value are written with our key."""
+        place, key = meaning.place, meaning.place[0]
+        if key == "reference":
+            return self._reference()
+        if meaning.kind == "needless":
+            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS["mode"])
+        called = "" if place[-1] == folded(word) else f"it is called `{'.'.join(place)}` here: "
+        if key in self.present and len(place) == 1:
+            return f"it is called `{key}` here, which is given already: take one of the two out"
+        if (
+            isinstance(value, dict | list)
+            and not meaning.kind
+            and key not in self.present
+            and len(place) == 1
+        ):
+            return f"{called}rename it"
+        example = example_at(self.form, place)
+        converted = _CONVERSIONS.get(meaning.kind or ".".join(place), _plain)(value, example)
+        text, condition = converted or (example, "")
+        such = "write" if converted is not None else "write for example"
+        if key in self.present:
+            return f"{called}{such} `{place[-1]}: {text}` below `{key}`{condition}"
+        return f"{called}{such} `{self._at(place, text)}`{condition}"
+
+    def _reference(self) -> str:
+        measure = "`dxlrun calibrate ROBOT.yaml` measures it"
+        if "reference" in self.present:
+            return f"take it out: the zero of the joint is its `reference`; {measure}"
+        return f"write `reference`, the servo's angle where the joint is at zero, such as 180 deg; {measure}"
+
+    def _misplaced(self, key: str, value: object) -> str:
+        """Return what to do about a key that does not mean another one here; empty: nothing is known."""
+        word, colon, rest = key.partition(":")
+        if colon and word in self.known and value is None:
+            return f"write a space after the colon: `{word}: {rest}`"
+        if len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys():
+            return f"`{self.path[1]}` is a section of the file: write it without indentation"
+        if key == "name" or (folded(key) in _REMARKS and not near(key, self.known)):
+            entry = self.path[1] if len(self.path) == 2 and key == "name" else ""
+            is_remark = f"write it as a comment: `# {_yaml(value)}`"
+            return f"take it out: the entry is called {entry} already" if entry else is_remark
+        places = [] if folded(key) in self.known else places_of(self.root, folded(key), value)
+        return self._moved(folded(key), value, places) if places else ""
+
+    def _moved(self, key: str, value: object, places: list[Place]) -> str:
+        """Return where a key belongs: at the place that shares most with where it is now."""
+        here = tuple(NAME if at == 1 else str(step) for at, step in enumerate(self.path))
+
+        def shared(place: Place) -> int:
+            same = (one == other for one, other in zip(place, here, strict=False))
+            return next((steps for steps, each in enumerate(same) if not each), min(len(place), len(here)))
+
+        place = max(places, key=lambda place: (shared(place), -len(place)))
+        common, written = shared(place), f"{key}: {_yaml(value)}"
+        below = place[common:-1]
+        if common == len(here) and below and NAME not in below:
+            if below[0] in self.present:
+                return f"it belongs into `{'.'.join(below)}`: move it there"
+            return f"it belongs into `{'.'.join(below)}`: write `{_in_mappings(below, written)}`"
+        names = [*self.sections.get(place[0], ())]
+        entry = str(self.path[1]) if common >= 2 else names[0] if len(names) == 1 else NAME
+        where = ".".join(entry if step == NAME else step for step in place[:-1])
+        if not where:
+            return f"it belongs to the top of the file: write `{written}` without indentation"
+        return f"it belongs into `{where}`: move it there"
+
+
+def sections_meant(root: type[BaseModel], data: Mapping[str, object]) -> dict[str, str]:
+    """Return the sections of a file that have another name in it: `joints` for its key `motors`."""
+    found: dict[str, str] = {}
+    context = Context(root, root, (), [*root.model_fields], [*data], {})
+    for key, value in data.items():
+        meaning = None if key in root.model_fields else context._meaning(key)
+        if meaning is None or not isinstance(value, dict | list) or section_of(root, value):
+            continue
+        if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in (*data, *found.values()):
+            found[key] = meaning.place[0]
+    return found
+
+
+def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
+    """Return the words of a form that mean one of some keys of ours."""
+    return frozenset(word for word, meaning in _table()[form].items() if meaning.place[0] in keys)
+
+
+@cache
+def _table() -> Mapping[str, Mapping[str, _Meaning]]:
+    """Return what each word means, by the name of the form in which it is written."""
+    text = Path(__file__).with_name("words.toml").read_text("utf-8")
+    found: dict[str, dict[str, _Meaning]] = {}
+    for form, meanings in tomllib.loads(text).items():
+        words = found.setdefault(form, {})
+        for target, theirs in meanings.items():
+            place, _, kind = target.partition(":")
+            for word in theirs.split():
+                words.setdefault(word, _Meaning(tuple(place.split(".")), kind))
+    return found
+
+
+def _in_mappings(keys: Place, written: str) -> str:
+    return f"{keys[0]}: {{{_in_mappings(keys[1:], written)}}}" if keys else written
+
+
+def _yaml(value: object) -> str:
+    """Return a value as a file has it, cut where it is long."""
+    if isinstance(value, dict):
+        text = f"{{{', '.join(f'{key}: {_yaml(each)}' for key, each in value.items())}}}"
+    elif isinstance(value, list):
+        text = f"[{', '.join(map(_yaml, value))}]"
+    else:
+        text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+_Written = tuple[str, str] | None
+"""A value as our key has it, and the condition under which it is meant; None: it cannot be converted."""
+_UNIT = re.compile(r"[-0-9.]+ ([A-Za-z/^0-9%]+)")
+_PERIOD = re.compile(r"([0-9.]+) *(s|ms|us)?")
+_SECONDS = {None: 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
+_FORWARDS = ("1", "+1", "direct", "normal", "forward", "forwards", "positive", "false", "+")
+_BACKWARDS = ("-1", "indirect", "reverse", "reversed", "inverted", "backward", "backwards", "negative", "-")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _plain(value: object, example: str) -> _Written:
+    if isinstance(value, dict | list) or value is None:
+        return None
+    unit = _UNIT.fullmatch(example)
+    if unit is not None and _is_number(value):
+        return f"{_yaml(value)} {unit[1]}", f", if this is in {unit[1]}"
+    return (_yaml(value), "") if unit is None or isinstance(value, str) else None
+
+
+def _limits_text(values: list[object], *, of_urdf: bool = False, linear: bool = False) -> _Written:
+    """Return a lower and an upper limit as a list; a missing one (None) is named in capitals."""
+    numbers = [abs(value) for value in values if isinstance(value, int | float)]
+    if numbers and max(numbers) > _LARGEST_ANGLE and not of_urdf:
+        return None
+    unit = ("m" if linear else "rad") if of_urdf else ("mm" if linear else "deg")
+    texts = [
+        name if value is None else f"{_yaml(value)} {unit}" if _is_number(value) else _yaml(value)
+        for value, name in zip(values, ("LOWER", "UPPER"), strict=True)
+    ]
+    return f"[{', '.join(texts)}]", f", if these are {unit}" if numbers and not of_urdf else ""
+
+
+def _pair(value: object, example: str) -> _Written:
+    return _limits_text(value) if isinstance(value, list) and len(value) == 2 else None
+
+
+def _direction(value: object, example: str) -> _Written:
+    word = _yaml(value).lower()
+    return ("1", "") if word in _FORWARDS else ("-1", "") if word in _BACKWARDS else None
+
+
+def _inverted(value: object, example: str) -> _Written:
+    return ("-1" if value else "1", "") if isinstance(value, bool | int) else None
+
+
+def _drive_mode(value: object, example: str) -> _Written:
+    # bit 0 of Drive Mode is Reverse Mode (e-Manual, Drive Mode)
+    return ("-1" if value & 1 else "1", "") if isinstance(value, int) else None
+
+
+def _on_or_off(value: object, example: str) -> _Written:
+    return ("on" if value in (True, 1, "on") else "off", "")
+
+
+def _rate(value: object, example: str) -> _Written:
+    period = _PERIOD.fullmatch(_yaml(value))
+    seconds = float(period[1]) * _SECONDS[period[2]] if period and period[1].count(".") <= 1 else 0.0
+    return (f"{1 / seconds:.6g}", "") if seconds > 0 else None
+
+
+def _simulated(value: object, example: str) -> _Written:
+    return ("sim", "") if value is True else (example, "")
+
+
+def _real_time(value: object, example: str) -> _Written:
+    return ("round_robin" if value is True else "other", "")
+
+
+_CONVERSIONS: Mapping[str, Callable[[object, str], _Written]] = {
+    "direction": _direction,
+    "inverted": _inverted,
+    "drive_mode": _drive_mode,
+    "pair": _pair,
+    "period": _rate,
+    "simulated": _simulated,
+    "real_time": _real_time,
+    "torque": _on_or_off,
+}
