@@ -80,6 +80,13 @@ class _GroupController(Controller[GroupParameters]):
         else:
             getattr(self.context.commands, self.claimed[0]).fill(0.0)
 
+    def on_restart(self, time_ns: int) -> None:
+        """Keep the efforts or PWM of the other joints, which may carry a load; else as an activation."""
+        self.on_activate(time_ns)
+        if self.claimed[0] in ("effort", "pwm"):
+            sent = getattr(self.context.goals, self.claimed[0])
+            np.copyto(getattr(self.context.commands, self.claimed[0]), sent, where=np.isfinite(sent))
+
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new values."""
         for name, values in zip(self.claimed, data.reshape(len(self.claimed), -1), strict=True):

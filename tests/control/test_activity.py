@@ -192,7 +192,7 @@ def test_the_page_names_what_is_called_until_it_returns(page):
             activity.call(place, step, "", lambda: seen.append(page.activity))
             assert not page.activity
     calls = ["__init__", "on_configure", "on_activate", "update", "on_command", "on_deactivate"]
-    calls += ["on_goal", "on_cancel", "on_parameters", "on_hold"]
+    calls += ["on_goal", "on_cancel", "on_parameters", "on_hold", "on_restart"]
     assert seen[: len(calls)] == [f"{call} of controller arm" for call in calls]
     assert seen[len(calls)].startswith("__init__ of controller h\u00e4ndh\u00e4nd")
     assert page.beats == page.cycles == 0

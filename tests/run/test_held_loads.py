@@ -248,3 +248,30 @@ def test_a_goal_in_which_a_joint_is_lost_is_aborted_with_servo_and_distance(tmp_
     assert found, text
     off = abs(math.degrees(-0.35) - float(np.degrees(log.cycles["position"][-1, 1])))
     assert float(found[1]) == pytest.approx(off, abs=0.01)
+
+
+STEPS = "steps: [{time: 400 ms, pose: {shoulder: 20 deg}}, {time: 400 ms, pose: {shoulder: 0 deg}}]"
+KEYFRAMES = (
+    f"player: {{type: keyframe_player, {OWN}, start: wave, motions: {{wave: {{repeat: 50, {STEPS}}}}}}}"
+)
+
+
+def test_the_motion_of_an_activation_is_not_begun_again_when_a_joint_was_given_torque(tmp_path):
+    arm = Arm(tmp_path, Chain((KEYFRAMES,), "", ""), seconds=5.0)
+    arm.lose(MOVING_MS, "without power")
+    play = prepared(arm.robot, "player", "play", motion="wave")
+    arm.asked[400] = [play]
+    log = arm.run()
+    back_ms = next(event.t_ns for event in log.events if event.code == EventCode.SERVO_BACK) / 1e6
+    assert np.ptp(arm.shoulder(0, MOVING_MS)) > 15
+    assert np.ptp(arm.shoulder(back_ms, 400 * PERIOD_MS)) <= HELD_DEG
+    assert np.ptp(arm.shoulder(400 * PERIOD_MS, 5000)) > 15
+
+
+def test_a_group_of_efforts_carries_its_other_joint_when_one_was_given_torque(tmp_path):
+    arm = Arm(tmp_path, CHAINS["efforts"])
+    arm.lose(RESTING_MS - 500, "without power")
+    log = arm.run()
+    assert [event for event in log.events if "restarted at the measured positions" in event.text]
+    assert np.ptp(arm.shoulder(RESTING_MS - 500, END_S * 1000)) <= HELD_DEG
+    assert log.cycles["goal_effort"][-1].tolist() == pytest.approx([0.2, 0.0])

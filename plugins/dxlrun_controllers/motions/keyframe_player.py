@@ -113,7 +113,7 @@ class KeyframeParameters(ParametersModel):
     partial: bool = False
     """Joints without torque are left out; without it none may be without."""
     start: str | None = None
-    """The motion that begins whenever the controller becomes active."""
+    """The motion that begins whenever the controller is activated, but not after a joint regained torque."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Yield names of motions and joints that there are not, and circles of motions."""
@@ -289,10 +289,17 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Hold where the joints are."""
         hold(self.context)
         self._now.rest_at(self.context.commands.position)
+        self._limp.fill(False)
+        self._out.fill(False)
         self._goal: Goal | None = None
         self._playing = self._stopping = False
         self._unknown = True
         self._starting = self.parameters.start is not None
+
+    def on_restart(self, time_ns: int) -> None:
+        """Hold where the joints are; a client may play the motion of the activation again."""
+        self.on_activate(time_ns)
+        self._starting = False
 
     def on_deactivate(self, time_ns: int) -> None:
         """Leave the goal: the runtime ends it."""
@@ -351,6 +358,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def _leave_out(self) -> None:
         """Let joints without torque be where they stand, and command them to stay there."""
         states = self.context.states
+        if states.has_lost:  # whether it has torque is known when it is back
+            return
         for row in range(self._limp.size):
             self._limp[row] = states.unable((row,)) is not None
         np.copyto(self._stand, states.position, where=self._limp & np.isfinite(states.position))

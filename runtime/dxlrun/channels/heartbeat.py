@@ -69,6 +69,7 @@ class ControllerMethod(IntEnum):
     ON_CANCEL = 8
     ON_PARAMETERS = 9
     ON_HOLD = 10
+    ON_RESTART = 11
 
     def __str__(self) -> str:
         return "__init__" if self is ControllerMethod.INIT else self.name.lower()

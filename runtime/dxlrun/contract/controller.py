@@ -404,6 +404,14 @@ class Controller(ABC, Generic[P]):
     def on_activate(self, time_ns: int) -> None:
         """Take over the claimed joints; `context.states` and `context.goals` are fresh."""
 
+    def on_restart(self, time_ns: int) -> None:
+        """Begin again where the joints are: one of them was given torque, or was moved in a pause.
+
+        Called in place of `on_activate`, after `on_deactivate` in the same cycle. `context.goals` of such a
+        joint are where it is, or 0; those of the others are what was last sent.
+        """
+        self.on_activate(time_ns)
+
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take a prepared command at the start of a cycle; `data` stays as it is until the run ends."""
 

@@ -237,9 +237,12 @@ class Managed:
         """True when it is active."""
         return self.state is State.ACTIVE
 
-    def activate(self, time_ns: int) -> None:
-        """Let the controller take over its joints. Raises ControllerFault."""
-        self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
+    def activate(self, time_ns: int, *, restarts: bool = False) -> None:
+        """Let the controller take over its joints, or begin again with them. Raises ControllerFault."""
+        if restarts:
+            self._call_without_commands(ControllerMethod.ON_RESTART, self.controller.on_restart, time_ns)
+        else:
+            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
         self._last_ns = -1
         self.due_cycle = self.until_ns = 0
         self.on(Event.ENTER)

@@ -48,6 +48,7 @@ _METHODS = (
     "speed_peaks",
     "on_configure",
     "on_activate",
+    "on_restart",
     "on_command",
     "on_goal",
     "on_cancel",

@@ -153,7 +153,7 @@ class Switching:
         named = {managed.plan.name: managed for managed in again}
         names = [name for name in lowers_first(list(named), self.standing.known) if name in named]
         failed: list[_Failed] = []
-        self._activate_all([named[name] for name in names], time_ns, failed)
+        self._activate_all([named[name] for name in names], time_ns, failed, restarts=True)
         self._fall_back_all(failed, time_ns)
         for managed in withheld:
             if managed.active:
@@ -365,7 +365,7 @@ class Switching:
         return Waiting(tuple(names))
 
     def _activate_all(
-        self, entering: Sequence[Managed], time_ns: int, failed: list[_Failed]
+        self, entering: Sequence[Managed], time_ns: int, failed: list[_Failed], *, restarts: bool = False
     ) -> Refusal | None:
         """Activate controllers whose claims were checked together; add what fails to `failed`.
 
@@ -383,7 +383,7 @@ class Switching:
                 self._report_left_out(name, f"{name} is not activated: {problem}", fault_of(managed, problem))
                 continue
             try:
-                managed.activate(time_ns)
+                managed.activate(time_ns, restarts=restarts)
             except ControllerFault as fault:
                 self._take_out(managed, fault)
                 uppers = above([one.plan for one in entering], name)
