@@ -42,7 +42,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import hold, or_number
+from dxlrun_controllers.joints import hold, or_number, take_shorter_way_from_goals
 
 STATE_NS = 50_000_000
 """Between two messages of the topic, ns."""
@@ -265,7 +265,7 @@ class GripperController(Controller[GripperParameters]):
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Begin to close or open; an angle beyond the joint's limits is refused."""
         self._goal, self._cancelled, self._stalled = None, False, False
-        angle, effort = float(data[0]), float(data[1])
+        angle, effort = float(take_shorter_way_from_goals(data[:1], self.context)[0]), float(data[1])
         if not self._lower <= angle <= self._upper:
             limits = f"{self._lower:.4g}..{self._upper:.4g} {self._unit}"
             text = f"{angle:.4g} {self._unit} is outside its limits {limits}"
@@ -283,7 +283,7 @@ class GripperController(Controller[GripperParameters]):
         self._end(Outcome.PREEMPTED, "positions came")
         self._cancelled, self._stalled = False, False
         self.on_parameters(time_ns)
-        np.copyto(self.context.commands.position, data)
+        np.copyto(self.context.commands.position, take_shorter_way_from_goals(data, self.context))
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Hold where the gripper is now; the goal has ended when it is at rest."""

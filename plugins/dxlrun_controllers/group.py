@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Interfaces
-from dxlrun_controllers.joints import JointsParameters, hold
+from dxlrun_controllers.joints import JointsParameters, hold, take_shorter_way_from_goals
 
 
 class GroupParameters(JointsParameters):
@@ -90,7 +90,8 @@ class _GroupController(Controller[GroupParameters]):
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new values."""
         for name, values in zip(self.claimed, data.reshape(len(self.claimed), -1), strict=True):
-            np.copyto(getattr(self.context.commands, name), values)
+            wanted = take_shorter_way_from_goals(values, self.context) if name == "position" else values
+            np.copyto(getattr(self.context.commands, name), wanted)
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Keep the last command: the manager takes the arrays as they are."""

@@ -24,6 +24,7 @@ from dxlrun_controllers.joints import (
     commanded_by,
     finite_or,
     row_of,
+    take_shorter_way,
     take_where_heard,
 )
 from dxlrun_controllers.laws.limiting import Limiter
@@ -97,7 +98,8 @@ class JointLimiter(Controller[LimiterParameters]):
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new positions."""
-        np.copyto(self._setpoint, data)
+        near = self._limiter.position
+        np.copyto(self._setpoint, take_shorter_way(data, near, np.array(self.context.wrap)))
 
     def on_hold(self, time_ns: int) -> None:
         """Stop as soon as the limits allow."""

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter
 
-from dxlrun import Context, Floats, Goal, Mistake, Outcome, ParametersModel, States
+from dxlrun import Context, Floats, Goal, Mistake, Outcome, ParametersModel, States, nearest_turn
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -124,6 +125,20 @@ def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:
         joint = joints[int(unknown.argmax())]
         goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
     return bool(unknown.any())
+
+
+def take_shorter_way(positions: Floats, near: Floats, wrap: NDArray[np.bool_]) -> Floats:
+    """Return positions with those of the joints of `wrap` at most half a turn from `near`, rad.
+
+    They stay as they are where `near` is not known (NaN).
+    """
+    return np.where(wrap & np.isfinite(near), nearest_turn(positions, near), positions)
+
+
+def take_shorter_way_from_goals(positions: Floats, context: Context) -> Floats:
+    """Return positions by the shorter way from what was last sent, or from where the joints were read."""
+    near = finite_or(context.goals.position, context.states.position)
+    return take_shorter_way(positions, near, np.array(context.wrap))
 
 
 def hold(context: Context) -> None:

@@ -28,6 +28,7 @@ from dxlrun_controllers.joints import (
     clamped,
     commanded_by,
     hold,
+    take_shorter_way,
     take_where_heard,
 )
 
@@ -117,6 +118,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         # no rows where positions are commanded
         self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
         self._wanted = np.zeros(count)
+        self._wrap = np.array(context.wrap)
         self._in_step = np.zeros(count, dtype=np.bool_)
         self._posvel = self.parameters.command_interface == "posvel"
 
@@ -147,8 +149,9 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._following, self._reported = True, False
         if self._led:
             self._wanted = self._leader_position * self._scale + self._offset
-        reachable = clamped(self._wanted, self._lower, self._upper)
         position, reach = self.context.commands.position, self.parameters.speed * period_ns * 1e-9
+        wanted = take_shorter_way(self._wanted, position, self._wrap)
+        reachable = clamped(wanted, self._lower, self._upper)
         step = reachable - position
         self._in_step |= np.abs(step) <= reach
         step = clamped(step, -reach, reach)

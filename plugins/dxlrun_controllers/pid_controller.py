@@ -28,6 +28,7 @@ from dxlrun_controllers.joints import (
     Positive,
     finite_or,
     row_of,
+    take_shorter_way,
 )
 from dxlrun_controllers.laws.pid import Gains, Pid, Slope, feed_velocities_forward
 
@@ -244,10 +245,9 @@ class PidController(Controller[PidParameters]):
         if states.has_lost:  # the joints are held where the last reference was
             held = self._reference if self._by_position else np.zeros_like(wanted)
             np.copyto(wanted, held, where=free & np.isfinite(held))
-        np.copyto(self._reference, wanted)
+        np.copyto(self._reference, take_shorter_way(wanted, self._measurement, self._wrap))
         np.subtract(self._reference, self._measurement, out=error)
         self._measured = np.isfinite(error) & states.valid
-        np.add(error, np.rint(error / (2 * np.pi)) * (-2 * np.pi), out=error, where=self._wrap)
         velocity = self._reference
         if self._by_position:
             velocity = finite_or(references.velocity, 0.0)

@@ -77,6 +77,7 @@ class Stage:
     into: tuple[str, ...] = ()
     motors: tuple[MotorModel | None, ...] = ()
     servos: tuple[ServoModel | None, ...] = ()
+    wrap: bool = False
     linear: bool = False
     urdf: str | None = None
     kept: bytes = b""
@@ -118,6 +119,7 @@ class Stage:
             into=self.into,
             motors=self.motors,
             servos=self.servos,
+            wrap=(self.wrap,) * count,
             linear=(self.linear,) * count,
             urdf=self.urdf,
             provided=np.full(len(self.interfaces.provides), np.nan),
@@ -136,7 +138,7 @@ class Stage:
         self.states.position[:] = self.sent.position[:] = np.resize(self.present, count)
         self.states.valid[:], self.states.torque[:] = True, Torque.ON
         events = type("Events", (), {"emit": lambda self, *_: None})()
-        plans = [JointPlan(joint, -np.inf, np.inf, None) for joint in joints]
+        plans = [JointPlan(joint, -np.inf, np.inf, None, wrap=self.wrap) for joint in joints]
         commanded = Commanded.by_interfaces(joints, self.interfaces.command, self.commands)
         self.judge = Goals(_Record(self), events, plans, lambda _: commanded)  # type: ignore[arg-type]  # of a record it reads states and times alone
         self.controller.on_configure(self.context)

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats
+from dxlrun import Floats, nearest_turn
 
 LINEAR, CUBIC, QUINTIC = 2, 4, 6
 """Number of coefficients of a piece."""
@@ -207,7 +207,7 @@ def whole_turns(data: Floats, now: Floats, wrap: NDArray[np.bool_]) -> Floats:
     count, joints, order = map(int, data[:START_IN].tolist())
     ends = _HEAD + count
     first = data[ends : ends + joints]
-    moved = np.where(wrap, -2 * np.pi * np.rint((first - now) / (2 * np.pi)), 0.0)
+    moved = np.where(wrap, nearest_turn(first, now) - first, 0.0)
     if not np.any(moved) or not np.isfinite(moved).all():
         return data
     shifted, body = data.copy(), ends + 6 * joints

@@ -31,6 +31,7 @@ from dxlrun import (
     ParametersModel,
     SpeedPeak,
     Tolerance,
+    nearest_turn,
 )
 from dxlrun_controllers.joints import (
     CLOSING_SPEED,
@@ -41,6 +42,7 @@ from dxlrun_controllers.joints import (
     hold,
     not_one_of,
     row_of,
+    take_shorter_way,
     take_where_heard,
 )
 from dxlrun_controllers.laws.spline import (
@@ -108,6 +110,9 @@ class KeyframeParameters(ParametersModel):
     """How far a joint may be off at the end; left out: its own tolerance."""
     settle: Duration | None = None
     """ns after the end in which the tolerance may still be reached; left out: the joints' own"""
+    wrap: tuple[str, ...] = ()
+    """Continuous joints that take the shorter way, as one turn more is the same place; left out: those with
+    `wrap: true`"""
     speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
     """What all motions are sped up by."""
     partial: bool = False
@@ -119,6 +124,9 @@ class KeyframeParameters(ParametersModel):
         """Yield names of motions and joints that there are not, and circles of motions."""
         yield from super().mistakes()
         known = f"there are {', '.join(self.motions)}"
+        for place, joint in enumerate(self.wrap):
+            if joint not in self.joints:
+                yield ("wrap", place), f"{joint} is {not_one_of(self.joints)}"
         if self.start is not None and self.start not in self.motions:
             yield ("start",), f"there is no motion {self.start}; {known}"
         for name, motion in self.motions.items():
@@ -233,7 +241,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 moved = [joint for joint in step.pose if joint in at]
                 time_s = step.time * 1e-9 / rate
                 ends = np.zeros((2, 2, len(moved)))
-                ends[:, 0] = [at[joint] for joint in moved], [step.pose[joint] for joint in moved]
+                pose = {
+                    joint: nearest_turn(end, at[joint]) if joint in parameters.wrap and joint in at else end
+                    for joint, end in step.pose.items()
+                }
+                ends[:, 0] = [at[joint] for joint in moved], [pose[joint] for joint in moved]
                 order = LINEAR if step.interpolation == "linear" else CUBIC
                 piece = np.zeros((order, len(moved)))
                 solve(order, time_s, ends[0], ends[1], piece)
@@ -242,7 +254,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 for joint, peak, time in zip(moved, peaks.tolist(), times.tolist(), strict=True):
                     if joint not in highest or abs(peak) > abs(highest[joint].speed):
                         highest[joint] = SpeedPeak(joint, peak, begin_s + time, where, key)
-                at.update(step.pose)
+                at.update(pose)
                 begin_s += time_s + step.pause * 1e-9 / rate
         yield from highest.values()
 
@@ -265,6 +277,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._speeds = finite_or(context.limits.velocity, np.inf)
         self._closing = np.minimum(self._speeds, CLOSING_SPEED)
         self._posvel = parameters.command_interface == "posvel"
+        self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._now = SplineSample(count)
         """Where the joints are sent, rad, and how fast, in rad a second of the motion's own time."""
         self._piece = np.zeros((CUBIC, count))
@@ -436,6 +449,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.copyto(start[0], self._now.position)
         np.copyto(start[1], self._now.velocity)
         np.copyto(end[0], start[0])
+        pose = take_shorter_way(pose, start[0], self._wrap)
         posed = np.isfinite(pose) & ~self._out
         np.copyto(self._asked, pose, where=posed)
         np.copyto(end[0], pose, where=posed)

@@ -35,6 +35,7 @@ from dxlrun_controllers.joints import (
     finite_or,
     hold,
     row_of,
+    take_shorter_way,
 )
 from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
 from dxlrun_controllers.motions.trajectory_command import Near
@@ -152,6 +153,7 @@ class SamplePlayer(Controller[SampleParameters]):
         self._hottest = np.inf if bounds.temperature is None else bounds.temperature
         self._strongest = row_of(bounds.effort, context.joints)
         self._oldest_ns = np.int64(np.iinfo(np.int64).max if bounds.age is None else bounds.age)
+        self._wrap = np.array(context.wrap)
         self._still = SplineSample(count)
         self._stop = Stop(count)
         self._deceleration = finite_or(limits.acceleration, DECELERATION)
@@ -250,7 +252,10 @@ class SamplePlayer(Controller[SampleParameters]):
             piece = self._pieces[self._piece]
         at = (index - self._first) * self._width
         joints = len(self._primary)
-        np.copyto(self._primary, piece[at : at + joints])
+        values = piece[at : at + joints]
+        if self._by_position:
+            values = take_shorter_way(values, self._primary, self._wrap)
+        np.copyto(self._primary, values)
         if self._width > joints:
             np.copyto(self.context.commands.velocity, piece[at + joints : at + self._width])
         if self._goal is not None:

@@ -339,7 +339,7 @@ def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) 
                 continue
             speed = min(joint.highest_speed, abs(target.velocity or math.inf))
             if 0 < speed < math.inf:
-                way_s = abs(target.position - held.get(name, target.position)) / speed
+                way_s = abs(joint.way(held.get(name, target.position), target.position)) / speed
                 starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
                 arrival_ns = max(arrival_ns, sample.t_ns + round((way_s + starting_s) * 1e9))
             held[name] = target.position

@@ -283,6 +283,8 @@ class Context(msgspec.Struct, frozen=True):
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
     servos: tuple[ServoModel | None, ...] = ()
     """Its joints' servos, by the manual; None: several servos move the joint."""
+    wrap: tuple[bool, ...] = ()
+    """True: a continuous joint to which a turn more is the same place; goals take the shorter way"""
     linear: tuple[bool, ...] = ()
     """True for each joint whose positions are lengths, m."""
     urdf: str | None = None

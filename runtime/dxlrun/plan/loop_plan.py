@@ -10,6 +10,7 @@ import msgspec
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.modes import Mode
+from dxlrun.description.turns import nearest_turn
 from dxlrun.plan.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
 
 if TYPE_CHECKING:
@@ -183,6 +184,10 @@ class JointPlan(msgspec.Struct, frozen=True):
         """Speed below which the joint counts as at rest, rad/s or m/s."""
         default = GOAL_TOLERANCE_M if self.linear else GOAL_TOLERANCE_RAD  # per second
         return default if self.rest_speed is None else self.rest_speed
+
+    def way(self, begin: float, end: float) -> float:
+        """Return the signed way from one position to another, the shorter one of a joint that wraps."""
+        return (nearest_turn(end, begin) if self.wrap else end) - begin
 
     @property
     def slow_speed(self) -> float:

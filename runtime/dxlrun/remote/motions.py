@@ -64,6 +64,10 @@ class Running:
         goal = float(self.record.goals.position[row])
         return goal if math.isfinite(goal) else float(self.record.states.position[row])
 
+    def way(self, joint: str, position: float) -> float:
+        """Return the signed way of a joint to a position."""
+        return self.joints[joint].way(self.position(joint), position)
+
 
 class Played(msgspec.Struct, frozen=True, tag="played"):
     """A motion, ready for the loop."""
@@ -89,7 +93,7 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
     longest_s = 0.0
     for joint, position, commanded in zip(known.joints, positions, speeds, strict=True):
         row = record.layout.joints.index(joint.name)
-        way, speed = abs(position - float(record.states.position[row])), joint.highest_speed
+        way, speed = abs(joint.way(float(record.states.position[row]), position)), joint.highest_speed
         if commanded:  # at 0 the servo goes as fast as it can
             speed = min(speed, abs(commanded))
         if math.isfinite(way) and math.isfinite(speed):
@@ -248,7 +252,7 @@ def _refused(warning: Problem) -> Problem:
 def _way_ns(part: _Part, running: Running) -> int:
     """Return how long the way to the first pose takes."""
     ways = (
-        (abs(target.position - running.position(joint)), running.joints[joint].highest_speed)
+        (abs(running.way(joint, target.position)), running.joints[joint].highest_speed)
         for joint, target in part.samples[0].targets.items()
         if target.position is not None
     )
@@ -283,7 +287,7 @@ def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[Sample]:
     if not known or first_ns <= 0:
         return
     fields = part.controller.offer.controller.Commands[part.kind].model_fields
-    ways = {joint: (target.position or 0.0) - running.position(joint) for joint, target in known.items()}
+    ways = {joint: running.way(joint, target.position or 0.0) for joint, target in known.items()}
     if "velocities" in fields:
         seconds = first_ns * 1e-9
         targets = {

@@ -121,8 +121,8 @@ class Commanded(NamedTuple):
 class _Target(NamedTuple):
     """Goal position of one joint, with its tolerances."""
 
-    joint: str
-    index: int
+    joint: JointPlan
+    column: int
     """Its place among the joints of the controller."""
     row: int
     position: float
@@ -131,7 +131,6 @@ class _Target(NamedTuple):
     """rad or m"""
     rest_speed: float
     """Speed below which the joint is at rest, rad/s or m/s."""
-    linear: bool
 
 
 class _Judgement(NamedTuple):
@@ -304,7 +303,7 @@ class Goals:
             slow = plan.highest_rest_speed if math.isnan(slow) else slow
             if positions is None:
                 slow = UNLIMITED
-            targets.append(_Target(name, index, row, position, near, slow, plan.linear))
+            targets.append(_Target(plan, index, row, position, near, slow))
         settle_ns = longest_ns if settle_ns is None else settle_ns
         if tolerances is not None and tolerances.left_ns is not None:
             settle_ns = min(settle_ns, tolerances.left_ns)
@@ -336,7 +335,8 @@ class Goals:
         found = unable or doubtful
         outcome, joint, error = Outcome.REACHED, "", math.nan
         if found is not None:
-            outcome, joint = Outcome.ABORTED, targets[rows.index(found[0])].joint
+            outcome, target = Outcome.ABORTED, targets[rows.index(found[0])]
+            joint = target.joint.name
             error, reason = self._describe_unable(judgement, joint, found[1])
         else:
             joint, error, reason = self._find_worst(targets, self._commanded(goal.controller).velocities)
@@ -358,23 +358,24 @@ class Goals:
         states = self._record.states
         worst: tuple[int, float, str, float, str] = (0, -1.0, "", math.nan, "")
         for target in targets:
-            error = abs(states.position.item(target.row) - target.position)
+            plan = target.joint
+            error = abs(plan.way(states.position.item(target.row), target.position))
             speed = abs(states.velocity.item(target.row))
             commanded = 0.0
             if velocities is not None and math.isnan(target.position):  # else they hold the position
-                commanded = abs(velocities.item(target.index))
+                commanded = abs(velocities.item(target.column))
             rank, off, reason = 0, 0.0 if math.isnan(error) else error, ""
             if error > target.tolerance:
-                rank, reason = 2, f"joint {target.joint} is {distance_text(error, target.linear)} off"
+                rank, reason = 2, f"joint {plan.name} is {distance_text(error, plan.linear)} off"
             elif speed > target.rest_speed:
                 rank, off = 1, speed
-                reason = f"joint {target.joint} still moves at {distance_text(speed, target.linear)}/s"
+                reason = f"joint {plan.name} still moves at {distance_text(speed, plan.linear)}/s"
             elif commanded > 0 and target.rest_speed < UNLIMITED:
                 rank, off = 1, commanded
-                shown = f"{distance_text(commanded, target.linear)}/s"
-                reason = f"joint {target.joint} is left with a commanded velocity of {shown}"
+                shown = f"{distance_text(commanded, plan.linear)}/s"
+                reason = f"joint {plan.name} is left with a commanded velocity of {shown}"
             if (rank, off) > worst[:2]:
-                name = "" if math.isnan(error) and not reason else target.joint
+                name = "" if math.isnan(error) and not reason else plan.name
                 worst = rank, off, name, error, reason
         return worst[2:]
 
@@ -408,7 +409,7 @@ class Goals:
         row, plan = self._joints[joint]
         targets = () if judgement is None else judgement.targets
         position = next((target.position for target in targets if target.row == row), math.nan)
-        error = abs(self._record.states.position.item(row) - position)
+        error = abs(plan.way(self._record.states.position.item(row), position))
         off = "" if math.isnan(error) else f"; it is {distance_text(error, plan.linear)} off"
         return error, f"joint {plan.label} {why}{off}"
 

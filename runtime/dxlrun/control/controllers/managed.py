@@ -186,6 +186,7 @@ class Managed:
             into=plan.into,
             motors=tuple(joint.motor for joint in joints),
             servos=tuple(joint.servo_model for joint in joints),
+            wrap=tuple(joint.wrap for joint in joints),
             linear=tuple(joint.linear for joint in joints),
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
