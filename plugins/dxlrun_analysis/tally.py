@@ -128,7 +128,8 @@ class Tally:
         servos, buses = self._traffic.finish()
         acts, pauses = self._steering.finish()
         tracking = self._tracking.finish(log)
-        movement = tuple(self._tracking.movement.findings())
+        conduct = self._conduct.finish()
+        movement = tuple(self._tracking.movement.findings(conduct.goals.allowed))
         gaps = self._unread
         with suppress(KeyError, ValueError):
             gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
@@ -157,7 +158,7 @@ class Tally:
             ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),
-            conduct=self._conduct.finish(),
+            conduct=conduct,
         )
 
 

@@ -7,7 +7,7 @@ where they are 9 deg and a quarter further apart than the model turns in that ti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Bins
-from dxlrun_analysis.joints.failing import AWAY, MOVED_RAD, WORSE, Windows, failure_of
+from dxlrun_analysis.joints.failing import AWAY, AWAY_RAD, MOVED_RAD, WORSE, Windows, failure_of
 from dxlrun_analysis.joints.following import followed
 from dxlrun_analysis.joints.kinds import KINDS, distance, finding, finding_of
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Trail
 from dxlrun_analysis.joints.wear import worn
 
+_NONE: Mapping[str, float] = {}
 _WINDOW_S = 0.5
 _JUMP_S = 0.5  # Positions that are further apart in time are not compared: it may have been moved
 _TOO_FAST = 1.25  # A supply at its limit and a load that pulls make a servo a little faster than its model
@@ -156,9 +157,15 @@ class Movement:
         rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
         return np.maximum(self._swings(cycles, way), np.where(begins, 2.0 * rate, 0.0))
 
-    def findings(self) -> Iterable[Finding]:
-        """Name joints that stand still, are blocked or weak, or follow worse than before."""
-        short, windows = self._windows(0.0), self._windows(_WINDOW_S)
+    def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
+        """Name joints that stand still, are blocked or weak, or follow worse than before.
+
+        Args:
+            reached_off: Distance at which a goal of a joint was reached, rad or m. A joint is not at
+                fault within it, nor within the tolerance of the robot file.
+        """
+        allowed = [max(reached_off.get(one.name, 0.0), one.logged.tolerance or 0.0) for one in self._joints]
+        short, windows = self._windows(0.0, allowed), self._windows(_WINDOW_S, allowed)
         bad = [(brief.joint, *failure_of(brief, each)) for brief, each in zip(short, windows, strict=True)]
         shared = [joint for joint, _, failing in bad if failing is not None and KINDS[failing.code].shared]
         together = len(shared) > max(1, len(bad) // 2)
@@ -188,8 +195,13 @@ class Movement:
             )
         yield from worn(followed(self._joints, self._trail.samples()), named)
 
-    def _windows(self, seconds: float) -> list[Windows]:
+    def _windows(self, seconds: float, allowed: Sequence[float]) -> list[Windows]:
         length_s, *values = self.bins.joined(seconds)
+        away = values[1][AWAY]
+        wide = np.where(
+            [off > AWAY_RAD * one.share for off, one in zip(allowed, self._joints, strict=True)], allowed, 0.0
+        )
+        away[away <= wide] = 0.0
         return [
             Windows(joint, length_s, *(each[:, :, row] for each in values))
             for row, joint in enumerate(self._joints)

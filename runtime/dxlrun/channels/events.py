@@ -180,6 +180,8 @@ class GoalTotals(msgspec.Struct, frozen=True):
     """Number of goals of motion files that were accepted, by their origins."""
     failed: tuple[GoalReport, ...] = ()
     """Goals that were missed or aborted: the first hundred of motion files, the first hundred of clients."""
+    allowed: dict[str, float] = {}
+    """Largest distance at which a goal was reached, by the joint that was farthest off, rad or m."""
 
     @property
     def asked(self) -> int:
@@ -204,6 +206,7 @@ class GoalHistory:
         self._begun: Counter[str] = Counter()
         self._failed: list[GoalReport] = []
         self._kept: Counter[bool] = Counter()
+        self._allowed: dict[str, float] = {}
 
     def add(self, report: GoalReport) -> None:
         """Count a report, and keep it if the goal failed and few of its kind did before."""
@@ -211,6 +214,9 @@ class GoalHistory:
         self._counts[report.status] += 1
         if report.status == "accepted" and planned:
             self._begun[report.origin] += 1
+        if report.status == "reached" and report.joint and report.error is not None:
+            before = self._allowed.get(report.joint, 0.0)
+            self._allowed[report.joint] = max(before, report.error)
         if report.status in ("missed", "aborted") and self._kept[planned] < MOST_FAILED:
             self._kept[planned] += 1
             self._failed.append(report)
@@ -218,7 +224,7 @@ class GoalHistory:
     @property
     def totals(self) -> GoalTotals:
         """The goals that were added until now."""
-        return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed))
+        return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed), self._allowed.copy())
 
 
 class EventSink(Protocol):
