@@ -30,7 +30,7 @@ from dxlrun.description.joints.motor import MotorLoad as MotorLoad
 from dxlrun.description.joints.motor import MotorModel as MotorModel
 from dxlrun.description.joints.motor import Stribeck as Stribeck
 from dxlrun.description.joints.servo import ServoModel as ServoModel
-from dxlrun.description.turns import nearest_turn as nearest_turn
+from dxlrun.description.joints.turns import nearest_turn as nearest_turn
 from dxlrun.description.units import Angle as Angle
 from dxlrun.description.units import AngularAcceleration as AngularAcceleration
 from dxlrun.description.units import AngularJerk as AngularJerk

@@ -124,9 +124,9 @@ class KeyframeParameters(ParametersModel):
         """Yield names of motions and joints that there are not, and circles of motions."""
         yield from super().mistakes()
         known = f"there are {', '.join(self.motions)}"
-        for place, joint in enumerate(self.wrap):
+        for index, joint in enumerate(self.wrap):
             if joint not in self.joints:
-                yield ("wrap", place), f"{joint} is {not_one_of(self.joints)}"
+                yield ("wrap", index), f"{joint} is {not_one_of(self.joints)}"
         if self.start is not None and self.start not in self.motions:
             yield ("start",), f"there is no motion {self.start}; {known}"
         for name, motion in self.motions.items():
