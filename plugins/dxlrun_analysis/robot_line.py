@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
+from dxlrun.description.units import distance_text
 from dxlrun.errors import counted
 from dxlrun.plan.played_goals import motion_name, played_name
 from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
@@ -146,8 +147,7 @@ def _off(report: GoalReport, *, linear: bool) -> str:
         return ""
     if report.error is None:
         return f" ({report.joint})"
-    far = abs(report.error)
-    return f" ({report.joint} {f'{far * 1e3:.1f} mm' if linear else f'{math.degrees(far):.1f} deg'} off)"
+    return f" ({report.joint} {distance_text(abs(report.error), linear, digits=1)} off)"
 
 
 def _takeovers(totals: RunTotals) -> Iterator[str]:
@@ -191,6 +191,5 @@ def _within(totals: RunTotals) -> str:
     )
     if worst is None or worst.worst_rad is None or worst.worst_rad < _NOTICED_RAD:
         return ""
-    far = worst.worst_rad
-    shown = f"{math.degrees(far):.1f} deg" if worst.unit == "rad" else f"{far * 1e3:.1f} mm"
+    shown = distance_text(worst.worst_rad, worst.unit != "rad", digits=1)
     return f" within {shown} ({worst.name})"

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dxlrun.description.units import distance_text
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.failing import (
     AWAY,
@@ -62,7 +63,7 @@ def finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, brief:
 
 def distance(joint: PlannedJoint, way: float) -> str:
     """Return a distance of a joint in the unit of its kind."""
-    return f"{way * 1e3:.1f} mm" if joint.logged.linear else f"{math.degrees(way):.1f} deg"
+    return distance_text(way, joint.logged.linear, digits=1)
 
 
 # What is said of each

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_text
+from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.description.units import distance_text
 from dxlrun.dynamixel.plan.planning import torque_off_ns
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import BusPlan
@@ -72,7 +73,7 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
                     what = f"{joint} {kind}, and pose {pose} has it in {position.unit}"
                     file.error(mark, what, f"write it as {example}")
                 elif not allowed.contains(Interval(position, position)):
-                    what = f"pose {pose} puts {joint} at {position_text(position, plan.linear)}"
+                    what = f"pose {pose} puts {joint} at {distance_text(position, plan.linear, trim=True)}"
                     file.error(mark, what, f"it can go to {allowed}")
 
 

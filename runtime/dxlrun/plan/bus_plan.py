@@ -198,7 +198,9 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
     def position_text(self, position: float) -> str:
         """Write a position of the joint, rad or m, for a person: `12.3 deg`, `4.56 mm`."""
-        return f"{position * 1e3:.2f} mm" if self.linear else f"{math.degrees(position):.1f} deg"
+        from dxlrun.description.units import distance_text  # not above: it loads pydantic
+
+        return distance_text(position, self.linear, digits=2 if self.linear else 1)
 
     def outside_limits(self, raw: int, lower_tick: int, upper_tick: int) -> str:
         """Return the problem and its fix for a position outside limits, all in ticks; follows the name."""

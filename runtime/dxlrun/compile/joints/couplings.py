@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun.compile.joints.limits import Interval, degrees, position_text
+from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description.document import KeyPath
@@ -20,6 +20,7 @@ from dxlrun.description.joints.mechanics import (
     Transmission,
 )
 from dxlrun.description.modes import Mode
+from dxlrun.description.units import distance_text
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
 
@@ -372,7 +373,7 @@ def _fits(
         upper = needed.upper - reach.upper > reach.lower - needed.lower
         end = needed.upper if upper else needed.lower
         corner = " and ".join(
-            f"{joint} at {position_text(one.upper if (factor > 0) is upper else one.lower, linear=False)}"
+            f"{joint} at {distance_text(one.upper if (factor > 0) is upper else one.lower, False, trim=True)}"
             for joint, factor, one in zip(coupling.joints, row, limits, strict=True)
             if factor
         )

@@ -11,6 +11,7 @@ import msgspec
 
 from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import CommandModel, SpeedPeak
+from dxlrun.description.units import distance_text
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
 
@@ -66,11 +67,6 @@ def number(position: float, linear: bool) -> str:
     return _digits(position * 1e3 if linear else math.degrees(position), signed=True)
 
 
-def position_text(position: float, linear: bool) -> str:
-    """Write a position, rad or m, with its unit."""
-    return f"{number(position, linear)} {'mm' if linear else 'deg'}"
-
-
 def speed_unit(linear: bool) -> str:
     """Return the SI unit of a joint's speed."""
     return "m/s" if linear else "rad/s"
@@ -96,7 +92,7 @@ def check_samples(
     """
     farthest, fastest = _worst(samples, joints, peaks)
     for joint, (_, sample, position) in farthest.items():
-        where = position_text(position, joints[joint].linear).removeprefix("+")
+        where = distance_text(position, joints[joint].linear, trim=True)
         problems.warning(
             sample.targets[joint].mark,
             f"{joint} is sent to {where} at {(start_ns + sample.t_ns) * 1e-9:.3f} s, outside its limits "
