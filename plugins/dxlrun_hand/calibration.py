@@ -12,10 +12,11 @@ from collections.abc import Sequence
 
 import msgspec
 
-from dxlrun.compile.joints.limits import degrees, position_text
+from dxlrun.compile.joints.limits import degrees
 from dxlrun.compile.joints.servos import servo_travel
 from dxlrun.description.document import KeyPath
 from dxlrun.description.reading import Replacement
+from dxlrun.description.units import distance_text
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find
@@ -236,4 +237,4 @@ def replacements(
 def _written(value: float, linear: bool, unit: str) -> str:
     if unit == "rad":
         return f"{value + 0.0:.4f} rad"
-    return position_text(value, linear).removeprefix("+")
+    return distance_text(value, linear, trim=True)
