@@ -112,6 +112,38 @@ def test_a_stopped_loop_is_continued_to_its_end(dxlrun, orphan: Begin) -> None:
     assert loop.wait(60) == 0
 
 
+STOPPED_SUPERVISOR = """\
+import os, subprocess, sys
+plan = os.memfd_create("dxlrun-plan")
+os.pwrite(plan, b'{"robot":"held_arm","loop":{}}', 0)
+source = "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit()); "
+source += "print('ready', flush=True); signal.pause()"
+loop = [sys.executable, "-c", source, "dxlrun.run.loop_process"]
+sys.exit(subprocess.Popen(loop, pass_fds=[plan]).wait())
+"""
+
+
+def test_stop_continues_a_stopped_supervisor_whose_loop_runs(
+    dxlrun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr("dxlrun.run.unsteered._END_S", 10.0)
+    program = tmp_path / "bin/dxlrun"
+    program.parent.mkdir()
+    program.write_text(STOPPED_SUPERVISOR)
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True) as supervisor:
+        try:
+            assert supervisor.stdout
+            assert supervisor.stdout.readline() == "ready\n"
+            supervisor.send_signal(signal.SIGSTOP)
+            os.waitpid(supervisor.pid, os.WUNTRACED)
+            said = dxlrun("stop", "--robot", "held_arm")
+        finally:
+            supervisor.kill()
+    assert said.code == 0, said.err
+    assert said.out.startswith("held_arm has ended; it could not be steered: ")
+
+
 def test_a_run_of_another_runtime_directory_is_ended_by_name_only(
     dxlrun, orphan: Begin, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -100,12 +100,20 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(h
 
 
 @pytest.mark.parametrize(
-    ("phase", "holds"), [(Phase.SETUP, False), (Phase.RUNNING, True), (Phase.STOPPING, False)]
+    ("policy", "phase", "holds"),
+    [
+        ("on_fault", Phase.SETUP, False),
+        ("on_fault", Phase.RUNNING, True),
+        ("on_fault", Phase.STOPPING, False),
+        ("on_exit", Phase.RUNNING, False),
+    ],
 )
-def test_the_guardian_holds_only_a_robot_that_was_running(start, tmp_path, monkeypatch, phase, holds):
+def test_the_guardian_holds_only_a_robot_that_was_running_by_the_policy_for_faults(  # noqa: PLR0917  fixtures
+    start, tmp_path, monkeypatch, policy, phase, holds
+):
     """In a set-up, and while torque is switched off, some servos have torque and others have not."""
     robot = tmp_path / "holding.yaml"
-    robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
+    robot.write_text((tmp_path / "pair.yaml").read_text() + f"policies: {{{policy}: hold}}\n")
     plan = plan_of(robot)
     memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter(phase)

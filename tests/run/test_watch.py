@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import socket
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msgspec.json import Decoder
+from rich.console import Console
 
 from dxlrun.channels import heartbeat, process
 from dxlrun.channels.cycle import Commands, States
@@ -28,10 +31,11 @@ from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.process_table import read_stat
-from dxlrun.run import watch
+from dxlrun.run import supervisor, watch
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
 from dxlrun.run.loop_process import AskedToStop, Pulse
 from dxlrun.run.run_processes import create_memory, guardian_job
+from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.watch import (
     HALTED_NS,
     LEAST_TIMEOUT_NS,
@@ -594,3 +598,45 @@ def test_a_guardian_stops_the_loop_in_order_when_its_supervisor_was_stopped(watc
             page.beat()
             found.append(duty_of(Watched.GUARDIAN, made._silent()) is Duty.STOP_LOOP)
     assert found == [at_ms * MS > HALTED_NS for at_ms in range(0, 300, 10)]
+
+
+class HangingGuardian:
+    """A guardian that neither responds nor is stopped, as on a machine that gives it no processor."""
+
+    def __init__(self, pid: int) -> None:
+        self.process = SimpleNamespace(pid=pid)
+        self.channel, self.theirs = process.message_channel(Decoder(GuardianMessage))
+        self.now_ns = 0
+        self.killed_ns = 0
+
+    def poll(self, timeout_s: float, *_: int) -> None:
+        self.now_ns += round(timeout_s * 1e9)
+
+    def kill(self) -> None:
+        self.killed_ns = self.now_ns
+
+
+@pytest.mark.parametrize(
+    ("signals", "phase", "least_s", "most_s"),
+    [
+        (2, Phase.RUNNING, 0.1, 0.5),
+        (2, Phase.ENGAGING, 0.1, 0.5),
+        (1, Phase.RUNNING, 5.0, 5.5),
+        (2, Phase.LOADING, 5.0, 5.5),
+    ],
+)
+def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut(  # noqa: PLR0917  fixtures
+    start, tmp_path, monkeypatch, signals, phase, least_s, most_s
+):
+    plan = plan_of(tmp_path / "pair.yaml")
+    memory = create_memory(plan)
+    Heartbeat(memory.heartbeat).enter(phase)
+    run = supervisor._Run(plan, RunOptions(gateway=False), memory, Console(file=io.StringIO()))
+    run.signals = signals
+    guardian = HangingGuardian(os.getpid())
+    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic_ns=lambda: guardian.now_ns))
+    run.watch(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
+    assert least_s < guardian.killed_ns * 1e-9 <= most_s
+    assert run.sentences == ["the guardian did not look after the loop any more and was killed"]
+    guardian.channel.close()
+    guardian.theirs.close()
