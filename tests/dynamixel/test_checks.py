@@ -40,6 +40,11 @@ FAILS = (
     (2.0, {"drive_mode": 64}, "which has no known meaning: write 0 there"),
     (2.0, {"homing_offset": -3}, "has Homing Offset (20) = -3, which shifts every position"),
     (2.0, {"min_position_limit": 700}, "has position limits 700..4095, narrower than the joint's"),
+    (
+        2.0,
+        {"min_position_limit": 2048, "max_position_limit": 2048},
+        "has position limits 2048..2048, narrower than the joint's",
+    ),
     (2.0, {"startup_configuration": 1}, "which switches its torque on at power-up: write 0 there"),
     (2.0, {"hardware_error_status": 32}, "reports in Hardware Error Status (70): overload error"),
     (2.0, {"torque_enable": 1}, "holds torque already"),

@@ -135,6 +135,16 @@ def test_an_item_of_a_plugin_without_a_judgement_is_reported():
     assert find_deviations(items.values(), {"shove": 32}) == ()
 
 
+@pytest.mark.parametrize(("value", "factory"), [(799, 800), (800, None), (1023, None), (0, 800)])
+def test_an_item_without_an_initial_value_begins_with_that_of_the_item_that_bounds_it(value, factory):
+    """A value beyond that of the other item is no deviation: the other one may have been lowered later."""
+    text = Path("runtime/dxlrun/dynamixel/control_table/tables/protocol1/AX-12A.toml").read_text()
+    rule = 'deviation = {judgement = "report", limited_by = "max_torque", effect = "makes it weak"}'
+    items = read_control_table(text.replace("torque_limit = {", f"torque_limit = {{{rule}, ")).items
+    found = find_deviations([items["torque_limit"]], {"torque_limit": value, "max_torque": 800})
+    assert [one.factory for one in found] == ([] if factory is None else [factory])
+
+
 @every_table
 def test_a_setting_of_another_program_is_refused_reported_or_silent_as_its_table_says(table):
     bench = Bench(table)

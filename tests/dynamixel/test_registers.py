@@ -189,6 +189,17 @@ def test_a_servo_that_refuses_a_register_gets_no_torque():
     assert held(rig, "position_p_gain", 1) == 850
 
 
+def test_a_servo_that_acknowledges_a_register_and_keeps_the_old_value_gets_no_torque():
+    rig = make_rig(declared(make_x((11, 12)), 0, position_p_gain=850))
+    rig.stick(11, "position_p_gain", 800)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    told = "arm_11_joint (ID 11 on bus arm) was given Position P Gain (84) = 850, but has 800"
+    assert str(caught.value).splitlines() == [told]
+    assert rig.torque() == [False, False]
+    assert rig.events.texts(EventCode.REGISTER_WRITTEN) == []
+
+
 def test_a_difference_that_the_start_mends_does_not_forbid_it():
     plan = declared(make_plan((1, 3)), 1, status_return_level=2, return_delay_time=0)
     rig = make_rig(plan)

@@ -96,6 +96,8 @@ def test_controllers_of_a_lost_servo_are_held_and_the_others_go_on(built, acts, 
     assert swing(goals(robot, 3), lost_ns, BACK_NS) == 0
     assert [t for t, _ in goals(robot, 7) if lost_ns < t < BACK_NS] == []
     assert swing(goals(robot, 9), lost_ns, BACK_NS) > 0.5
+    free = [angle for t, angle in goals(robot, 9) if lost_ns < t < BACK_NS]
+    assert max(abs(b - a) for a, b in itertools.pairwise(free)) > 1.5 * 0.02 + TICK, "yaw was slowed down"
     told = [event.text for event in read_log(tmp_path / "run.mcap").events if event.code == EventCode.POLICY]
     assert told == ["is held until all its joints answer again", "resumes: all its joints answer again"]
 
