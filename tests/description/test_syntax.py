@@ -26,7 +26,7 @@ WRONG = [
     ),
     ("a:\n\tb: 1\n", "2:1: there is a tab", "spaces"),
     ("a: b: c\n", "1:5: there is a ':' where none can be", "quotes"),
-    ("a: [1, 2\nb: 3\n", "2:2: a comma is missing, or a bracket (opened in line 1) is not closed", "add"),
+    ("a: [1, 2\nb: 3\n", "1:4: the [ that is opened here is not closed", "write ] at the end of line 1"),
     ("a: 1\nb: 'x\nc: 1\n", "2:4: a quote is opened here and never closed", "close"),
     ("a: *x\n", "1:4: this alias names no anchor", "value"),
     ("a: @x\n", "1:4: a value cannot start with @", "quotes"),

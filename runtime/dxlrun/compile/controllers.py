@@ -23,6 +23,7 @@ from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach
 from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form import ParametersModel
+from dxlrun.description.mistakes.foreign import ros_type
 from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.description.problems import errors_between_keys, problems_of
 from dxlrun.description.reading import Description
@@ -62,7 +63,7 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
     folder = file.description.path.parent
     texts: dict[str, str] = {}
     for controller, entry in file.robot.controllers.items():
-        if not is_of_file(entry.type):
+        if not is_of_file(entry.type) or ros_type(entry.type, ()):
             continue
         mark, name = file.at("controllers", controller, "type"), file_of(entry.type)
         path = folder / (name or "")
@@ -262,7 +263,9 @@ def _every(file: RobotFile, name: str, rate: float | None) -> int:
 def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offer | None:
     offer = plugins.controllers.get(type_name)
     mark = file.at("controllers", name, "type")
-    if offer is None and is_of_file(type_name):
+    if offer is None and (ros := ros_type(type_name, plugins.controllers)):
+        file.error(mark, *ros)
+    elif offer is None and is_of_file(type_name):
         if type_name in plugins.broken:  # else its file could not be read
             file.error(mark, f"{type_name} of {name} cannot be used", plugins.broken[type_name])
     elif offer is None:

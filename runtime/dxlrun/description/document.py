@@ -22,6 +22,8 @@ import msgspec
 import yaml
 from yaml.reader import Reader
 
+from dxlrun.description.mistakes.foreign import kind_of_bytes, kind_of_text
+from dxlrun.description.mistakes.syntax import explain_syntax
 from dxlrun.errors import InputError, Mark, Problem
 
 KeyPath = tuple[str | int, ...]
@@ -147,7 +149,12 @@ def read_text(path: Path, language: str = "YAML") -> str:
             raise refusal(Mark(file), reason, "split it, or thin it out") from None
         what, fix = f"the file cannot be read ({reason})", "check its name and its rights"
         raise refusal(Mark(file), what, fix) from None
-    return _decoded(data, file, language)
+    if language == "YAML" and (kind := kind_of_bytes(data, path)):
+        raise refusal(Mark(file), *kind)
+    text = _decoded(data, file, language)
+    if language == "YAML" and (kind := kind_of_text(text, path)):
+        raise refusal(Mark(file), *kind)
+    return text
 
 
 def _decoded(data: bytes, file: str, language: str) -> str:
@@ -169,7 +176,7 @@ def parse(text: str, file: str) -> Tree:
         problems = tuple(_refused_tags(text, file))
         root = yaml.compose(text, _Loader)
     except yaml.MarkedYAMLError as error:
-        raise InputError([_explained(error, text, file)]) from None
+        raise InputError(explain_syntax(text, file) or [_explained(error, text, file)]) from None
     except yaml.YAMLError as error:
         raise refusal(Mark(file), f"this is not YAML ({error})", "correct it") from None
     if root is None:
@@ -258,7 +265,7 @@ _WORDS = (
     ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space behind the ':'"),
     ("entries are not allowed", "a list cannot start here", "start it on a new line, or write [a, b]"),
     ("unexpected end of stream", "a quote is opened here and never closed", "close it"),
-    ("expected ',' or", "a comma is missing, or a bracket{since} is not closed", "add it"),
+    ("expected ',' or", "a comma is missing before this, in the brackets{since}", "add it"),
     ("could not find expected ':'", "a key has no ':'", "write `key: value`"),
     (
         "expected key",

@@ -13,6 +13,7 @@ from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, Name, key, refuse
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
+from dxlrun.description.mistakes.foreign import kind_of_data
 from dxlrun.description.problems import read_form
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
 
@@ -153,4 +154,6 @@ def motion_of(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescri
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
         fix = f"run it with `dxlrun {path}`, and give --play a motion file"
         raise refusal(grown.marks.value(), "this is a robot file, and no motion", fix)
+    if "motions" not in grown.data and (kind := kind_of_data(grown.data, path)):
+        raise refusal(grown.marks.value(), *kind)
     return MotionDescription(read_form(grown, Motion), grown.marks, path, text)

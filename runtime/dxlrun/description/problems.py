@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 
 from dxlrun.description.document import Grown, KeyPath, Marks, plain_value, text_of
 from dxlrun.description.form import Mistakes
+from dxlrun.description.mistakes.syntax import list_text
 from dxlrun.description.mistakes.words import Context, Remedy
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion
@@ -236,8 +237,13 @@ class _Error:
 
     @property
     def meant(self) -> bool:
-        """False for what follows from another error: a list is not too short because its items are wrong."""
+        """False for what follows from another error: a list is not too short because its items are wrong.
+
+        Nor does it lack an item where one is a range: `[-90..90 deg]`.
+        """
         least = self.context.get("min_length")
+        if self.missing and isinstance(self.input, list) and any(map(_is_range, self.input)):
+            return False
         return not (
             self.kind == "too_short"
             and isinstance(least, int)
@@ -260,6 +266,10 @@ class _Error:
         """The units of the value's quantity, each with its size in what the field holds; empty: none."""
         notes = () if self.model is None else _notes_at(self.model, self.location)
         return next((units for units in map(units_of, notes) if units), {})
+
+
+def _is_range(item: object) -> bool:
+    return isinstance(item, str) and list_text(item) != ""
 
 
 def path_text(path: KeyPath) -> str:
@@ -371,6 +381,8 @@ def _bound(value: object, error: _Error) -> str:
 def _remedy(error: _Error) -> str:
     """Return how to fix a value of a wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
+    if expected == "a list" and isinstance(error.input, str) and (items := list_text(error.input)):
+        return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
     if expected == "a mapping" and (fix := _indentation(error)):
         return fix
     if error.kind in ("literal_error", "enum"):

@@ -16,6 +16,7 @@ from dxlrun.description.document import Grown, KeyPath, Marks, refusal
 from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.groups import moved, with_groups
 from dxlrun.description.joints.joints import kind_of_joint, misfits
+from dxlrun.description.mistakes.foreign import kind_of_data
 from dxlrun.description.mistakes.words import sections_meant
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
@@ -119,6 +120,8 @@ _OTHER_FILES = {
 def _refuse_other_files(source: Source) -> None:
     """Raise InputError for a motion or motor file: nothing in it is wrong, but it stands for a robot."""
     data, marks = source.declared.data, source.declared.marks
+    if kind := kind_of_data(data, source.path):
+        raise refusal(marks.value(), *kind)
     if data.keys() & {"buses", "joints", "controllers", KEY}:
         return
     for key, (called, fix) in _OTHER_FILES.items():

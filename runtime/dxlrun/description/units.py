@@ -24,6 +24,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dxlrun.description.form import refuse
+from dxlrun.description.mistakes.syntax import list_text
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
@@ -302,6 +303,8 @@ def split(
         raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
         raise refuse(f"this is not {what}", f"write {what} such as {written}")
+    if several := list_text(text[:_LONGEST]):
+        raise refuse(f"{text[:_LONGEST]!r} is not {what}, but two", f"write them as a list: {several}")
     match = _QUANTITY.fullmatch(text.strip()) if len(text) <= _LONGEST else None
     number = match[1].replace("_", "") if match else ""
     if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):

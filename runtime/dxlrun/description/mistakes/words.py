@@ -155,6 +155,8 @@ class Context:
     def _misplaced(self, key: str, value: object) -> str:
         """Return what to do about a key that does not mean another one here; empty: nothing is known."""
         word, colon, rest = key.partition(":")
+        if key.endswith((")", "]")) and value is None:
+            return "write a list in square brackets: [a, b]"
         if colon and word in self.known and value is None:
             return f"write a space after the colon: `{word}: {rest}`"
         if len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys():

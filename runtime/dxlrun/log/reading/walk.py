@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+from dxlrun.description.mistakes.foreign import LONGEST_MAGIC, kind_of_bytes
 from dxlrun.errors import LogError
 from dxlrun.log.parts import log_files, missing_parts
 from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
@@ -109,7 +110,10 @@ def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
             size = os.fstat(stream.fileno()).st_size
             if size == 0:
                 raise LogError(f"{path}: the file is empty; its recorder never began to write")
-            if stream.read(len(MAGIC)) != MAGIC:
+            start = stream.read(LONGEST_MAGIC)
+            if not start.startswith(MAGIC):
+                if kind := kind_of_bytes(start, path):
+                    raise LogError(f"{path}: {'; '.join(kind)}")
                 raise LogError(f"{path}: this is no MCAP file, so it is no log of dxlrun")
             yield stream, size
     except OSError as error:

@@ -1,0 +1,173 @@
+"""Syntax: brackets that are not closed, and units and ranges as people write them.
+
+A YAML parser gives up where it can no longer go on, which is often far below the mistake. Which bracket is
+not closed follows from the indentation of the keys below it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import accumulate
+from typing import NamedTuple
+
+from dxlrun.errors import Mark, Problem
+
+_CLOSERS = {"{": "}", "[": "]"}
+_DEEPEST = 32  # Levels; a text that is nested deeper is refused for that
+_KEY = re.compile(r"( *)(?:- +)*(?:[\w./-]+|\"[^\"]*\"|'[^']*') *:(?= |$)")
+_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+_UNIT = r"(?:%|°|[A-Za-z]+(?:/[A-Za-z]+)?(?:\^\d)?)"
+_LIST_WITH_UNIT = re.compile(rf"([\[(])([^\[\](){{}}]*)[\])]\s*({_UNIT})(?=\s*(?:[,}}\]#]|$))")
+_RANGE = re.compile(
+    rf"[\[(]?\s*({_NUMBER})\s*({_UNIT})?\s*(?:,|;|\.\.+|to\b|\s)\s*({_NUMBER})\s*({_UNIT})?\s*[\])]?\s*({_UNIT})?"
+)
+_BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
+_PLUS_MINUS = re.compile(rf"(?:±|\+/?-)\s*({_NUMBER})\s*({_UNIT})?")
+
+
+class _Bracket(NamedTuple):
+    """A bracket that was opened: its place, counted from 0, and the indentation of its line."""
+
+    character: str
+    line: int
+    column: int
+    indentation: int
+
+
+def explain_syntax(text: str, file: str) -> list[Problem]:
+    """Return what is wrong with a text that is not YAML, as far as it is one of the mistakes known here."""
+    lines = text.splitlines()
+    return [*_units_behind_lists(lines, file)] or _open_brackets(lines, file)
+
+
+def list_text(text: str) -> str:
+    """Return a range as a list: `[-90 deg, 90 deg]` for `-90..90 deg`; empty: the text is not a range."""
+    text = text.strip()
+    if match := _PLUS_MINUS.fullmatch(text):
+        unit = f" {_unit(match[2])}" if match[2] else ""
+        return f"[-{match[1]}{unit}, {match[1]}{unit}]"
+    match = _RANGE.fullmatch(text)
+    if match is None:
+        return ""
+    unit = match[5] or match[4] or match[2]
+    first, second = (
+        f"{each} {_unit(own or unit)}".strip() for each, own in ((match[1], match[2]), (match[3], match[4]))
+    )
+    return f"[{first}, {second}]"
+
+
+def _unit(unit: str | None) -> str:
+    return {"°": "deg", "degrees": "deg", "degree": "deg", "radians": "rad"}.get(unit or "", unit or "")
+
+
+def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
+    for number, line in enumerate(lines, 1):
+        for match in _LIST_WITH_UNIT.finditer(line.partition(" #")[0]):
+            items = [item.strip() for item in match[2].split(",")]
+            if not all(re.fullmatch(_NUMBER, item) for item in items):
+                continue
+            written = ", ".join(f"{item} {_unit(match[3])}" for item in items)
+            yield Problem(
+                Mark(file, number, match.start(3) + 1),
+                f"a list cannot have the unit {match[3]} as a whole",
+                f"write the unit at each number: [{written}]",
+            )
+
+
+def _open_brackets(lines: list[str], file: str) -> list[Problem]:
+    """Return the brackets that are not closed; none are reported where all of them are."""
+    if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
+        return []
+    return _scanned(lines, file, by_keys=True)
+
+
+def _depth(lines: list[str]) -> int:
+    depths = accumulate(1 if each in _CLOSERS else -1 for *_, each, _ in _structure(lines) if each)
+    return max(depths, default=0)
+
+
+def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
+    """Return what is wrong with the brackets of a text.
+
+    Args:
+        lines: The text.
+        file: Its name.
+        by_keys: A key that is indented no more than the line of an open bracket ends what is in it.
+    """
+    problems: list[Problem] = []
+    opened: list[_Bracket] = []
+    for number, column, character, before in _structure(lines):
+        line = lines[number]
+        indentation = len(line) - len(line.lstrip(" "))
+        if not character:
+            ended = [each for each in opened if by_keys and each.indentation >= column and each.line < number]
+            if ended:
+                problems.append(_not_closed(ended, lines, number, file))
+                opened = opened[: -len(ended)]
+        elif character in _CLOSERS:
+            if opened or before in ("", ":", "-", "?"):  # else it is part of a text
+                opened.append(_Bracket(character, number, column, indentation))
+        elif opened and _CLOSERS[opened[-1].character] == character:
+            opened.pop()
+        elif opened:
+            problems.append(_mismatch(opened[-1], character, Mark(file, number + 1, column + 1)))
+            while opened and _CLOSERS[opened.pop().character] != character:
+                pass
+        elif before in ("]", "}"):
+            mark = Mark(file, number + 1, column + 1)
+            problems.append(Problem(mark, f"this {character} closes nothing", "take it out"))
+    if opened:
+        same = [each for each in opened if each.line == opened[-1].line]
+        problems.append(_not_closed(same, lines, len(lines), file))
+    return sorted(problems, key=lambda problem: problem.mark)
+
+
+def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
+    """Yield the brackets outside of quotes, comments and block scalars.
+
+    Each with line and column from 0, and the character before it in its line, spaces left out. For a key at
+    the beginning of a line the bracket is empty, and the column is the indentation of the key.
+    """
+    quote = ""
+    block: int | None = None  # Indentation of the line above a block scalar (`key: |`)
+    for number, line in enumerate(lines):
+        indentation = len(line) - len(line.lstrip(" "))
+        if block is not None and (not line.strip() or indentation > block):
+            continue
+        block = indentation if _BLOCK_SCALAR.search(line) else None
+        if not quote and (key := _KEY.match(line)):
+            yield number, len(key[1]), "", ""
+        escaped, before = False, ""
+        for column, character in enumerate(line):
+            if quote:
+                quote = "" if character == quote and not escaped else quote
+                escaped = character == "\\" and quote == '"' and not escaped
+            elif character == "#" and line[column - 1 : column] in ("", " "):
+                break
+            elif character in "\"'" and before in ("", *":-[{,?"):
+                quote = character
+            elif character in "[]{}":
+                yield number, column, character, before
+            before = before if character == " " else character
+
+
+def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: str) -> Problem:
+    """Return the problem of brackets on a line, or on several, that should be closed before a line."""
+    last = unclosed[-1]
+    end = next((above for above in range(number - 1, last.line, -1) if lines[above].strip()), last.line)
+    closers = "".join(_CLOSERS[each.character] for each in reversed(unclosed))
+    return Problem(
+        Mark(file, last.line + 1, last.column + 1),
+        f"the {last.character} that is opened here is not closed",
+        f"write {closers} at the end of line {end + 1}",
+    )
+
+
+def _mismatch(bracket: _Bracket, character: str, mark: Mark) -> Problem:
+    where = f"the {character} in line {mark.line}, column {mark.column}"
+    return Problem(
+        Mark(mark.file, bracket.line + 1, bracket.column + 1),
+        f"the {bracket.character} that is opened here is not closed",
+        f"write {_CLOSERS[bracket.character]} before {where}",
+    )
