@@ -140,6 +140,14 @@ def test_a_reply_that_comes_too_late_is_neither_garbled_nor_the_next_ones(after_
     assert line.bus.unrequested == line.bus.noise_bytes == 0
 
 
+def test_a_late_refusal_of_a_request_of_another_length_refuses_nothing_else():
+    refusal = protocol1.status_packet(7, 0x08)
+    line = ScriptedLine([], [(300_000, refusal), (700_000, ANSWER)])
+    (lost, reply), _, _ = talk(line, READ, QUESTION)
+    assert lost.outcome is Outcome.TIMEOUT
+    assert (reply.outcome, reply.parameters) == (Outcome.OK, b"a")
+
+
 def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled():
     stale = protocol1.status_packet(7, 0, b"------")
     (lost, reply), sink, _ = talk(ScriptedLine([], [(150_000, stale), (700_000, GOOD)]), READ, READ)

@@ -298,7 +298,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     )
     page.enter(Phase.SETUP)
     try:
-        hardware.start()
+        hardware.start(lambda: page.enter(Phase.ENGAGING))
     except AskedToStop:
         assert [servo.torque_on for servo in buses[0].servos] == [False, False]
         return any(bytes((24, 1)) in entry.data for entry in ledger.entries if entry.direction == "in")
