@@ -5,7 +5,7 @@ and what would overwrite one that it has not taken is refused. *Set-points* of s
 each controller, of which the loop takes the newest record. Answers come back through a ring of their own.
 
 One writer (the gateway), one reader (the loop). The reader trusts nothing that it finds: whatever is not
-whole is dropped, and counted. Layout, little-endian, 64-bit words aligned:
+whole is dropped. Layout, little-endian, 64-bit words aligned:
 
     header      magic u64, places u64, generation u64 (set-points ever put), 40 bytes reserved
     operations  a ring
@@ -124,7 +124,7 @@ class MailboxWriter:
 
 
 class Mailbox:
-    """The loop's end: an Inbox. `dropped` counts what was not whole."""
+    """The loop's end: an Inbox."""
 
     def __init__(self, descriptor: int, answers: Appender) -> None:
         self._words, (operations, *places) = _mapped(descriptor)
@@ -132,7 +132,6 @@ class Mailbox:
         self._places = [RingReader(place) for place in places]
         self._answers = answers
         self._generation = 0
-        self.dropped = 0
 
     def take(self) -> Sequence[Command]:
         """Return what has come, in order, at most MOST_PER_CYCLE (fewer where they are long, see MOST_BYTES)
@@ -145,25 +144,18 @@ class Mailbox:
         for _ in range(MOST_PER_CYCLE):
             if lane.position - begin > MOST_BYTES or (record := lane.read()) is None:
                 break
-            self._decode(record, commands)
+            _append_command(record, commands)
         lane.report_taken()
         if generation != self._generation:
             self._generation = load(self._words, _GENERATION)  # the places are no older
             for place in self._places:
                 if place.head > place.position:
-                    self._decode(place.newest() or Gap(1), commands)
+                    _append_command(place.newest(), commands)
         return commands
 
     def answer(self, number: int, answer: Answer) -> None:
         """Answer a command of the gateway; long texts in a refusal's fields are cut."""
         self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
-
-    def _decode(self, record: Record | Gap, commands: list[Command]) -> None:
-        found = _found(record) if isinstance(record, Record) else None
-        if isinstance(found, Command):
-            commands.append(found)
-        else:
-            self.dropped += record.lost if isinstance(record, Gap) else 1
 
 
 class Answers:
@@ -176,6 +168,12 @@ class Answers:
         """Return the answers since the last call, each with its command's number."""
         found = [_found(one) for one in iter(self._ring.read, None) if isinstance(one, Record)]
         return [one for one in found if isinstance(one, Answered)]
+
+
+def _append_command(record: Record | Gap | None, commands: list[Command]) -> None:
+    """Append the command of a record; a record that is not whole is dropped."""
+    if isinstance(record, Record) and isinstance(found := _found(record), Command):
+        commands.append(found)
 
 
 def _found(record: Record) -> Tagged | None:

@@ -119,7 +119,6 @@ def test_records_of_all_lengths_go_round_the_ring_many_times(both):
             assert taken == waiting[: len(taken)]
             del waiting[: len(taken)]
     assert both.take_all() == waiting
-    assert both.reader.dropped == 0
 
 
 OPERATIONS = 64
@@ -137,7 +136,6 @@ def test_a_writer_that_died_in_a_set_point_is_not_waited_for(both):
     both.writer.set_point(1, command(2, lease_ns=5))
     assert [one.number for one in both.reader.take()] == [2]
     assert list(both.reader.take()) == []
-    assert both.reader.dropped == 0
 
 
 def test_a_set_point_that_is_damaged_is_dropped_and_the_next_one_taken(both):
@@ -145,7 +143,6 @@ def test_a_set_point_that_is_damaged_is_dropped_and_the_next_one_taken(both):
     os.pwrite(both.descriptor, b"damage", PLACE_0 + 64 + 30)
     for _ in range(3):
         assert list(both.reader.take()) == []
-        assert both.reader.dropped == 1
     both.writer.set_point(0, command(2, lease_ns=5))
     assert [one.number for one in both.reader.take()] == [2]
 
@@ -155,7 +152,6 @@ def test_an_operation_that_is_damaged_is_dropped_and_the_next_one_taken(both):
     both.writer.post(command(2))
     os.pwrite(both.descriptor, b"damage", OPERATIONS + 64 + 30)
     assert [one.number for one in both.take_all()] == [2]
-    assert both.reader.dropped == 1
     both.writer.post(command(3))
     assert [one.number for one in both.take_all()] == [3]
 
@@ -184,7 +180,7 @@ def test_a_set_point_is_whole_before_it_is_shown(both, monkeypatch):
 
 def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop():
     """Any bytes in any place: no exception, a bounded number of commands, no endless loop."""
-    chance, dropped = random.Random(3), 0
+    chance, taken = random.Random(3), 0
     for number in range(300):
         if number % 10 == 0:
             both = Both()
@@ -197,10 +193,10 @@ def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop()
         both.writer.set_point(0, command(1, bytes(100), lease_ns=1))
         os.pwrite(both.descriptor, chance.randbytes(8), PLACE_0 + HEAD + chance.randrange(300))
         for _ in range(3):
-            assert len(both.reader.take()) <= MOST_PER_CYCLE + PLACES
-        if number % 10 == 9:
-            dropped += both.reader.dropped
-    assert dropped > 100
+            commands = both.reader.take()
+            assert len(commands) <= MOST_PER_CYCLE + PLACES
+            taken += len(commands)
+    assert 0 < taken < 2 * 300 - 100, "more than 100 were damaged"
 
 
 @pytest.mark.parametrize("last", [2**64 - 8, 2**64 - 1])
@@ -208,7 +204,6 @@ def test_counts_at_the_end_of_their_words_get_no_exception_out_of_the_loop(both,
     os.pwrite(both.descriptor, struct.pack("<Q", last), OPERATIONS + HEAD)
     for _ in range(3):
         assert list(both.reader.take()) == []
-    assert both.reader.dropped == 1
 
 
 def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
