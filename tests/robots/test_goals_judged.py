@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 from tests.kit.clients import Ask, steered
 from tests.kit.commands import Dxlrun
+from tests.kit.stories import Clients, prepared
 
 from dxlrun.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.testing import read_log, simulated_robot
 
 BUSES = """
 buses:
@@ -380,3 +382,40 @@ def test_a_weight_that_is_warned_of_keeps_a_goal_from_being_reached(tmp_path, gr
     (goal,) = ended(run)
     off = math.degrees(math.pi / 2 - shaft(run.robot, 1))
     assert (goal["status"], off > 5.0) == (status, status == "missed"), (goal, off)
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+@pytest.mark.parametrize("before_ms", [3, 12])
+def test_a_joint_that_shuts_itself_down_before_its_goal_is_judged_has_not_reached_it(
+    tmp_path, protocol, before_ms
+):
+    """Its reply reports the error, so its torque is in doubt, although it still stands at the goal."""
+    model = "MX-64" if protocol == 1.0 else "XM430-W350"
+    (tmp_path / "arm.yaml").write_text(f"""\
+name: arm
+buses:
+  main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 0 us}}
+loop: {{rate: 50}}
+joints:
+  a: {{bus: main, id: 1, model: {model}, reference: 180 deg, direction: 1}}
+controllers:
+  arm: {{type: joint_trajectory_controller, joints: [a]}}
+""")
+    judged_ms = 2000
+
+    def run(overloads_ms: float | None) -> tuple[str, float]:
+        log = tmp_path / "log.mcap"
+        log.unlink(missing_ok=True)
+        robot = simulated_robot(tmp_path / "arm.yaml", duration_s=judged_ms / 1000 + 0.8, log=log)
+        points = [{"positions": [0.5], "time": 1.0}]
+        Clients(robot, {50: [prepared(robot, "arm", "trajectory", points=points)]})
+        if overloads_ms is not None:
+            robot.buses[0].at(round(overloads_ms * 1e6), robot.buses[0].servo(1).trigger_overload)
+        robot.run()
+        (end,) = [event for event in read_log(log).events if event.code == EventCode.GOAL_ENDED]
+        return end.text, end.t_ns / 1e6
+
+    text, ended_ms = run(None)
+    assert "reached" in text
+    text, _ = run(ended_ms - before_ms)
+    assert re.match(r"goal 1 aborted: after .* s, joint a \(ID 1 on bus main\) has no torque", text)

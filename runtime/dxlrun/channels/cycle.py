@@ -131,7 +131,8 @@ class States:
     mode: NDArray[np.uint8]
     """A Mode: in which the servo is known to be; UNKNOWN while that changes."""
     torque: NDArray[np.uint8]
-    """A Torque: whether the servo holds torque, as known before this cycle's read."""
+    """A Torque: whether the servo holds torque, as known before this cycle's read; in doubt where a reply
+    of it reports an error that is new."""
 
     def __post_init__(self) -> None:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):

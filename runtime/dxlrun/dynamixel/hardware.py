@@ -159,8 +159,7 @@ class DynamixelHardware:
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
-            if servos.life.torque_changed:
-                servos.show_torque(self._states.torque)
+        self._show_torque()
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
 
@@ -192,6 +191,13 @@ class DynamixelHardware:
                 self._samples.judge(self._clock.now_ns())
         if self._look:
             self._by_kernel = None
+            # A reply with an error puts torque in doubt: the states that it brought are not judged without.
+            self._show_torque()
+
+    def _show_torque(self) -> None:
+        for servos in self._servos:
+            if servos.life.torque_changed:
+                servos.show_torque(self._states.torque)
 
     def _plan_reads(self) -> bool:
         """Plan the next reads, once a cycle and before any of them is sent.

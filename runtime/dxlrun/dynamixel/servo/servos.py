@@ -230,6 +230,7 @@ class Servos:
             if self._dialect.ALERT:
                 if error & ~before & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
+                    self.life.on(index, ServoEvent.DOUBT)  # it may have shut down
                 elif not error & self._dialect.ALERT:
                     self._shown[self._rows[index]] = self._read_errors[index] = 0
             else:
