@@ -32,6 +32,8 @@ WITHOUT_JSON = (
     "swich",
     "chekc",
     "juggle",
+    "other/",
+    "bioloid_torso",
     ".",
     "--",
 )

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from cyclopts import App, CycloptsError, Group
+from cyclopts import App, CoercionError, CycloptsError, Group, MissingArgumentError, UnknownOptionError
 
 from dxlrun.cli import verbs
 from dxlrun.cli.run import run
-from dxlrun.errors import DxlrunError, InputError, Problem, Refused
+from dxlrun.errors import DxlrunError, InputError, Problem, Refused, near
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import out, print_error, print_refusal, print_warning, show
 
@@ -133,6 +135,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
     """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
     app = build(tokens[0] if tokens else "")
     try:
+        _refuse_other_words(tokens)
         code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()  # a reader that went away is noticed here, not when the interpreter ends
     except KeyboardInterrupt:
@@ -148,7 +151,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
         if isinstance(error, InputError) and error.problems:
             _refuse(tokens, (), error.problems)
             return error.exit_code
-        sentences, code = _explained(error, tokens[0] if tokens else "")
+        sentences, code = _explained(error, tokens)
         reason = {"code": error.code, "fields": error.fields} if isinstance(error, Refused) else {}
         _refuse(tokens, sentences, reason=reason)
         return code
@@ -171,14 +174,121 @@ def _refuse(
         print_error(sentence if sentence == "interrupted" else f"dxlrun: {sentence}")
 
 
-def _explained(error: Exception, verb: str) -> tuple[tuple[str, ...], int]:
+def _refuse_other_words(tokens: Sequence[str]) -> None:
+    """Raise InputError for a verb of another program, with the command line that does the same."""
+    word = tokens[0] if tokens else ""
+    verb = verbs.verb_for(word)
+    if verb is None or word in verbs.names() or Path(word).exists():
+        return
+    given = [*verb.split(), *_without_output(tokens[1:])]
+    line = shlex.join(("dxlrun", *given)) if given else "dxlrun ROBOT.yaml"
+    raise InputError(f"'{word}' is not a command; write `{line}`")
+
+
+def _without_output(tokens: Sequence[str]) -> list[str]:
+    """Return a command line without options that a person who mistyped it does not mean to repeat."""
+    return [token for token in tokens if token not in ("--json", "--debug")]
+
+
+_OF_ROBOT = ("robot", "file", "robot-file", "config", "yaml", "input", "f", "c", "r", "i")
+"""Options of other programs for what is written without one here."""
+
+
+def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
+    """Return the command line that was meant, with the given values; empty: it is not known."""
+    verb = list(error.command_chain or ())
+    given = _without_output(tokens[len(verb) :])
+    if isinstance(error, UnknownOptionError):
+        return _without_options(error, verb, given)
+    if isinstance(error, MissingArgumentError) and verb:
+        # `set base gain=400`, `set base.gain 400`: two words were written as one
+        for sign in (":=", "=", "."):
+            words = [part for word in given for part in ([word] if word[:1] == "-" else word.split(sign, 1))]
+            if len(words) == len(given) + 1 and all(words):
+                return shlex.join(("dxlrun", *verb, *words))
+    if isinstance(error, CoercionError) and verb == ["torque"] and {"on", "off"} & set(given[1:]):
+        state = next(word for word in given if word in ("on", "off"))
+        return shlex.join(("dxlrun", "torque", state, *(word for word in given if word != state)))
+    return ""
+
+
+_OPTION_WORDS = {
+    "duration": "time seconds timeout for t length",
+    "play": "motion motions animation",
+    "virtual": "sim simulate simulation dry-run fake",
+    "no-record": "no-log nolog norecord",
+    "output": "out o to",
+}
+"""Options of other programs, by ours."""
+
+
+def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequence[str]) -> str:
+    """Return a command line in which unknown options are what they stand for; empty: it is not known."""
+    known = error.argument_collection
+    places = {place.name.lower() for place in known if place.field_info.is_positional}
+    options = {name for each in known for name in each.names}
+    first: list[str] = []
+    words: list[str] = []
+    last: list[str] = []
+    rest = [*given]
+    while rest:
+        option, sign, value = rest.pop(0).partition("=")
+        name = option.lstrip("-")
+        if option == name or option in options:
+            words.append(f"{option}{sign}{value}")
+            continue
+        ours = next((f"--{our}" for our, theirs in _OPTION_WORDS.items() if name in theirs.split()), "")
+        if not sign and rest and rest[0][:1] != "-" and ours != "--virtual":
+            value = rest.pop(0)
+        if ours in options:
+            words += [ours, value] if value else [ours]
+        elif value and name in _OF_ROBOT:
+            first.append(value)
+        elif value and name in places:
+            words.append(value)
+        elif value and name in _declared((*words, *rest)):
+            last.append(f"{name}:={value}")
+        else:
+            return ""
+    return shlex.join(("dxlrun", *verb, *first, *words, *last))
+
+
+def _declared(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the arguments that the robot file of a command line declares; none where it cannot be read."""
+    from dxlrun.description.including import read_sources  # not above: only a wrong command line needs it
+
+    robot = next((word for word in words if word.endswith((".yaml", ".yml"))), None)
+    if robot is None:
+        return ()
+    try:
+        blocks = [source.declared.data.get("arguments") for source in read_sources(Path(robot))]
+    except InputError:
+        return ()
+    return tuple(name for block in blocks if isinstance(block, dict) for name in block)
+
+
+def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
+    """Return what is wrong with a command line, and the right one, or where its usage is shown."""
+    usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
+    what, fix = " ".join(str(error).split()).removesuffix("."), f"`{usage}` shows the usage"
+    if isinstance(error, UnknownOptionError):
+        option = (error.token.keyword or error.token.value).partition("=")[0]
+        what = f"Unknown option: {option}"
+        names = {name.lstrip("-"): name for each in error.argument_collection for name in each.names}
+        if meant := near(option.lstrip("-"), [name for name in names if names[name].startswith("--")]):
+            fix = f"did you mean {' or '.join(names[name] for name in meant)}?"
+    if line := _right_form(error, tokens):
+        fix = f"write `{line}`"
+    return f"{what}; {fix}"
+
+
+def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...], int]:
     """Return an error without places in files, in one sentence a problem, and the exit code."""
+    verb = tokens[0] if tokens else ""
     if isinstance(error, DxlrunError):
         return tuple(str(error).splitlines()) or (type(error).__name__,), error.exit_code
     if isinstance(error, CycloptsError):
-        usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
-        what = " ".join(str(error).split()).removesuffix(".")
-        return (f"{what}; `{usage}` shows the usage",), InputError.exit_code
+        return (_usage_error(error, tokens),), InputError.exit_code
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return (f"{where}{error.strerror or error}; --debug shows what was being done",), 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -101,14 +102,19 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
     for word in assignments:
         name, sign, value = word.partition(":=")
         if not sign or not name:
-            hint = (
-                "a motion needs its own --play" if word.endswith((".yaml", ".yml")) else "write name:=value"
-            )
-            raise InputError(f"{word!r} is no argument of the robot file; {hint}")
+            raise InputError(f"{word!r} is not an argument of the robot file; write {_assignment_for(word)}")
         if name in arguments:
             raise InputError(f"argument {name} is given twice; give it once")
         arguments[name] = value
     return arguments
+
+
+def _assignment_for(word: str) -> str:
+    """Return how a word is written that was meant as an argument of the robot file, or as an option."""
+    if word.endswith((".yaml", ".yml")):
+        return f"--play {word.removeprefix('play=').removeprefix('play:')}"
+    name, sign, value = re.match(r"([A-Za-z_]\w*)?\s*(=|:)?\s*(.*)", word, re.DOTALL).groups()  # type: ignore[union-attr]  # it always matches
+    return f"{name}:={value or 'VALUE'}" if name and sign else "name:=value"
 
 
 def leave_real_time() -> None:
@@ -174,13 +180,31 @@ def known_file(robot: Path) -> None:
     if robot.is_dir():
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
-        raise InputError(f"there is no robot file {word}; check the path")
+        raise InputError(f"there is no robot file {word}; {_other_file(robot)}")
     if package := verbs.package_of(word):
         raise InputError(
             f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
             f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` "
             "where dxlrun came from installs it"
         )
+    if (named := robot.with_suffix(".yaml")).is_file():
+        raise InputError(f"there is no file {word}; write `{named}`")
+    if is_example(robot.name):
+        raise InputError(f"there is no file {word}; `dxlrun examples {word}` copies the robot of this name")
     otherwise = "a robot is run by `dxlrun ROBOT.yaml`, `dxlrun help` lists the commands"
     hint = suggestion(word, verbs.names(), otherwise)
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")
+
+
+def _other_file(robot: Path) -> str:
+    """Return which file may be meant by the name of a robot file that is missing."""
+    beside = [path.name for path in robot.parent.glob("*.y*ml")] if robot.parent.is_dir() else []
+    copies = f"`dxlrun examples {robot.stem}` copies the robot of this name"
+    return suggestion(robot.name, beside, copies if is_example(robot.stem) else "check the path")
+
+
+def is_example(name: str) -> bool:
+    """Return whether a robot of a name comes with dxlrun."""
+    from dxlrun.cli.examples import examples_directory  # not above: that module imports this one
+
+    return (examples_directory() / f"{name}.yaml").is_file()

@@ -73,6 +73,38 @@ _PACKAGES = {
 """Verbs of this repository's packages, to name the package where it is not installed."""
 
 
+_OTHER_WORDS = {
+    "": "run start launch exec execute go up robot",
+    "check": "validate lint verify test info",
+    "list": "ls ps status robots",
+    "stop": "kill quit exit end shutdown down",
+    "sim": "simulate simulator simulation emulate",
+    "scan": "ping discover find detect search ports probe",
+    "doctor": "diagnose troubleshoot env",
+    "analyze": "analyse report plot stats inspect",
+    "logs": "log history",
+    "watch": "monitor top state states",
+    "send": "move goto command cmd",
+    "torque on": "enable",
+    "torque off": "disable limp relax release",
+    "set": "write",
+    "get": "read",
+    "examples": "init new create example",
+    "plugins": "types controllers plugin",
+    "models": "servos model",
+    "parameters": "params param parameter",
+    "calibrate": "calibration home",
+    "teach": "record",
+    "help": "man usage",
+}
+"""Words of other programs, by the verb of ours that does this; without one: `dxlrun ROBOT.yaml`."""
+
+
+def verb_for(word: str) -> str | None:
+    """Return the verb, or the beginning of a command line, that a word of other programs means."""
+    return next((verb for verb, words in _OTHER_WORDS.items() if word in words.split()), None)
+
+
 def is_verb(word: str) -> bool:
     """Return whether a word may be a verb, and no path of a robot file."""
     return re.fullmatch(r"[a-z][a-z0-9-]*", word) is not None

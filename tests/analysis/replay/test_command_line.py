@@ -67,7 +67,7 @@ def test_remarks_go_to_stderr(
     [
         (["missing.mcap"], "there is no log missing.mcap"),
         ([__file__], "this is no MCAP file"),
-        (["{log}", "fast"], "'fast' is no argument of the robot file"),
+        (["{log}", "fast"], "'fast' is not an argument of the robot file"),
         (["{log}", "--set", "neck.gain=1"], "the log has no such controller"),
         (["{log}", "--set", "all_inputs.gian=1"], "dxlrun: --set all_inputs has an unknown key 'gian'; did"),
         (["{log}", "rate:=100"], "change the loop's period"),

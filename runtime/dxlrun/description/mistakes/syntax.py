@@ -160,7 +160,7 @@ def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: s
     return Problem(
         Mark(file, last.line + 1, last.column + 1),
         f"the {last.character} that is opened here is not closed",
-        f"write {closers} at the end of line {end + 1}",
+        f"write {closers} at the end{f' of line {end + 1}' if lines[1:] else ''}",
     )
 
 
