@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from tests.kit.examples import as_parameters
 
-from dxlrun.cli import examples
+from dxlrun.cli import inputs
 from dxlrun.compile.robot import compile_files
+from dxlrun.errors import DxlrunError
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 NAMES = sorted(path.stem for path in ROBOTS.glob("*.yaml"))
@@ -99,8 +100,8 @@ def test_a_directory_that_cannot_be_made_is_one_sentence(dxlrun: Callable, tmp_p
 
 def test_an_installed_package_takes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     package = tmp_path / "site-packages" / "dxlrun"
-    monkeypatch.setattr(examples, "__file__", str(package / "cli" / "examples.py"))
-    with pytest.raises(examples.DxlrunError, match="has no examples"):
-        examples.examples_directory()
+    monkeypatch.setattr(inputs, "__file__", str(package / "cli" / "inputs.py"))
+    with pytest.raises(DxlrunError, match="has no examples"):
+        inputs.examples_directory()
     shutil.copytree(ROBOTS, package / "examples")
-    assert examples.examples_directory() == package / "examples"
+    assert inputs.examples_directory() == package / "examples"

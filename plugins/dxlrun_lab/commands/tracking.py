@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from dxlrun.cli.examples import examples_directory
 from dxlrun.cli.inputs import (
     Assignment,
     DebugFlag,
@@ -15,6 +14,7 @@ from dxlrun.cli.inputs import (
     JsonFlag,
     check_report,
     compiled,
+    examples_directory,
     read_models,
     terminated_as_interrupted,
     write_report,

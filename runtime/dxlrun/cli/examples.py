@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.cli.inputs import DebugFlag, JsonFlag, examples_directory
+from dxlrun.errors import InputError
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -75,15 +75,6 @@ def examples(
     motion = f" --play {directory / 'motions' / example.motions[0]}.yaml" if example.playable else ""
     show(*copied, f"next: dxlrun {copied[0]}{motion}")
     return 0
-
-
-def examples_directory() -> Path:
-    """Return where the examples are: in the installed package, or in the clone that it is edited in."""
-    package = Path(__file__).parents[1]
-    for place in (package / "examples", package.parents[1] / "robots"):
-        if place.is_dir():
-            return place
-    raise DxlrunError("this installation of dxlrun has no examples; install it anew")
 
 
 def _list(found: Sequence[Example], *, as_json: bool) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli import verbs
-from dxlrun.errors import InputError, missing_extra, suggestion
+from dxlrun.errors import DxlrunError, InputError, missing_extra, suggestion
 
 if TYPE_CHECKING:
     from cyclopts import Token
@@ -203,8 +203,15 @@ def _other_file(robot: Path) -> str:
     return suggestion(robot.name, beside, copies if is_example(robot.stem) else "check the path")
 
 
+def examples_directory() -> Path:
+    """Return where the examples are: in the installed package, or in the clone that it is edited in."""
+    package = Path(__file__).parents[1]
+    for place in (package / "examples", package.parents[1] / "robots"):
+        if place.is_dir():
+            return place
+    raise DxlrunError("this installation of dxlrun has no examples; install it again")
+
+
 def is_example(name: str) -> bool:
     """Return whether a robot of a name comes with dxlrun."""
-    from dxlrun.cli.examples import examples_directory  # not above: that module imports this one
-
     return (examples_directory() / f"{name}.yaml").is_file()

@@ -298,7 +298,9 @@ def parameters_of(
     except ValidationError as error:
         prefix = (f"{kind}s", name)
         beside = sorted(type(entries[name]).model_fields.keys() - {"parameters"})
-        file.extend(problems_of(error, file.marks, prefix, model=model, beside=beside))
+        file.extend(
+            problems_of(error, file.marks, prefix, model=model, beside=beside, document=type(file.robot))
+        )
         between = errors_between_keys(entries[name].parameters, error, model)
         if between is not None:
             replaced = {(*prefix, *path) for path in between[1]}

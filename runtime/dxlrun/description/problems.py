@@ -28,13 +28,15 @@ def problems_of(
     *,
     model: type[BaseModel] | None = None,
     beside: Collection[str] = (),
+    document: type[BaseModel] | None = None,
     unknown: Set[KeyPath] = frozenset(),
     most: int | None = None,
 ) -> list[Problem]:
     """Return one problem for each place that a model refused, in file order.
 
-    `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest known
-    one, also of those that stand `beside` the model's, and missing keys an example. `unknown` paths and what
+    `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest
+    known one, also of those that stand `beside` the model's, and missing keys an example. `document` is the
+    model of the whole file where `model` is of a part: a key may belong elsewhere. `unknown` paths and what
     is below them are skipped. `most` of pydantic's errors are looked at, None: all.
     """
     found: dict[KeyPath, list[_Error]] = {}
@@ -42,11 +44,13 @@ def problems_of(
         one = _Error(details, marks, prefix, model, beside)
         if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
             found.setdefault(one.path, []).append(one)
-    problems = [_merged(errors, marks) for errors in _explain_unknown_keys(found, marks)]
+    problems = [_merged(errors, marks) for errors in _explain_unknown_keys(found, marks, document)]
     return sorted(problems, key=lambda problem: problem.mark)
 
 
-def _explain_unknown_keys(found: Mapping[KeyPath, list[_Error]], marks: Marks) -> Iterator[list[_Error]]:
+def _explain_unknown_keys(
+    found: Mapping[KeyPath, list[_Error]], marks: Marks, document: type[BaseModel] | None
+) -> Iterator[list[_Error]]:
     """Yield the errors of each place; unknown keys get their remedies, a pair of them is one error.
 
     A missing key is not an error where an unknown one means it.
@@ -57,17 +61,26 @@ def _explain_unknown_keys(found: Mapping[KeyPath, list[_Error]], marks: Marks) -
             parents.setdefault(path[:-1], {})[str(path[-1])] = errors[0]
     settled: set[KeyPath] = set()
     for parent, errors_of in parents.items():
-        for remedy in _remedies_at(parent, errors_of, marks):
+        for remedy in _remedies_at(parent, errors_of, marks, document):
             first, *others = (errors_of[key] for key in remedy.keys)
             first.remedy = remedy
             settled.update(one.path for one in others)
             settled.add((*parent, remedy.means))
+    for parent in {path[:-1] for path in found}:
+        entries = [path for path in found if path[:-1] == parent and _is_key_of_entry(found[path][0])]
+        settled.update(entries[1:])
+        if entries:
+            above = [path for path in found if path[:-1] == parent and found[path][0].input is None]
+            found[entries[0]][0].unindented = [str(path[-1]) for path in entries]
+            settled.update(above)
     for path, errors in found.items():
         if path not in settled or (errors[0].kind == "extra_forbidden" and errors[0].remedy is not None):
             yield errors
 
 
-def _remedies_at(parent: KeyPath, unknown: Mapping[str, _Error], marks: Marks) -> list[Remedy]:
+def _remedies_at(
+    parent: KeyPath, unknown: Mapping[str, _Error], marks: Marks, document: type[BaseModel] | None
+) -> list[Remedy]:
     first = next(iter(unknown.values()))
     form = None if first.model is None else _follow(first.model, first.location[:-1])
     if first.model is None or form is None:
@@ -80,7 +93,7 @@ def _remedies_at(parent: KeyPath, unknown: Mapping[str, _Error], marks: Marks) -
     known = (*known, *first.beside) if len(first.location) == 1 else known
     values = {key: error.input for key, error in unknown.items() if key not in refused}
     present = [str(path[-1]) for path in marks.keys if path[:-1] == parent]
-    return [*Context(first.model, form, parent, known, present, sections).remedies(values)]
+    return [*Context(document or first.model, form, parent, known, present, sections).remedies(values)]
 
 
 def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
@@ -234,6 +247,8 @@ class _Error:
         self.path: KeyPath = (*path, location[-1]) if self.missing else path
         self.at_key = of_key or self.missing or self.kind == "extra_forbidden"
         self.remedy: Remedy | None = None
+        self.unindented: list[str] = []
+        """Keys of an entry that are indented like the entry's name, this one first."""
 
     @property
     def meant(self) -> bool:
@@ -395,11 +410,20 @@ def _remedy(error: _Error) -> str:
     return _example(error) or _REMEDIES.get(expected, "correct it")
 
 
+def _is_key_of_entry(error: _Error) -> bool:
+    """Return whether the name of an entry that is not a mapping is a key that entries have."""
+    if _TYPES.get(error.kind) != "a mapping" or error.model is None or not error.path:
+        return False
+    form = _follow(error.model, error.location)
+    return form is not None and error.path[-1] in form.model_fields
+
+
 def _indentation(error: _Error) -> str:
     """Return how to indent what should be a mapping; empty: its indentation is right, as far as is known."""
-    form = None if error.model is None else _follow(error.model, error.location)
-    if form is not None and error.path and error.path[-1] in form.model_fields:
-        return f"{error.path[-1]} is a key of an entry: indent it below the entry's name"
+    if error.unindented:
+        *others, last = error.unindented
+        named = f"{', '.join(others)} and {last} are keys" if others else f"{last} is a key"
+        return f"{named} of an entry: indent {'them' if others else 'it'} below the entry's name"
     if isinstance(error.input, list) and error.input and all(isinstance(one, dict) for one in error.input):
         names = [one.get("name", "NAME") for one in error.input]
         return f"write `{names[0]}: {{...}}` for each entry, without `-` before it"

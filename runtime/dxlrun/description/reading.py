@@ -18,7 +18,7 @@ from dxlrun.description.joints.groups import moved, with_groups
 from dxlrun.description.joints.joints import kind_of_joint, misfits
 from dxlrun.description.mistakes.foreign import kind_of_data
 from dxlrun.description.mistakes.words import sections_meant
-from dxlrun.description.problems import places_of, problems_of
+from dxlrun.description.problems import path_text, places_of, problems_of
 from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem, told_once
 
@@ -131,21 +131,31 @@ def _refuse_other_files(source: Source) -> None:
 
 
 def _with_own_sections(grown: Grown) -> Grown:
-    """Return a document whose sections have our names; each that had another one is a problem."""
-    meant = sections_meant(Robot, {k: v for k, v in grown.data.items() if k not in Robot.read_before})
-    if not meant:
+    """Return a document whose sections are at its top, by our names; where one was not, is a problem."""
+    own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
+    data, problems = dict(grown.data), [*grown.problems]
+    moves: dict[KeyPath, list[KeyPath]] = {}
+    said: set[str] = set()
+    for path, name, fix in sections_meant(Robot, own):
+        *above, key = path
+        inside = data[above[0]] if above else data
+        assert isinstance(inside, dict)  # noqa: S101 (it has the key)
+        value = inside[key]
+        if above:
+            data[above[0]] = {each: item for each, item in inside.items() if each != key}
+        else:
+            del data[key]
+        data[name] = value
+        moves[path] = [(name,)]
+        if fix not in said:
+            said.add(fix)
+            where = path_text(tuple(above))
+            problems.append(Problem(grown.marks.key(*path), f"{where} has an unknown key {key!r}", fix))
+    if not moves:
         return grown
-    problems = tuple(
-        Problem(
-            grown.marks.key(key),
-            f"the file has an unknown key {key!r}",
-            f"it is called `{ours}` here: rename it",
-        )
-        for key, ours in meant.items()
-    )
-    data = {meant.get(key, key): value for key, value in grown.data.items()}
-    placed = moved(grown, {(key,): [(ours,)] for key, ours in meant.items()})
-    return replace(placed, data=data, problems=(*grown.problems, *problems))
+    emptied = {key for path in moves if len(path) > 1 and not data.get(key := str(path[0]), True)}
+    data = {key: value for key, value in data.items() if key not in emptied or key in Robot.model_fields}
+    return replace(moved(grown, moves), data=data, problems=tuple(problems))
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:

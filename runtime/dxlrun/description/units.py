@@ -303,18 +303,63 @@ def split(
         raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
         raise refuse(f"this is not {what}", f"write {what} such as {written}")
-    if several := list_text(text[:_LONGEST]):
-        raise refuse(f"{text[:_LONGEST]!r} is not {what}, but two", f"write them as a list: {several}")
     match = _QUANTITY.fullmatch(text.strip()) if len(text) <= _LONGEST else None
     number = match[1].replace("_", "") if match else ""
     if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):
-        raise refuse(f"{text[:_LONGEST]!r} is not {what}", f"write {what} such as {written}")
+        fix = _meant(text[:_LONGEST], units) or f"write {what} such as {written}"
+        raise refuse(f"{text[:_LONGEST]!r} is not {what}", fix)
     unit = match[2] or bare
     if not unit:
         raise refuse(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
     if unit not in units:
-        raise refuse(f"{text!r} has the unit {unit}, which is not one of {what}", f"write it as {written}")
+        fix = _meant(text, units) or f"write it as {written}"
+        raise refuse(f"{text!r} has the unit {unit}, which is not one of {what}", fix)
     return number, unit
+
+
+_UNIT_WORDS: Mapping[str, str] = {
+    "rad": "rads radian radians",
+    "deg": "° degs degree degrees",
+    "rpm": "rev/min revs/min r/min",
+    "s": "sec secs second seconds",
+    "ms": "msec msecs millisecond milliseconds",
+    "us": "µs usec microsecond microseconds",
+    "min": "minute minutes",
+    "h": "hour hours",
+    "m": "meter meters metre metres",
+    "mm": "millimeter millimeters millimetre",
+    "Nm": "n.m n*m nm n-m newtonmeter",
+    "A": "a amp amps ampere",
+    "mA": "ma milliamp milliamps",
+    "V": "v volt volts",
+    "%": "percent pct",
+    "Hz": "hz hertz",
+    "kHz": "khz",
+    "g": "gram grams",
+    "kg": "kilogram kilograms",
+}
+"""Our units, and how others write them."""
+
+
+def _meant(text: str, units: Mapping[str, object]) -> str:
+    """Return how a quantity is written that has a unit by another name, or is two; empty: it is not known."""
+    if several := list_text(text):
+        return f"these are two values, so write a list: {several}"
+    match = re.fullmatch(r"([-+]?[0-9_.]+(?:[eE][-+]?\d+)?)\s*(\D.*)", text.strip())
+    if match is None:
+        return "write the number: pi is 180 deg" if re.search(r"\bpi\b", text) and "deg" in units else ""
+    powers = re.sub(r"([A-Za-z])\*{0,2}([23])$", r"\1^\2", match[2].replace("²", "^2").replace("³", "^3"))
+    name, slash, divisor = powers.partition("/")
+    base, power, exponent = divisor.partition("^")
+    unit = f"{_unit_for(name)}{slash}{_unit_for(base)}{power}{exponent}"
+    unit = unit if unit in units else _unit_for(powers)
+    return f"write {match[1]} {unit}" if unit in units else ""
+
+
+def _unit_for(name: str) -> str:
+    """Return our unit for a name of it; the name itself, where it is not known."""
+    word = name.strip().lower()
+    return next((unit for unit, words in _UNIT_WORDS.items() if word in words.split()), name.strip())
 
 
 def units_of(note: object) -> Mapping[str, float]:

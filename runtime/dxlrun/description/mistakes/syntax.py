@@ -26,6 +26,10 @@ _BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
 _PLUS_MINUS = re.compile(rf"(?:±|\+/?-)\s*({_NUMBER})\s*({_UNIT})?")
 
 
+class _OpenQuoteError(Exception):
+    """A quote is not closed, so what is behind it is unknown; the parser reports its place."""
+
+
 class _Bracket(NamedTuple):
     """A bracket that was opened: its place, counted from 0, and the indentation of its line."""
 
@@ -38,7 +42,7 @@ class _Bracket(NamedTuple):
 def explain_syntax(text: str, file: str) -> list[Problem]:
     """Return what is wrong with a text that is not YAML, as far as it is one of the mistakes known here."""
     lines = text.splitlines()
-    return [*_units_behind_lists(lines, file)] or _open_brackets(lines, file)
+    return [*_units_behind_lists(lines, file), *_round_mappings(lines, file)] or _open_brackets(lines, file)
 
 
 def list_text(text: str) -> str:
@@ -75,11 +79,21 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
             )
 
 
+def _round_mappings(lines: list[str], file: str) -> Iterator[Problem]:
+    for number, line in enumerate(lines, 1):
+        if match := re.search(r"[:,-] +(\()\s*[\w-]+: ", line.partition(" #")[0]):
+            mark = Mark(file, number, match.start(1) + 1)
+            yield Problem(mark, "a mapping is not written in ( )", "write { before it and } behind it")
+
+
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:
     """Return the brackets that are not closed; none are reported where all of them are."""
-    if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
+    try:
+        if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
+            return []
+        return _scanned(lines, file, by_keys=True)
+    except _OpenQuoteError:
         return []
-    return _scanned(lines, file, by_keys=True)
 
 
 def _depth(lines: list[str]) -> int:
@@ -116,7 +130,9 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
                 pass
         elif before in ("]", "}"):
             mark = Mark(file, number + 1, column + 1)
-            problems.append(Problem(mark, f"this {character} closes nothing", "take it out"))
+            problems.append(
+                Problem(mark, f"this {character} closes nothing", "take it out, or open it before")
+            )
     if opened:
         same = [each for each in opened if each.line == opened[-1].line]
         problems.append(_not_closed(same, lines, len(lines), file))
@@ -150,6 +166,8 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
             elif character in "[]{}":
                 yield number, column, character, before
             before = before if character == " " else character
+    if quote:
+        raise _OpenQuoteError
 
 
 def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: str) -> Problem:

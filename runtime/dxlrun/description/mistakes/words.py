@@ -17,7 +17,7 @@ from typing import NamedTuple
 from pydantic import BaseModel
 
 from dxlrun.description.form import folded
-from dxlrun.description.mistakes.forms import NAME, Place, example_at, places_of, section_of
+from dxlrun.description.mistakes.forms import NAME, Place, entries_of, example_at, places_of, section_of
 from dxlrun.errors import near
 
 _REMARKS = {"comment", "comments", "description", "note", "notes", "remark", "remarks", "author", "version"}
@@ -72,7 +72,7 @@ class Context:
 
     def remedies(self, unknown: Mapping[str, object]) -> Iterator[Remedy]:
         """Yield what to do about unknown keys with their values, as far as their meaning is known."""
-        meant = {key: meaning for key in unknown if (meaning := self._meaning(key)) is not None}
+        meant = {key: meaning for key in unknown if (meaning := self.meaning(key)) is not None}
         limits = {meaning.kind: key for key, meaning in meant.items() if meaning.kind in ("lower", "upper")}
         if limits:
             keys = tuple(key for key in unknown if key in limits.values())
@@ -81,15 +81,20 @@ class Context:
             if key in limits.values():
                 continue
             section = section_of(self.root, value)
-            if section:
+            if section and not self._is_misplaced_section:
                 where = f"like {self.path[1]}" if section in self.path[:1] else f"below `{section}:`"
                 yield Remedy((key,), f"it has the keys of an entry of {section}: indent it {where}")
             elif (meaning := meant.get(key)) is not None:
-                yield Remedy((key,), self._renamed(meaning, key, value), meaning.place[0])
+                yield Remedy((key,), self._said_of(meaning, key, value), meaning.place[0])
             elif fix := self._misplaced(key, value):
                 yield Remedy((key,), fix)
 
-    def _meaning(self, key: str) -> _Meaning | None:
+    @property
+    def _is_misplaced_section(self) -> bool:
+        """True: this is taken for an entry of a section, but is a section itself, indented too far."""
+        return len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys()
+
+    def meaning(self, key: str) -> _Meaning | None:
         """Return what a key means; None where it is not a known word, or the form has no such key.
 
         The words of a joint are those of its parts, too: `lower` means the same in a joint as in its limits.
@@ -121,15 +126,21 @@ class Context:
         here = place[1:] if place[0] == _PARTS_OF_JOINT.get(self.form.__name__, "") else place
         return _in_mappings(here[:-1], f"{here[-1]}: {text}")
 
+    def _said_of(self, meaning: _Meaning, word: str, value: object) -> str:
+        """Return what to do about a word for a key of ours."""
+        if meaning.kind == "needless":
+            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS["mode"])
+        if meaning.place[0] == "reference":
+            return self._reference()
+        return self._renamed(meaning, word, value)
+
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
         """Return how a word and its value are written with our key."""
         place, key = meaning.place, meaning.place[0]
-        if key == "reference":
-            return self._reference()
-        if meaning.kind == "needless":
-            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS["mode"])
         called = "" if place[-1] == folded(word) else f"it is called `{'.'.join(place)}` here: "
         if key in self.present and len(place) == 1:
+            if elsewhere := places_of(self.root, folded(word), value):
+                return self._moved(folded(word), value, elsewhere)
             return f"it is called `{key}` here, which is given already: take one of the two out"
         if (
             isinstance(value, dict | list)
@@ -159,8 +170,10 @@ class Context:
             return "write a list in square brackets: [a, b]"
         if colon and word in self.known and value is None:
             return f"write a space after the colon: `{word}: {rest}`"
-        if len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys():
+        if self._is_misplaced_section:
             return f"`{self.path[1]}` is a section of the file: write it without indentation"
+        if key in ("unit", "units"):
+            return f"take it out: the unit is written at each value, such as 90 {_yaml(value)}"
         if key == "name" or (folded(key) in _REMARKS and not near(key, self.known)):
             entry = self.path[1] if len(self.path) == 2 and key == "name" else ""
             is_remark = f"write it as a comment: `# {_yaml(value)}`"
@@ -191,17 +204,34 @@ class Context:
         return f"it belongs into `{where}`: move it there"
 
 
-def sections_meant(root: type[BaseModel], data: Mapping[str, object]) -> dict[str, str]:
-    """Return the sections of a file that have another name in it: `joints` for its key `motors`."""
-    found: dict[str, str] = {}
+def sections_meant(
+    root: type[BaseModel], data: Mapping[str, object]
+) -> Iterator[tuple[tuple[str, ...], str, str]]:
+    """Yield the sections of a file that have another name in it, or are not at its top.
+
+    Each as the path where it is, the name of the section, and how to fix it.
+    """
     context = Context(root, root, (), [*root.model_fields], [*data], {})
+    found = set(data)
     for key, value in data.items():
-        meaning = None if key in root.model_fields else context._meaning(key)
+        inner = value if isinstance(value, dict) else {}
+        own = [name for name in inner if name in root.model_fields]
+        if key not in root.model_fields and len(own) > 1:
+            for name in own:
+                if name not in found:
+                    found.add(name)
+                    yield (key, name), name, f"take `{key}:` out, and write what is in it without indentation"
+            continue
+        for name in own if entries_of(root, key) is not None else ():
+            if name not in found and isinstance(inner[name], dict):
+                found.add(name)
+                yield (key, name), name, f"`{name}` is a section of the file: write it without indentation"
+        meaning = None if key in root.model_fields else context.meaning(key)
         if meaning is None or not isinstance(value, dict | list) or section_of(root, value):
             continue
-        if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in (*data, *found.values()):
-            found[key] = meaning.place[0]
-    return found
+        if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in found:
+            found.add(meaning.place[0])
+            yield (key,), meaning.place[0], f"it is called `{meaning.place[0]}` here: rename it"
 
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
