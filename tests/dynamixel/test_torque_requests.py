@@ -156,6 +156,32 @@ def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has():
         other.start()
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_servo_that_resets_after_torque_on_gets_no_goal(protocol):
+    """Its torque is read once more before its first goal, which may switch its torque on."""
+    arm = Arm(protocol).let_go()
+    arm.rig.restless = 0.02
+    assert arm.told(arm.switch(True)) == ""
+    arm.servo.poke("torque_enable", 0)
+    begun = len(arm.rig.into_bus())
+    arm.follow(30)
+    assert goals_to(arm, begun) == {11, 13}
+    assert arm.rig.torque() == [True, False, True]
+
+
+def test_torque_off_that_was_not_heard_is_written_again_and_one_that_is_never_heard_is_named():
+    arm = Arm().start()
+    written = arm.rig.torque_given(12)
+    arm.servo.registers.watch(
+        ("torque_enable",), lambda: len(written) == 1 and arm.servo.poke("torque_enable", 1)
+    )
+    assert arm.told(arm.switch(False)) == ""
+    assert arm.rig.torque() == [True, False, True]
+    arm = Arm().start()
+    arm.rig.stick(12, "torque_enable", 1)
+    assert arm.told(arm.switch(False)).endswith("did not confirm torque off; it is tried again")
+
+
 def test_off_and_on_twice_is_off_and_on():
     arm = Arm().start()
     assert [arm.told(arm.switch(on)) for on in (False, False, True, True)] == [""] * 4
@@ -238,6 +264,9 @@ def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_
     assert arm.rig.torque() == [True, False, True]  # it had none before
     assert arm.told(arm.switch(True)) == ""
     assert arm.rig.torque() == [True] * 3
+    _shut_down(arm)  # the same error again
+    assert arm.shown[1] is Torque.OFF
+    assert arm.rig.states.hardware_error[1] == 0x20
 
 
 def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps():
