@@ -279,7 +279,7 @@ def test_wrong_keys_have_their_place(written: Written) -> None:
         "robot.yaml:7:64: controllers.head.frequency: 2 has no unit; write a frequency with its"
     )
     assert second.startswith(
-        "robot.yaml:7:67: controllers.head has an unknown key 'joint'; did you mean joints?"
+        "robot.yaml:7:67: controllers.head has an unknown key 'joint'; it is called `joints` here"
     )
 
 
