@@ -264,8 +264,10 @@ def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offe
     offer = plugins.controllers.get(type_name)
     mark = file.at("controllers", name, "type")
     if offer is None and (ros := ros_type(type_name, plugins.controllers)):
-        file.error(mark, *ros)
-    elif offer is None and is_of_file(type_name):
+        what, fix, ours = ros
+        file.error(mark, what, fix)
+        return plugins.controllers.get(ours)  # so that its parameters are checked, too
+    if offer is None and is_of_file(type_name):
         if type_name in plugins.broken:  # else its file could not be read
             file.error(mark, f"{type_name} of {name} cannot be used", plugins.broken[type_name])
     elif offer is None:

@@ -33,7 +33,9 @@ def _name(value: str) -> str:
 
 def _item_name(value: str) -> str:
     if not _NAME.fullmatch(value) or value != folded(value):
-        raise refuse(f"{value!r} is not the name of an item", _name_fix(folded(value)))
+        short = folded(value).removeprefix("k").removesuffix("_gain")
+        meant = f"position_{short}_gain" if short in ("p", "i", "d") else folded(value)
+        raise refuse(f"{value!r} is not the name of an item", _name_fix(meant))
     return value
 
 

@@ -65,7 +65,8 @@ def _explain_unknown_keys(
             first, *others = (errors_of[key] for key in remedy.keys)
             first.remedy = remedy
             settled.update(one.path for one in others)
-            settled.add((*parent, remedy.means))
+            if (missing := found.get((*parent, remedy.means))) and missing[0].missing:
+                settled.add((*parent, remedy.means))
     for parent in {path[:-1] for path in found}:
         entries = [path for path in found if path[:-1] == parent and _is_key_of_entry(found[path][0])]
         settled.update(entries[1:])

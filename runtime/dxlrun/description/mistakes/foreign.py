@@ -184,8 +184,10 @@ _ROS_TYPES: Mapping[str, str] = {
 """Types of ros2_control and ros_control with another name than ours; theirs are written as ours are."""
 
 
-def ros_type(type_name: str, known: Collection[str]) -> Kind | None:
-    """Return what is wrong with a controller type of ROS, and ours in its place; None: it is no such type.
+def ros_type(type_name: str, known: Collection[str]) -> tuple[str, str, str] | None:
+    """Return what is wrong with a controller type of ROS, how to fix it, and ours in its place (empty: none).
+
+    None: it is not such a type.
 
     Args:
         type_name: As written: `position_controllers/JointGroupPositionController`.
@@ -199,4 +201,4 @@ def ros_type(type_name: str, known: Collection[str]) -> Kind | None:
     fix = (
         f"write {ours}" if ours in known else "dxlrun has none of this name; `dxlrun plugins` lists its types"
     )
-    return f"{type_name} is a type of ROS", fix
+    return f"{type_name} is a type of ROS", fix, ours if ours in known else ""

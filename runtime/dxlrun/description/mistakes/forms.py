@@ -10,6 +10,7 @@ from typing import Annotated, Union, cast, get_args, get_origin
 from pydantic import BaseModel, TypeAdapter
 
 from dxlrun.description.form import PlugInEntry
+from dxlrun.errors import near
 
 Place = tuple[str, ...]
 """A key below a form: `("limits", "position")`; NAME stands for the name of an entry."""
@@ -32,6 +33,11 @@ def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
     ]
 
 
+def keys_of(root: type[BaseModel]) -> set[str]:
+    """Return all keys of a document, wherever they are."""
+    return {place[-1] for place, _ in _all_places(root)}
+
+
 def section_of(root: type[BaseModel], value: object) -> str:
     """Return the section whose entries have the keys of a mapping; empty: it is not an entry of any."""
     best, most = "", 1
@@ -39,7 +45,8 @@ def section_of(root: type[BaseModel], value: object) -> str:
         return best
     for name in root.model_fields:
         for form in _forms(entries_of(root, name)):
-            own = [key for key in value if key in form.model_fields and key != "parameters"]
+            fields = form.model_fields.keys() - {"parameters"}
+            own = [key for key in value if key in fields or len(near(key, fields)) == 1]
             free = issubclass(form, PlugInEntry)  # it takes any other keys, and has a type
             score = len(own) + 2 * ("type" in own) if free else 2 * len(own) - len(value)
             if score > most:

@@ -17,18 +17,28 @@ from typing import NamedTuple
 from pydantic import BaseModel
 
 from dxlrun.description.form import folded
-from dxlrun.description.mistakes.forms import NAME, Place, entries_of, example_at, places_of, section_of
-from dxlrun.errors import near
+from dxlrun.description.mistakes.forms import (
+    NAME,
+    Place,
+    entries_of,
+    example_at,
+    keys_of,
+    places_of,
+    section_of,
+)
+from dxlrun.errors import near, suggestion
 
 _REMARKS = {"comment", "comments", "description", "note", "notes", "remark", "remarks", "author", "version"}
 _LONGEST = 80  # Characters of a value that is repeated
+_TURN = 6.3  # rad; a larger number of a limit is in deg
 _LARGEST_ANGLE = 720  # deg; a larger number counts ticks of a servo
 _PARTS_OF_JOINT = {"Limits": "limits", "GoalTolerance": "tolerance", "SharedTolerance": "tolerance"}
 _SERVO_FORMS = ("OneOfServos", "TransmissionServo")  # They have keys of a joint
 
 
 _NEEDLESS = {
-    "mode": "take it out: the mode of a servo follows from what the joint's controller commands",
+    "type": "take it out: the type of the controller decides that",
+    "model": "take it out: the mode of a servo follows from what the joint's controller commands",
     "revolute": "take it out: a joint that is not linear turns",
     "continuous": "write `continuous: true`",
     "prismatic": "write `travel_per_turn: 94.2 mm`, how far it moves in a turn of the servo",
@@ -88,6 +98,8 @@ class Context:
                 yield Remedy((key,), self._said_of(meaning, key, value), meaning.place[0])
             elif fix := self._misplaced(key, value):
                 yield Remedy((key,), fix)
+            elif close := near(key, self.known):
+                yield Remedy((key,), suggestion(key, self.known), close[0] if len(close) == 1 else "")
 
     @property
     def _is_misplaced_section(self) -> bool:
@@ -128,8 +140,10 @@ class Context:
 
     def _said_of(self, meaning: _Meaning, word: str, value: object) -> str:
         """Return what to do about a word for a key of ours."""
-        if meaning.kind == "needless":
-            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS["mode"])
+        if meaning.kind == "needless" and (
+            folded(word) != "type" or isinstance(value, int) or _yaml(value).lower() in _NEEDLESS
+        ):
+            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS[meaning.place[0]])
         if meaning.place[0] == "reference":
             return self._reference()
         return self._renamed(meaning, word, value)
@@ -165,21 +179,37 @@ class Context:
 
     def _misplaced(self, key: str, value: object) -> str:
         """Return what to do about a key that does not mean another one here; empty: nothing is known."""
-        word, colon, rest = key.partition(":")
-        if key.endswith((")", "]")) and value is None:
-            return "write a list in square brackets: [a, b]"
-        if colon and word in self.known and value is None:
-            return f"write a space after the colon: `{word}: {rest}`"
+        if fix := self._miswritten(key, value):
+            return fix
         if self._is_misplaced_section:
             return f"`{self.path[1]}` is a section of the file: write it without indentation"
-        if key in ("unit", "units"):
-            return f"take it out: the unit is written at each value, such as 90 {_yaml(value)}"
-        if key == "name" or (folded(key) in _REMARKS and not near(key, self.known)):
-            entry = self.path[1] if len(self.path) == 2 and key == "name" else ""
-            is_remark = f"write it as a comment: `# {_yaml(value)}`"
-            return f"take it out: the entry is called {entry} already" if entry else is_remark
-        places = [] if folded(key) in self.known else places_of(self.root, folded(key), value)
-        return self._moved(folded(key), value, places) if places else ""
+        ours = folded(key)
+        if ours in self.known or near(key, self.known):
+            return ""
+        if not (places := places_of(self.root, ours, value)):
+            ours = next(iter(near(key, keys_of(self.root))), ours)
+            places = places_of(self.root, ours, value)
+        return self._moved(ours, value, places) if places else ""
+
+    def _miswritten(self, key: str, value: object) -> str:
+        """Return what to do about what is not a key at all; empty: it may be one."""
+        word, colon, rest = key.partition(":")
+        named = f"take it out: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
+        if key.endswith((")", "]")) and value is None:
+            fix = "write a list in square brackets: [a, b]"
+        elif colon and word in self.known and value is None:
+            fix = f"write a space after the colon: `{word}: {rest}`"
+        elif not self.path and isinstance(value, str) and value.startswith(("/dev/", "COM")):
+            fix = f"it belongs to a bus: `buses: {{main: {{port: {value}, ...}}}}`"
+        elif key in ("unit", "units"):
+            fix = f"take it out: the unit is written at each value, such as 90 {_yaml(value)}"
+        elif key == "name" and named:
+            fix = named
+        elif folded(key) in _REMARKS and not near(key, self.known):
+            fix = f"write it as a comment: `# {_yaml(value)}`"
+        else:
+            fix = ""
+        return fix
 
     def _moved(self, key: str, value: object, places: list[Place]) -> str:
         """Return where a key belongs: at the place that shares most with where it is now."""
@@ -201,7 +231,7 @@ class Context:
         where = ".".join(entry if step == NAME else step for step in place[:-1])
         if not where:
             return f"it belongs to the top of the file: write `{written}` without indentation"
-        return f"it belongs into `{where}`: move it there"
+        return f"it belongs into `{where}`: write `{written}` there"
 
 
 def sections_meant(
@@ -295,7 +325,9 @@ def _limits_text(values: list[object], *, of_urdf: bool = False, linear: bool = 
     numbers = [abs(value) for value in values if isinstance(value, int | float)]
     if numbers and max(numbers) > _LARGEST_ANGLE and not of_urdf:
         return None
-    unit = ("m" if linear else "rad") if of_urdf else ("mm" if linear else "deg")
+    in_rad = of_urdf or any(isinstance(number, float) and number % 1 for number in numbers)
+    turns = "rad" if in_rad and max(numbers, default=0) <= _TURN else "deg"
+    unit = ("m" if of_urdf else "mm") if linear else turns
     texts = [
         name if value is None else f"{_yaml(value)} {unit}" if _is_number(value) else _yaml(value)
         for value, name in zip(values, ("LOWER", "UPPER"), strict=True)
