@@ -316,6 +316,24 @@ def test_controller_of_a_joint_that_is_given_torque_begins_again(story):
     assert story.column("active") == [1] * 12
 
 
+def test_joint_that_is_given_torque_holds_where_its_first_reply_finds_it(story):
+    """Its controller holds the goal with which it begins; a reply that is missing is awaited."""
+    begun = np.zeros(1)
+
+    def hold(controller, step, *_):
+        context = controller.context
+        np.copyto(
+            *((begun, context.goals.position) if step == "activate" else (context.commands.position, begun))
+        )
+
+    story.script("holds", hold, joints=("j2",), command=("position",)).build()
+    story.hardware.follow_goals = lambda rows: story.shows(rows, torque=Torque.ON)()
+    limp = [story.shows(2, torque=Torque.OFF), lambda: _let_lie(story)]
+    given, back = story.shows(2, torque=Torque.GIVEN, valid=False), story.shows(2, position=0.9, valid=True)
+    story.run(12, {3: limp, 5: given, 7: back})
+    np.testing.assert_allclose(story.goals(2), [0.25] * 7 + [0.9] * 5)
+
+
 @pytest.mark.parametrize("torque", [Torque.ON, Torque.OFF, Torque.RELEASED])
 def test_a_fallback_does_not_take_over_a_limp_joint(story, torque):
     story.script("first", joints=("j2",), fallback="other")
