@@ -6,6 +6,7 @@ How one or several servos move a joint is in `mechanics`.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Self
 
@@ -193,7 +194,7 @@ def kind_of_joint(joint: object) -> str:
     if isinstance(joint, dict):
         if "servos" in joint:
             return "<several servos>"
-        surplus = joint.keys() - BareJoint.model_fields.keys()
+        surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in BareJoint.model_fields}
         if surplus and (surplus & _OF_A_SERVO or surplus & words_for("BareJoint", _OF_A_SERVO)):
             return "<one servo>"
         return "<transmission>"

@@ -64,6 +64,10 @@ _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
         ("this is a .robot file of ROBOTIS-Framework", _DRAFT),
     ),
     (
+        re.compile(r"(?:\s*[#;].*\n)*\s*(\[[\w. \"-]+\]\s*\n\s*[\w-]+\s*[=:]|[\w.-]+ *= *\S)"),
+        ("this is TOML, or an INI file", f"write a robot file, which is YAML: `key: value`; {_DRAFT}"),
+    ),
+    (
         re.compile(
             r"(?:\s*#.*\n)*\s*(from [\w.]+ import |import [\w.]+\s*(as \w+)?\s*$|def \w+\(|\"\"\")", re.M
         ),

@@ -42,7 +42,7 @@ class _Bracket(NamedTuple):
 def explain_syntax(text: str, file: str) -> list[Problem]:
     """Return what is wrong with a text that is not YAML, as far as it is one of the mistakes known here."""
     lines = text.splitlines()
-    return [*_units_behind_lists(lines, file), *_round_mappings(lines, file)] or _open_brackets(lines, file)
+    return [*_units_behind_lists(lines, file), *_wrong_signs(lines, file)] or _open_brackets(lines, file)
 
 
 def list_text(text: str) -> str:
@@ -79,11 +79,23 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
             )
 
 
-def _round_mappings(lines: list[str], file: str) -> Iterator[Problem]:
+_SIGNS: tuple[tuple[re.Pattern[str], str, str], ...] = (
+    (
+        re.compile(r"[:,-] +(\()\s*[\w-]+: "),
+        "a mapping is not written in ( )",
+        "write { before it and } behind it",
+    ),
+    (re.compile(r"[{,][^{},]*(;) *[\w-]+:"), "a ; does not separate keys", "write a comma"),
+    (re.compile(r"^ *[A-Za-z][\w-]*( )[{\[]"), "a colon is missing before this", "write `key: value`"),
+)
+"""Signs that are written in place of others: where they are, what is wrong, and how to fix it."""
+
+
+def _wrong_signs(lines: list[str], file: str) -> Iterator[Problem]:
     for number, line in enumerate(lines, 1):
-        if match := re.search(r"[:,-] +(\()\s*[\w-]+: ", line.partition(" #")[0]):
-            mark = Mark(file, number, match.start(1) + 1)
-            yield Problem(mark, "a mapping is not written in ( )", "write { before it and } behind it")
+        for pattern, what, fix in _SIGNS:
+            if match := pattern.search(line.partition(" #")[0]):
+                yield Problem(Mark(file, number, match.start(1) + 1), what, fix)
 
 
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:
@@ -124,11 +136,11 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
                 opened.append(_Bracket(character, number, column, indentation))
         elif opened and _CLOSERS[opened[-1].character] == character:
             opened.pop()
-        elif opened:
+        elif any(_CLOSERS[each.character] == character for each in opened):
             problems.append(_mismatch(opened[-1], character, Mark(file, number + 1, column + 1)))
             while opened and _CLOSERS[opened.pop().character] != character:
                 pass
-        elif before in ("]", "}"):
+        elif opened or before in ("]", "}"):  # else it is part of a text
             mark = Mark(file, number + 1, column + 1)
             problems.append(
                 Problem(mark, f"this {character} closes nothing", "take it out, or open it before")

@@ -193,12 +193,13 @@ class Context:
 
     def _miswritten(self, key: str, value: object) -> str:
         """Return what to do about what is not a key at all; empty: it may be one."""
-        word, colon, rest = key.partition(":")
+        word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
         named = f"take it out: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
         if key.endswith((")", "]")) and value is None:
             fix = "write a list in square brackets: [a, b]"
-        elif colon and word in self.known and value is None:
-            fix = f"write a space after the colon: `{word}: {rest}`"
+        elif sign and word in self.known and value is None:
+            how = "write a space after the colon" if sign == ":" else "write a colon for ="
+            fix = f"{how}: `{word}: {rest}`"
         elif not self.path and isinstance(value, str) and value.startswith(("/dev/", "COM")):
             fix = f"it belongs to a bus: `buses: {{main: {{port: {value}, ...}}}}`"
         elif key in ("unit", "units"):
