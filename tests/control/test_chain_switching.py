@@ -190,8 +190,9 @@ def test_the_upper_end_is_held_while_a_joint_of_the_lower_one_is_lost():
     story.run(20, {4: lambda: answers(False), 12: lambda: answers(True)})
     assert story.column("reference", 0) == [0.4] * 20
     assert [len(story.steps(name)) for name in ("lower", "upper")] == [20, 20]
-    held = [name for name, text in story.events.of(EventCode.POLICY) if "is held" in text]
-    assert sorted(held) == ["lower", "upper"]
+    told = [(name, text.partition(":")[0]) for name, text in story.events.of(EventCode.POLICY)]
+    until = "is held until all its joints answer again"
+    assert told == [("lower", until), ("upper", until), ("lower", "resumes"), ("upper", "resumes")]
 
 
 # Faults
