@@ -12,7 +12,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from cyclopts import App, CoercionError, CycloptsError, Group, MissingArgumentError, UnknownOptionError
+from cyclopts import (
+    App,
+    CoercionError,
+    CycloptsError,
+    Group,
+    MissingArgumentError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
 
 from dxlrun.cli import verbs
 from dxlrun.cli.run import run
@@ -200,6 +208,10 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
     given = _without_output(tokens[len(verb) :])
     if isinstance(error, UnknownOptionError):
         return _without_options(error, verb, given)
+    if {"=", ":="} & set(given) and verb:
+        return shlex.join(("dxlrun", *verb, *(word for word in given if word not in ("=", ":="))))
+    if verb == ["switch"] and isinstance(error, UnusedCliTokensError):
+        return shlex.join(("dxlrun", *verb, "--activate", *given))
     if isinstance(error, MissingArgumentError) and verb:
         # `set base gain=400`, `set base.gain 400`: two words were written as one
         for sign in (":=", "=", "."):
@@ -275,8 +287,11 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
         option = (error.token.keyword or error.token.value).partition("=")[0]
         what = f"Unknown option: {option}"
         names = {name.lstrip("-"): name for each in error.argument_collection for name in each.names}
-        if meant := near(option.lstrip("-"), [name for name in names if names[name].startswith("--")]):
-            fix = f"did you mean {' or '.join(names[name] for name in meant)}?"
+        long = [name for name in names if names[name].startswith("--")]
+        letter = option.lstrip("-") if len(option.lstrip("-")) == 1 else ""
+        short = [name for name in long if letter and name.startswith(letter)]
+        if meant := near(option.lstrip("-"), long) or short:
+            fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
     if line := _right_form(error, tokens):
         fix = f"write `{line}`"
     return f"{what}; {fix}"

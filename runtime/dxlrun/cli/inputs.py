@@ -99,6 +99,8 @@ def read_models(
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
     """Return the arguments of `name:=value` words; raises InputError for a word that is none."""
     arguments: dict[str, str] = {}
+    if len(assignments) == 3 and assignments[1] in ("=", ":=", ":"):
+        assignments = ["".join(assignments)]  # written with spaces; the sign is judged below
     for word in assignments:
         name, sign, value = word.partition(":=")
         if not sign or not name:
