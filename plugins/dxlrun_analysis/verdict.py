@@ -139,6 +139,7 @@ def _beyond(totals: RunTotals) -> Iterable[Finding]:
         count = clamped.get(joint, 0)
         if (
             group.code == EventCode.GATE
+            and group.severity >= Severity.WARNING
             and "position limit" in what
             and count > _OFTEN * totals.periods.records
         ):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.kit.loops import PERIOD_NS, GateRig
 
 from dxlrun.channels.cycle import Clamp, Torque
-from dxlrun.control.gate import BACK_SPEED
+from dxlrun.control.gate import BACK_SPEED, CLAMP_ENDS_NS
 from dxlrun.plan.loop_plan import SourcePlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 
@@ -120,12 +120,24 @@ def test_a_step_beyond_the_velocity_limit_is_walked_in_steps():
     assert rig.texts == ["j0, controller b: held to the step or acceleration limit"]
 
 
-def test_each_beginning_of_a_clamping_is_told_once():
+def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
     rig = GateRig()
     for position in (3.0, 3.0, 0.0, 3.0, -3.0):
         led(rig, position)
-    assert [text.split()[3] for text in rig.texts] == ["lowered", "lowered", "raised"]
+    assert [text.split()[3] for text in rig.texts] == ["lowered", "raised"]
     assert rig.gate.counts[0].tolist() == [1, 3, 0, 0, 0, 0, 0, 0]
+    cycles = CLAMP_ENDS_NS // PERIOD_NS
+    for _ in range(cycles - 2):
+        led(rig, 0.0)
+    assert len(rig.texts) == 2
+    for _ in range(2):
+        led(rig, 0.0)
+    assert rig.texts[2:] == [
+        "j0: lowered to the upper position limit; this ended after 0.1 s",
+        "j0: raised to the lower position limit; this ended after 0.0 s",
+    ]
+    led(rig, 3.0)
+    assert len(rig.texts) == 5
 
 
 def test_the_first_second_is_slow_even_without_a_velocity_limit():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from ctypes import c_int64, c_void_p
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -44,8 +45,20 @@ _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.PWM: "pwm",
 }
 """Clamps by a limit that a register of the servo may be tighter than."""
+CLAMP_ENDS_NS = 1_000_000_000
+"""A clamp that pauses for less goes on: a joint that is pressed against a limit swings there. [i]"""
 _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that is 0 where a joint in this mode shall not move by its own."""
+
+
+@dataclass(slots=True)
+class _Clamped:
+    """One clamp of one joint, since it was reported."""
+
+    what: str
+    begun_ns: int
+    last_ns: int
+    """Newest cycle in which it was done."""
 
 
 class Gate:
@@ -84,8 +97,8 @@ class Gate:
       has none of this.
     - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
 
-    `record.clamped` has what was done, bits of Clamp; an event reports when it begins. `counts`, shape
-    (joints, 8), counts cycles by joint and bit.
+    `record.clamped` has what was done, bits of Clamp; an event reports when it begins, and one when it has
+    ended. `counts`, shape (joints, 8), counts cycles by joint and bit.
     """
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
@@ -99,6 +112,9 @@ class Gate:
         self._joints = _laid_out(plan.joints)
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
+        self._now_ns = 0  # Sum of the times between cycles
+        self._clamps: dict[tuple[Clamp, int], _Clamped] = {}
+        """What was reported to have begun and not to have ended, by bit and row."""
         states, commands, goals = record.states, record.commands, record.goals
         self._gate = STRUCTS["Gate"](
             joints=self._joints.ctypes.data,
@@ -199,20 +215,36 @@ class Gate:
 
     def apply(self, dt_ns: int) -> None:
         """Move the goals toward the commands in place; `dt_ns` is the time since the cycle before."""
+        self._now_ns += dt_ns
         if self._law(self._address, dt_ns):
-            self._report()
+            self._report_begun()
+        if self._clamps:
+            self._report_ended()
         if self._devices.commands.size:
             self._devices.apply()
 
-    def _report(self) -> None:
+    def _report_begun(self) -> None:
         for bit, what in _WHAT.items():
             for row in np.flatnonzero(self._begun & np.uint8(bit)).tolist():
+                if (bit, row) in self._clamps:
+                    continue
                 name = self._plan.joints[row].name
                 # what commands it now may stand in for the controller whose fault this is, which has an event
                 by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
-                text = f"{name}{by}: {f'clamped by register {own.text}' if own else what}"
-                self._events.emit(EventCode.GATE, Severity.WARNING, name, text)
+                what_by = f"clamped by register {own.text}" if own else what
+                self._clamps[bit, row] = _Clamped(what_by, self._now_ns, self._now_ns)
+                self._events.emit(EventCode.GATE, Severity.WARNING, name, f"{name}{by}: {what_by}")
+
+    def _report_ended(self) -> None:
+        for (bit, row), clamped in tuple(self._clamps.items()):
+            if self._record.clamped[row] & bit:
+                clamped.last_ns = self._now_ns
+            elif self._now_ns - clamped.last_ns >= CLAMP_ENDS_NS:
+                del self._clamps[bit, row]
+                name, lasted_s = self._plan.joints[row].name, (clamped.last_ns - clamped.begun_ns) * 1e-9
+                text = f"{name}: {clamped.what}; this ended after {lasted_s:.1f} s"
+                self._events.emit(EventCode.GATE, Severity.INFO, name, text)
 
     def _owner(self, joint: str) -> str:
         """Return the controller that commands a servo, with those above it that command its references."""
