@@ -152,7 +152,7 @@ MOST_ROOMS = 18
 
 def entries(folder: Path) -> list[Path]:
     """Return what a reader finds in a folder: its modules, with what they have in C, and rooms."""
-    made = {"__init__.py", "__init__.pyi", "py.typed", "__pycache__"}
+    made = {"__init__.py", "__init__.pyi", "__main__.py", "py.typed", "__pycache__"}
     found = [path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"]
     return [path for path in found if path.suffix != ".c" or not path.with_suffix(".py").exists()]
 

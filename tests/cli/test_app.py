@@ -202,3 +202,15 @@ def test_tab_completion_is_installed_where_it_is_asked_for_and_completes(tmp_pat
         ["/bin/bash", "-c", f". {script}; {asked}"], check=True, capture_output=True, text=True, cwd=tmp_path
     )
     assert shown.stdout.splitlines() == ["analyze", "--online", "--virtual"]
+
+
+def test_the_package_is_run_as_the_program() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "dxlrun", "check", "none.yaml"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ran.returncode == 2
+    assert "none.yaml" in ran.stderr

@@ -18,7 +18,8 @@ from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import SIMULATED
 from dxlrun.description.modes import Mode
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.dynamixel.control_table.device_table import DeviceTable
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
@@ -62,6 +63,7 @@ def compile_buses(
         attached = [device for device in devices.values() if device.described.bus == name]
         if not wirings and not attached:
             continue
+        _check_baud_rate(file, name, [*(each.table for each in wirings), *(each.table for each in attached)])
         try:
             plan = bus_plan(
                 name=name,
@@ -81,6 +83,22 @@ def compile_buses(
         _check_budget(file, plan)
         plans.append(_with_monitoring(file, plan))
     return plans
+
+
+def _check_baud_rate(file: RobotFile, name: str, tables: Sequence[ControlTable | DeviceTable]) -> None:
+    """Refuse a rate that nothing on the bus can have; what of it cannot have it is a warning."""
+    rate, mark = file.robot.buses[name].baud_rate, file.at("buses", name, "baud_rate")
+    lacking = {table.model: table for table in tables if not table.has_baud_rate(rate)}
+    if not lacking:
+        return
+    common = set.intersection(*(set(table.baud_rates.values()) for table in lacking.values()))
+    known = ", ".join(f"{each:_}" for each in sorted(common))
+    fix = f"write one of theirs: {known}" if known else "give models with other rates a bus of their own"
+    what = f"no {' or '.join(sorted(lacking))} on bus {name} can run at {rate:_} bit/s"
+    if all(table.model in lacking for table in tables):
+        file.error(mark, what, fix)
+    else:
+        file.warning(mark, what, fix)
 
 
 def _own_ports(file: RobotFile) -> None:

@@ -87,7 +87,7 @@ class Bus(Form):
         examples=["1.0"],
         json_schema_extra={"enum": [1.0, 2.0]},
     )
-    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=10_000_000)
+    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=10_500_000)
     adapter: Adapter = key("The adapter.", "{latency: 1 ms}", Adapter())
     return_delay_time: Duration = key("How long a servo waits before it answers.", "500 us", 500_000)
     bus_watchdog: AutoDuration = key(

@@ -229,7 +229,7 @@ class Gateway(Form):
 class Processes(Form):
     """Processes beside the loop."""
 
-    refused: ClassVar[Mapping[str, str]] = {"view": "this version has no view yet; take it out"}
+    refused: ClassVar[Mapping[str, str]] = {"view": "take it out; `dxlrun view` shows a run"}
 
     gateway: Gateway = key("Steering from outside, over a Unix socket.", "{enabled: false}", Gateway())
 

@@ -251,7 +251,7 @@ def _baud_rate(tables: Sequence[ControlTable], chosen: int | None) -> int:
         f"an {table.model} has no baud rate of {chosen} bit/s; "
         f"it has {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}"
         for table in tables
-        if chosen not in table.baud_rates.values() and not _by_formula(table, chosen)
+        if not table.has_baud_rate(chosen)
     ]
     if wrong:
         raise InputError("\n".join(wrong))
@@ -264,14 +264,6 @@ def _shipped_rate(table: ControlTable) -> int | None:
         if item is not None and item.initial is not None:
             return table.baud_rates.get(item.initial)
     return None
-
-
-def _by_formula(table: ControlTable, rate: int) -> bool:
-    """Whether Protocol 1.0 servos have a rate by 2,000,000 / (value + 1) (e-Manual, Baud Rate (4))."""
-    if table.protocol != 1.0 or rate <= 0:
-        return False
-    value = round(2_000_000 / rate) - 1
-    return 0 <= value <= 254 and abs(2_000_000 / (value + 1) - rate) < 0.03 * rate
 
 
 def _middle(table: ControlTable) -> float:

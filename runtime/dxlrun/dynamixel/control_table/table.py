@@ -120,6 +120,18 @@ class Table(msgspec.Struct, Generic[Item], frozen=True):
         """Number of bytes from address 0 to the end of the last item."""
         return max(item.address + item.size for item in self.items.values())
 
+    def has_baud_rate(self, rate: int) -> bool:
+        """Whether the model can run at a rate, bit/s; in Protocol 1.0 also by 2,000,000 / (value + 1).
+
+        True where the manual lists no rates (e-Manual, Baud Rate (4)).
+        """
+        if rate in self.baud_rates.values() or not self.baud_rates:
+            return True
+        if self.protocol != 1.0 or rate <= 0:
+            return False
+        value = round(2_000_000 / rate) - 1
+        return 0 <= value <= 254 and abs(2_000_000 / (value + 1) - rate) < 0.03 * rate
+
     def readable(self, start: int, end: int) -> bool:
         """Check whether the addresses from `start` up to before `end` all belong to items."""
         items = self.items.values()
