@@ -59,6 +59,19 @@ def entries_of(form: type[BaseModel], key: str) -> object:
     return _entries(_annotation(form, key))
 
 
+def may_be_entry(root: type[BaseModel], section: str, value: object) -> bool:
+    """Return whether a value may be an entry of a section, by any name; True where that has no forms."""
+    forms = list(_forms(entries_of(root, section)))
+    if not forms or not isinstance(value, dict):
+        return True
+    for form in forms:
+        needed = {name for name, info in form.model_fields.items() if info.is_required()}
+        known = value.keys() <= form.model_fields.keys() or issubclass(form, PlugInEntry)
+        if known and (not needed or needed & value.keys()):
+            return True
+    return False
+
+
 def _annotation(form: type[BaseModel], key: str) -> object:
     info = form.model_fields.get(key)
     if info is None:

@@ -23,6 +23,7 @@ from dxlrun.description.mistakes.forms import (
     entries_of,
     example_at,
     keys_of,
+    may_be_entry,
     places_of,
     section_of,
 )
@@ -254,7 +255,7 @@ def sections_meant(
                     yield (key, name), name, f"take `{key}:` out, and write what is in it without indentation"
             continue
         for name in own if entries_of(root, key) is not None else ():
-            if name not in found and isinstance(inner[name], dict):
+            if name not in found and not may_be_entry(root, key, inner[name]):
                 found.add(name)
                 yield (key, name), name, f"`{name}` is a section of the file: write it without indentation"
         meaning = None if key in root.model_fields else context.meaning(key)
