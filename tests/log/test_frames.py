@@ -162,7 +162,7 @@ def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(log: Path) ->
         row = read.joints.index(yaw.name)
         assert angles[-1] == pytest.approx(cycles[t_ns]["position"][row], abs=1e-9)
         assert local[:3, 3] == pytest.approx(yaw.xyz)
-    assert len(frames) == 75  # 30 a second
+    assert len(frames) in {75, 76}  # 30 a second, from the first cycle on
     assert np.ptp(angles) > 0.3
 
 
@@ -205,8 +205,8 @@ def test_rerun_shows_a_robot_that_moves(log: Path) -> None:
     assert set(rows) == {(joint.parent, joint.child) for joint in urdf.joints}
     column = np.array(rows["base_link", "neck_link"])
     ours = open_log(log).columns("/tf", "transforms.transform.rotation.z")
-    mine = ours["transforms.transform.rotation.z"].reshape(75, -1)
-    assert len(column) == 75
+    mine = ours["transforms.transform.rotation.z"].reshape(len(column), -1)
+    assert len(column) in {75, 76}
     assert any(np.abs(each - column[:, 2]).max() < 1e-6 for each in mine.T)  # Rerun has float32
     assert np.ptp(2 * np.arctan2(column[:, 2], column[:, 3])) > 0.3  # rad about z: the head
 
@@ -223,9 +223,9 @@ def test_each_part_of_a_log_has_the_frames_that_do_not_move(tmp_path: Path) -> N
     assert sum(len(decoded(part, "/tf")) for part in parts) == pytest.approx(12, abs=len(parts))
 
 
-@pytest.mark.parametrize(("rate", "count"), [(0, 0), (10, 4), (1000, 20)])
+@pytest.mark.parametrize(("rate", "counts"), [(0, {0}), (10, {4, 5}), (1000, {20})])
 def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
-    rate: float, count: int, tmp_path: Path
+    rate: float, counts: set[int], tmp_path: Path
 ) -> None:
     text = (ROBOTS / "bioloid_torso.yaml").read_text()
     (tmp_path / "robot.yaml").write_text(
@@ -235,7 +235,7 @@ def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
     VirtualRobot(plan_of(tmp_path / "robot.yaml", duration_s=0.4), log=path).run()
     topics = open_log(path).topics
 
-    assert len(decoded(path, "/tf")) == count
+    assert len(decoded(path, "/tf")) in counts
     assert ("/tf_static" in topics) == (rate > 0)
     assert "/robot_description" in topics
 

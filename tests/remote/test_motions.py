@@ -166,7 +166,7 @@ WRONG = [
     (HEAD % "posvel" + POINT % "tilt: {position: 0 rad}", "4:35", "tilt has no target velocity at", "give it one"),
     (HEAD % "positions" + POINT % "pan: {position: 0}", "4:51", "0 has no unit", "60 deg"),
     ("name: nod\n", "1:1", "motions", ""),
-    ("name: [\n", "2:1", "", ""),
+    ("name: [\n", "1:7", "", ""),
     (NOD + NOD.split("motions:\n")[1].split("  - controller: posvel", maxsplit=1)[0], "14:9", "this part begins before the one before", "start it later"),
 ]  # fmt: skip
 

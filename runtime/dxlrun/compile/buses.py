@@ -15,7 +15,7 @@ from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.bus import SIMULATED
+from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
 from dxlrun.description.modes import Mode
 from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table import ControlTable, control_table
@@ -86,8 +86,13 @@ def compile_buses(
 
 
 def _check_baud_rate(file: RobotFile, name: str, tables: Sequence[ControlTable | DeviceTable]) -> None:
-    """Refuse a rate that nothing on the bus can have; what of it cannot have it is a warning."""
+    """Refuse a rate that nothing on the bus can have; what of it cannot have it is a warning.
+
+    A rate beyond those of all lines stands for a bus without a wire, as a measurement of hosts makes one.
+    """
     rate, mark = file.robot.buses[name].baud_rate, file.at("buses", name, "baud_rate")
+    if rate > HIGHEST_BAUD_RATE:
+        return
     lacking = {table.model: table for table in tables if not table.has_baud_rate(rate)}
     if not lacking:
         return

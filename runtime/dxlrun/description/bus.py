@@ -11,6 +11,8 @@ from pydantic import AfterValidator, Field
 from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
+HIGHEST_BAUD_RATE = 10_500_000
+"""bit/s, of PRO, P and Y servos."""
 SIMULATED = "sim"  # The port of a simulated bus
 _HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
 _LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
@@ -87,7 +89,7 @@ class Bus(Form):
         examples=["1.0"],
         json_schema_extra={"enum": [1.0, 2.0]},
     )
-    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=10_500_000)
+    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=HIGHEST_BAUD_RATE)
     adapter: Adapter = key("The adapter.", "{latency: 1 ms}", Adapter())
     return_delay_time: Duration = key("How long a servo waits before it answers.", "500 us", 500_000)
     bus_watchdog: AutoDuration = key(

@@ -90,6 +90,9 @@ class _Writer:
             self._changed.wait_for(lambda: self._idle and not self._waiting, LAST_WRITE_S)
 
     def _write_for_ever(self) -> None:
+        with suppress(AttributeError, OSError):  # other systems have no such call; musl refuses it
+            # the terminal's real time (`chrt -r 31 dxlrun`) is for loop, guardian and simulated servos
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         while True:
             with self._changed:
                 self._idle = not self._waiting
