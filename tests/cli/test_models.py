@@ -129,7 +129,8 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
         "firmware": 0,
         "deviation": {
             "judgement": "harmless", "effect": "the servo is addressed by it", "bits": [], "refused": [],
-            "refused_effect": "", "remedy": "", "equivalent": [], "planned": False, "limited_by": "",
+            "refused_effect": "", "equivalent": [], "planned": False, "limited_by": "",
+            "remedy": "declare what the robot needs in `registers`, or write it by `dxlrun servo`",
         },
     }  # fmt: skip
 

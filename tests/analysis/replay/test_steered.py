@@ -144,7 +144,8 @@ def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> 
     ]
     log = read_log(tell("torque off and on"))
     shown = log.cycles["torque"]
-    assert [set(shown[:, row].tolist()) for row in range(3)] == [{1, 4, 7}] * 3  # 7: given
+    # 7: given, 2: in doubt until the torque that was given was read
+    assert [set(shown[:, row].tolist()) - {2} for row in range(3)] == [{1, 4, 7}] * 3
     assert (shown[-1] == 1).all()
     assert not log.cycles["active"][13] & 0b100
     log = read_log(tell("a fallback"))
