@@ -58,7 +58,7 @@ class Computers:
     def at(self, computer):
         """Be at one of them from now on."""
         home = self.place / computer
-        for name, folder in (("XDG_CONFIG_HOME", "settings"), ("XDG_RUNTIME_DIR", "run")):
+        for name, folder in (("XDG_CONFIG_HOME", "settings"), ("XDG_RUNTIME_DIR", "r")):
             (home / folder).mkdir(parents=True, exist_ok=True)
             self.patch.setenv(name, str(home / folder))
         self.patch.chdir(home)
