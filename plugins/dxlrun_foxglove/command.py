@@ -14,8 +14,9 @@ from urllib.parse import quote
 from cyclopts import Parameter
 
 from dxlrun import InputError, connect
-from dxlrun.cli.inputs import DebugFlag, Flag, RobotName, leave_real_time
+from dxlrun.cli.inputs import DebugFlag, Flag, RobotName
 from dxlrun.output.terminal import show
+from dxlrun.output.unblocked import leave_real_time
 
 if TYPE_CHECKING:
     from dxlrun.remote.network.listener import Listener

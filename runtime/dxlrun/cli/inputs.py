@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -115,18 +114,8 @@ def _assignment_for(word: str) -> str:
     """Return how a word is written that was meant as an argument of the robot file, or as an option."""
     if word.endswith((".yaml", ".yml")):
         return f"--play {word.removeprefix('play=').removeprefix('play:')}"
-    name, sign, value = re.match(r"([A-Za-z_]\w*)?\s*(=|:)?\s*(.*)", word, re.DOTALL).groups()  # type: ignore[union-attr]  # it always matches
-    return f"{name}:={value or 'VALUE'}" if name and sign else "name:=value"
-
-
-def leave_real_time() -> None:
-    """Give up a real-time policy of the terminal (`chrt -r 31 dxlrun`), before there are other threads.
-
-    Loop, guardian and simulated servos ask for theirs themselves; nothing else of a run may disturb them.
-    """
-    with suppress(AttributeError, OSError):  # other systems have no such call; musl refuses it
-        if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in {os.SCHED_FIFO, os.SCHED_RR}:
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    match = re.fullmatch(r"([A-Za-z_]\w*)\s*[=:]\s*(.*)", word, re.DOTALL)
+    return f"{match[1]}:={match[2] or 'VALUE'}" if match else "name:=value"
 
 
 @contextmanager

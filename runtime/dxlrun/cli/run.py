@@ -13,12 +13,11 @@ from dxlrun.cli.inputs import (
     Seconds,
     check_ledger,
     compiled,
-    leave_real_time,
     read_models,
 )
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
-from dxlrun.output.unblocked import unblocked
+from dxlrun.output.unblocked import leave_real_time, unblocked
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -17,6 +17,16 @@ LAST_WRITE_S = 3.0
 """How long the end of a command waits for a reader that takes nothing."""
 
 
+def leave_real_time() -> None:
+    """Give up a real-time policy of the terminal (`chrt -r 31 dxlrun`) for the calling thread.
+
+    Loop, guardian and simulated servos request theirs themselves; nothing else of a run may disturb them.
+    """
+    with suppress(AttributeError, OSError):  # other systems have no such call; musl refuses it
+        if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in {os.SCHED_FIFO, os.SCHED_RR}:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 @contextmanager
 def unblocked() -> Iterator[None]:
     """Let stdout and stderr take text at once, whatever their readers do; what a reader left is ignored.
@@ -90,9 +100,7 @@ class _Writer:
             self._changed.wait_for(lambda: self._idle and not self._waiting, LAST_WRITE_S)
 
     def _write_for_ever(self) -> None:
-        with suppress(AttributeError, OSError):  # other systems have no such call; musl refuses it
-            # the terminal's real time (`chrt -r 31 dxlrun`) is for loop, guardian and simulated servos
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        leave_real_time()
         while True:
             with self._changed:
                 self._idle = not self._waiting

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import DxlrunError, InputError, running
-from dxlrun.cli.inputs import leave_real_time
 from dxlrun.errors import suggestion
 from dxlrun.output.terminal import print_warning, progress_bar, show
+from dxlrun.output.unblocked import leave_real_time
 
 if TYPE_CHECKING:
     from types import FrameType

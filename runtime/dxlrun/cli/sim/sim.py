@@ -11,7 +11,7 @@ import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, check_ledger, compiled, leave_real_time
+from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, check_ledger, compiled
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
     Mistakes,
@@ -23,7 +23,7 @@ from dxlrun.cli.sim.sim_inputs import (
 )
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import out, print_error, print_warning, show
-from dxlrun.output.unblocked import unblocked
+from dxlrun.output.unblocked import leave_real_time, unblocked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
