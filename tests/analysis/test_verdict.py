@@ -21,12 +21,12 @@ from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.run.run_log import log_header
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.causes.machine import MachineLoad
 from dxlrun_analysis.conduct import steering
 from dxlrun_analysis.cycles import latency
 from dxlrun_analysis.cycles.latency import Latency, Periods
@@ -300,7 +300,7 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
 # A machine that is too busy, and servos that are simulated
 
 REAL, SIMULATED = "/dev/ttyUSB0", "sim"
-BUSY = Causes(load=MachineLoad(10, no_idle_core=9, waited=2, busy=10))
+BUSY = Causes(load=MachineLoad(10, busy_s=10, no_idle_core_s=9, waited_s=2))
 
 
 def lost(joint: str, at_ms: int = 5, count: int = 1, code: EventCode = EventCode.SERVO_LOST) -> EventGroup:
@@ -348,7 +348,7 @@ def test_a_busy_machine_stands_for_what_it_explains(port: str) -> None:
     ids=lambda one: one.code,
 )
 def test_a_busy_machine_is_no_excuse_for_what_it_does_not_do(finding: Finding) -> None:
-    half = replace(BUSY, load=MachineLoad(10, no_idle_core=5, busy=5))
+    half = replace(BUSY, load=MachineLoad(10, busy_s=5, no_idle_core_s=5))
     verdict = judge(totals(findings=(finding,), causes=half, plan=plan(REAL)))
     assert [one.code for one in verdict.findings] == ["robot", finding.code, "rate_kept"]
     assert verdict.findings[1].remedy == "Exchange the cable."

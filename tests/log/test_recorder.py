@@ -186,7 +186,7 @@ def test_what_waits_at_the_end_is_drained_however_much_it_is(
         control = MessageChannel(theirs, REQUESTS)
         MessageChannel(ours, REQUESTS).send(LateMetadata({"grants": {"loop": "none"}}))
         job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
-        summary = Recorder(job, control).run(lambda: True)
+        summary = Recorder(job, control).run(lambda: True).summary
     os.close(memory)
     log = read_log(tmp_path / "run.mcap")
     assert len(log.cycles) + summary.gaps == count + overwritten

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
+from dxlrun.plan.machine_load import MachineLoad
 from dxlrun_analysis.causes.account import Account, CauseName
-from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineLoad, MachineSample
+from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineSample
 from dxlrun_analysis.causes.timeline import timeline
 from dxlrun_analysis.cycles.latency import ROUGH_NS, begins, first_deadline_ns
 from dxlrun_analysis.cycles.worst import Cause, CauseShare, WorstCycle
@@ -81,6 +82,7 @@ class CycleCauses:
         self._samples: list[MachineSample] = []
         self._kept: list[_Kept] = []
         self._begin_ns: int | None = None
+        self._end_ns = 0  # Of the last cycle
 
     def take(self, log: Log) -> None:
         """Take the next slice. Raises LogError when a packet in it cannot be read."""
@@ -93,8 +95,10 @@ class CycleCauses:
             self._begin_ns = first_deadline_ns(log)
         if len(log.packets):
             self._packets.append(log.packets)
-        self._samples += self._machine.new(log, self._begin_ns)
+        self._samples += self._machine.new(log)
         cycles = cycles_of(log)
+        if len(cycles):
+            self._end_ns = int(cycles["written"][-1])
         self._advance(cycles if self._newest is None else np.concatenate([self._newest, cycles]))
 
     def finish(self) -> Causes:
@@ -120,7 +124,7 @@ class CycleCauses:
             tuple(causes),
             tuple(self._worst(one, account) for one, account in worst[:WORST]),
             self._machine.slow,
-            self._machine.load,
+            MachineLoad() if self._begin_ns is None else self._machine.load(self._begin_ns, self._end_ns),
         )
 
     def _advance(self, cycles: Cycles, *, final: bool = False) -> None:

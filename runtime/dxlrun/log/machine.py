@@ -8,18 +8,19 @@ frequency, some kernels no schedstat.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.log.schemas import MACHINE
-from dxlrun.messages.cdr import Codec
+from dxlrun.messages.cdr import Codec, Value
+from dxlrun.plan.machine_load import LoadSample
 
-INTERVAL_NS = 1_000_000_000
 _SHARES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq", "steal")
 """Columns of a core in /proc/stat; guests are in `user` already."""
 _LAST_CORE = 38
@@ -161,3 +162,16 @@ def _readable(paths: Iterable[Path]) -> Iterable[float]:
     for path in paths:
         with suppress(*_UNREADABLE):
             yield float(path.read_text())
+
+
+def load_sample(message: Mapping[str, Value]) -> LoadSample:
+    """Return the part of a message of /machine that the load of the machine is judged by."""
+    end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
+    idle, steal = (cast("Floats", message[name]) for name in ("idle", "steal"))
+    return LoadSample(
+        end_ns - interval_ns,
+        end_ns,
+        float(idle.max()) if len(idle) else math.nan,
+        float(np.nan_to_num(steal).max(initial=0.0)),
+        cast("float", message["loop_waiting"]) * 1e9 / interval_ns if interval_ns > 0 else math.nan,
+    )

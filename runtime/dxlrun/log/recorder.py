@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from msgspec.json import Decoder
 
 from dxlrun.channels import process
@@ -21,10 +22,12 @@ from dxlrun.channels.process import (
     MessageChannel,
     Ready,
 )
-from dxlrun.channels.ring import Gap, RingReader
-from dxlrun.log.machine import INTERVAL_NS, MachineSampler
+from dxlrun.channels.ring import Gap, Payload, RecordKind, RingReader
+from dxlrun.log.machine import MachineSampler, load_sample
 from dxlrun.log.part_writer import PartWriter, open_writer
-from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
+from dxlrun.log.schemas import MACHINE, LogClosed, RecorderJob
+from dxlrun.messages.cdr import Codec
+from dxlrun.plan.machine_load import SAMPLE_PERIOD_NS, LoadMeter, MachineLoad
 
 POLL_S = 0.005
 FLUSH_S = 0.5
@@ -44,11 +47,15 @@ class Recorder:
         self._log = open_writer(Path(job.path), job.header, job.recording)
         self._rings = [(name, RingReader(descriptor)) for name, descriptor in job.rings.items()]
         self._reported = False
+        self._layout = job.header.layout
+        self._codec = Codec(MACHINE)
         self._machine: MachineSampler | None = None
+        self._start_up: LoadMeter | None = None  # from the begin of the loop's process to its first cycle
+        self._run: LoadMeter | None = None  # from the first cycle on
         self._next_sample_ns = 0
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
-    def run(self, asked_to_stop: Callable[[], bool]) -> LogSummary:
+    def run(self, asked_to_stop: Callable[[], bool]) -> LogClosed:
         """Record until the supervisor or a signal ends it; then drain every ring and finish the file."""
         self._supervisor.send(Ready())
         while True:
@@ -61,7 +68,8 @@ class Recorder:
         self._sample_machine()
         summary = self._log.close()
         self._report()
-        return summary
+        loads = (MachineLoad() if meter is None else meter.load() for meter in (self._start_up, self._run))
+        return LogClosed(summary, *loads)
 
     def _requested_to_finish(self, seconds: float) -> bool:
         """Wait so long for requests and do them; True for Finish, and when the supervisor is gone."""
@@ -73,6 +81,7 @@ class Recorder:
                 self._log.late_metadata |= request.records
             elif isinstance(request, LoopRuns):
                 self._machine = MachineSampler(request.pid)
+                self._start_up = LoadMeter(time.monotonic_ns())
                 self._sample_machine()
             else:
                 finish = True
@@ -98,10 +107,14 @@ class Recorder:
         now_ns = time.monotonic_ns()
         if self._machine is None or now_ns < self._next_sample_ns:
             return
-        self._next_sample_ns = now_ns + INTERVAL_NS
-        sample = self._machine.sample(now_ns)
-        if sample is not None:
-            self._log.machine(now_ns, sample)
+        self._next_sample_ns = now_ns + SAMPLE_PERIOD_NS
+        data = self._machine.sample(now_ns)
+        if data is not None:
+            self._log.machine(now_ns, data)
+            sample = load_sample(self._codec.unpack(data))
+            for meter in (self._start_up, self._run):
+                if meter is not None:
+                    meter.add(sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
         """Write what is in a ring, at most _MOST_PER_TURN records; return whether there may be more."""
@@ -113,6 +126,8 @@ class Recorder:
             if isinstance(record, Gap):
                 lost += record.lost
                 continue
+            if self._run is None and record.kind == RecordKind.CYCLE:
+                self._begin_run(record.payload)
             try:
                 self._log.take(record.kind, record.payload)
             except (ValueError, IndexError, OverflowError):
@@ -120,6 +135,17 @@ class Recorder:
         if lost:
             self._log.gap(name, lost)
         return record is not None
+
+    def _begin_run(self, payload: Payload) -> None:
+        """Begin to measure the load of the run at its first deadline; activation is part of start-up."""
+        if len(payload) != self._layout.dtype.itemsize:
+            return
+        cycle = np.frombuffer(payload, self._layout.dtype)[0]
+        if cycle["cycle"] < 0:
+            return
+        self._run = LoadMeter(int(cycle["scheduled_ns"]))
+        if self._start_up is not None:
+            self._start_up.end_ns = int(cycle["scheduled_ns"])
 
     def _report(self) -> None:
         if self._log.error is not None and not self._reported:
@@ -137,9 +163,9 @@ def main() -> int:
     except OSError as error:
         supervisor.send(Failed(f"the log cannot be written: {error.strerror or error} ({job.path})"))
         return 1
-    summary = recorder.run(lambda: bool(stop))
-    supervisor.send(LogClosed(summary))
-    return 1 if summary.error or summary.gaps else 0
+    closed = recorder.run(lambda: bool(stop))
+    supervisor.send(closed)
+    return 1 if closed.summary.error or closed.summary.gaps else 0
 
 
 if __name__ == "__main__":

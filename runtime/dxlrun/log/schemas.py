@@ -16,6 +16,7 @@ from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.messages import Header, JointState, Quaternion, String, Time, Vector3
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import RULE, MessageType
+from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.recording_plan import RecordingPlan
 
 if TYPE_CHECKING:
@@ -334,6 +335,10 @@ class LogClosed(msgspec.Struct, frozen=True, tag=True):
     """Recorder to supervisor: the log is closed."""
 
     summary: LogSummary
+    start_up_load: MachineLoad = MachineLoad()
+    """Of the machine, from the begin of the loop's process to its first cycle."""
+    run_load: MachineLoad = MachineLoad()
+    """Of the machine, from the first cycle on."""
 
 
 _TEXTS = {

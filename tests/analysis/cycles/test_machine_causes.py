@@ -15,7 +15,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun_analysis.causes.causes import Causes, CycleCauses
-from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL, MachineLoad
+from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
 
 Make = Callable[..., Any]
 SECOND = 10**9
@@ -112,27 +112,8 @@ def test_a_slow_processor_that_is_cool_saves_power(found: Callable[..., Causes])
     assert found(sample(2.0), sample(3.0)).throttled == 0
 
 
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"idle": 0.06, "steal": 0.05, "waiting": 0.010}, ""),
-        ({"idle": 0.04}, "no core was idle in 1 of 2 s"),
-        ({"idle": 0.5, "steal": 0.06}, "the host kept cores back in 1 of 2 s"),
-        ({"idle": 0.5, "waiting": 0.011}, "the loop waited for a core in 1 of 2 s"),
-    ],
-)
-def test_a_second_in_which_the_machine_was_too_busy(
-    found: Callable[..., Causes], values: dict[str, float], text: str
-) -> None:
-    # that before the first deadline is not counted
-    load = found(sample(1.0), sample(2.0, idle=1.0), sample(3.0, **values)).load
-    assert (load.text, load.busy, load.seconds) == (text, int(bool(text)), 2)
-
-
-@pytest.mark.parametrize(
-    ("busy", "seconds", "share"), [(2, 3, 0.0), (3, 3, 1.0), (3, 30, 0.1), (3, 31, 0.0), (10, 40, 0.25)]
-)
-def test_a_machine_is_too_busy_from_3_s_and_a_tenth_of_the_run_on(
-    busy: int, seconds: int, share: float
-) -> None:
-    assert MachineLoad(seconds, busy=busy).share == share
+def test_load_counts_samples_from_the_first_deadline_on(found: Callable[..., Causes]) -> None:
+    """The first cycle is at 1 s, in the first of these samples; the run ends within the last one."""
+    load = found(sample(1.4), sample(2.4, idle=1.0), sample(3.4, idle=1.0), sample(4.4)).load
+    assert load.no_idle_core_s == pytest.approx(1.2, abs=0.05)
+    assert load.seconds == pytest.approx(3.2, abs=0.05)

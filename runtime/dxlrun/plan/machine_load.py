@@ -1,0 +1,143 @@
+"""Load of the machine: whether it was too busy for a run, out of the recorder's samples.
+
+A sample says what the cores and the loop's process did over an interval; dxlrun/log/machine.py makes one a
+second. The recorder, the end of a run and the analysis of a log judge by this module.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+SAMPLE_PERIOD_NS = 1_000_000_000
+"""Time between two samples."""
+_SILENT_NS = 2 * SAMPLE_PERIOD_NS
+"""The sampler missed at least one whole sample; it runs at ordinary priority, next to the loop."""
+_IDLE_SHARE = 0.05  # /proc/stat counts in steps of 10 ms, so a core that is idle for less counts as busy
+_STOLEN_SHARE = 0.05
+_WAITED_SHARE = 0.01  # of a second; a loop at 1 kHz misses ten cycles in it
+_SPARE_SHARE = 0.5  # a core that is idle for so much of a long sample: the sampler waited for something else
+_SHORTEST_NS = 100_000_000  # ten steps of /proc/stat; a shorter sample is not judged
+_FEWEST_BUSY_S = 3.0
+_BUSY_PART = 0.1
+_MOST_PART = 0.5
+
+
+class LoadSample(msgspec.Struct, frozen=True):
+    """Work of the cores in one interval, ns of the run's clock; NaN: the system does not report it."""
+
+    begin_ns: int
+    end_ns: int
+    most_idle: float
+    """Share of the interval in which the idlest core was idle."""
+    most_stolen: float
+    """Share of the interval that the host of a virtual machine withheld, of the core with the most."""
+    loop_waiting: float
+    """Share of the interval in which the loop's process was runnable without a core."""
+
+
+class MachineLoad(msgspec.Struct, frozen=True):
+    """Seconds of an interval in which the machine was too busy; samples count by their overlap with it.
+
+    Example:
+        >>> MachineLoad(seconds=6.0, busy_s=5.2, no_idle_core_s=5.2).text
+        'no core was idle in 5.2 of 6 s'
+    """
+
+    seconds: float = 0.0
+    """Of the interval, as far as it was sampled or the sampler was silent."""
+    busy_s: float = 0.0
+    """In which any of the following was true."""
+    no_idle_core_s: float = 0.0
+    waited_s: float = 0.0
+    """The loop was runnable without a core for more than 1 % of the sample."""
+    stolen_s: float = 0.0
+    """The host withheld more than 5 % of a core."""
+    silent_s: float = 0.0
+    """The recorder, which takes the samples, took none for 2 s or longer."""
+
+    @property
+    def share(self) -> float:
+        """Share of the interval in which the machine was too busy; 0 unless it was `too_busy`."""
+        return self.busy_s / self.seconds if self.too_busy else 0.0
+
+    @property
+    def too_busy(self) -> bool:
+        """Whether the machine was busy for a tenth of the interval, and for 3 s or half of the interval."""
+        lasting = self.busy_s >= min(_FEWEST_BUSY_S, _MOST_PART * self.seconds)
+        return self.busy_s > 0 and lasting and self.busy_s >= _BUSY_PART * self.seconds
+
+    @property
+    def text(self) -> str:
+        """Observations without a full stop, for a sentence; empty when the machine was never busy."""
+        observed = (
+            (self.no_idle_core_s, "no core was idle in"),
+            (self.waited_s, "the loop waited for a core in"),
+            (self.stolen_s, "the host withheld cores in"),
+            (self.silent_s, "the recorder took no sample in"),
+        )
+        of = f"of {_seconds(self.seconds)} s"
+        return ", ".join(f"{text} {_seconds(value)} {of}" for value, text in observed if value >= 0.05)
+
+
+class LoadMeter:
+    """Accumulates the samples of one interval, in constant memory.
+
+    Args:
+        begin_ns: Begin of the interval, ns of the run's clock.
+        end_ns: End of the interval; None: not known yet, or the end of the last sample.
+    """
+
+    def __init__(self, begin_ns: int, end_ns: int | None = None) -> None:
+        self.end_ns = end_ns
+        self._begin_ns = begin_ns
+        self._first_ns: int | None = None
+        self._last_ns = begin_ns
+        self._ns = dict.fromkeys(("sampled", "busy", "no_idle_core", "waited", "stolen", "silent"), 0)
+
+    def add(self, sample: LoadSample) -> None:
+        """Count the part of a sample that overlaps the interval; samples come in the order of their times."""
+        end_ns = sample.end_ns if self.end_ns is None else min(sample.end_ns, self.end_ns)
+        begin_ns = max(sample.begin_ns, self._begin_ns)
+        if begin_ns >= end_ns:
+            return
+        if self._first_ns is None:
+            self._first_ns = begin_ns
+        self._last_ns = max(self._last_ns, end_ns)
+        length_ns = sample.end_ns - sample.begin_ns
+        if length_ns < _SHORTEST_NS:
+            return
+        found = {
+            "no_idle_core": sample.most_idle < _IDLE_SHARE,
+            "waited": sample.loop_waiting > _WAITED_SHARE,
+            "stolen": sample.most_stolen > _STOLEN_SHARE,
+            "silent": length_ns > _SILENT_NS and not sample.most_idle >= _SPARE_SHARE,
+        }
+        found |= {"sampled": True, "busy": any(found.values())}
+        for name, counted in found.items():
+            self._ns[name] += counted * (end_ns - begin_ns)
+
+    def load(self) -> MachineLoad:
+        """Return the load of the interval.
+
+        Seconds before the first and after the last sample count as busy when the sampler was silent for 2 s
+        or longer. An interval without any sample says nothing.
+        """
+        silent_ns = 0
+        if self._first_ns is not None:
+            gaps_ns = (self._first_ns - self._begin_ns, (self.end_ns or self._last_ns) - self._last_ns)
+            silent_ns = sum(gap_ns for gap_ns in gaps_ns if gap_ns >= _SILENT_NS)
+        seconds = {name: ns / 1e9 for name, ns in self._ns.items()}
+        silent_s = silent_ns / 1e9
+        return MachineLoad(
+            seconds["sampled"] + silent_s,
+            seconds["busy"] + silent_s,
+            seconds["no_idle_core"],
+            seconds["waited"],
+            seconds["stolen"],
+            seconds["silent"] + silent_s,
+        )
+
+
+def _seconds(value: float) -> str:
+    """Return seconds to a tenth, without a trailing zero."""
+    return f"{value:.1f}".removesuffix(".0")
