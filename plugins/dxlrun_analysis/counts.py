@@ -1,4 +1,7 @@
-"""How often whole numbers were seen, and their exact quantiles; memory grows with how many of them differ."""
+"""Counts of whole numbers, and their exact quantiles; memory grows with the number of different values.
+
+`quantile` and `median` are the definitions of every percentile that is shown (docs/reference/analyze.md).
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,19 @@ class Counts:
 
 
 def quantile(values: Numbers, counts: Numbers, share: float) -> float:
-    """Return the smallest value that at least this share is not above; 0 of none."""
+    """Return a quantile by nearest rank: the smallest value that at least this share does not exceed.
+
+    It is a value that was seen, never interpolated. Of several seen n times in all it has rank
+    ceil(share * n).
+
+    Args:
+        values: Ascending, without repetition.
+        counts: How often each was seen.
+        share: 0.99 for 99 %.
+
+    Returns:
+        The value; 0 if there is none.
+    """
     seen = np.cumsum(counts)
     if not len(seen):
         return 0.0
@@ -62,7 +77,7 @@ def quantile(values: Numbers, counts: Numbers, share: float) -> float:
 
 
 def median(values: Numbers, counts: Numbers) -> float:
-    """Return the median, of an even number the mean of the two in the middle; 0 of none."""
+    """Return the median, of an even number of values the mean of the two in the middle; 0 of none."""
     seen = np.cumsum(counts)
     if not len(seen):
         return 0.0

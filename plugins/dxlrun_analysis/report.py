@@ -224,6 +224,9 @@ def _loop(report: Report) -> Table:
     if late is not None:
         rows += [
             ("wake-up latency, maximum", microseconds(late.max_us)),
+            ("  99.9 %", microseconds(late.p999_us)),
+            ("  99 %", microseconds(late.p99_us)),
+            ("  median", f"{late.median_us:.1f} us"),
             ("  mean", f"{late.mean_us:.2f} us"),
             ("  standard deviation", f"{late.deviation_us:.2f} us"),
             ("  mode", f"{late.mode_us} us"),

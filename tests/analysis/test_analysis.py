@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ from dxlrun.output.json import json_text
 from dxlrun.output.table import microseconds
 from dxlrun.output.terminal import show
 from dxlrun_analysis.cycles.latency import Durations, Punctuality
-from dxlrun_analysis.report import Report, analyze_log, parts
+from dxlrun_analysis.report import Report, analyze_log, parts, tables
 
 Make = Callable[..., Any]
 ASK_5 = bytes.fromhex("ffff0504022406ca")
@@ -73,6 +74,18 @@ def test_the_wake_up_latency_is_that_of_the_records(write: Make) -> None:
         2 / 8,
         1 / 8,
     )
+    assert (latency.median_us, latency.p99_us, latency.p999_us) == (33, 20_001, 20_001)
+
+
+def test_percentiles_of_wake_ups_are_values_that_occurred(write: Make) -> None:
+    late = [(number * 7919) % 2003 for number in range(2000)]
+    report = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)]))
+    expected = [sorted(late)[rank - 1] for rank in (1980, 1998)]
+    assert report.latency is not None
+    assert [report.latency.p99_us, report.latency.p999_us] == expected
+    assert report.latency.median_us == median(late)
+    rows = {str(row[0].text): row[1].text for row in tables(report)["loop"].rows}
+    assert [rows[name] for name in ("  99 %", "  99.9 %")] == [microseconds(us) for us in expected]
 
 
 def test_the_steps_take_the_times_of_the_records(write: Make) -> None:

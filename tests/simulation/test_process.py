@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any
 
 import pytest
@@ -23,7 +24,7 @@ from dxlrun.simulation.bus.ledger import Ledger, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
-from dxlrun.simulation.server import _WRITTEN
+from dxlrun.simulation.server import _WRITTEN, lateness_us
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -398,3 +399,8 @@ def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_p
     assert os.readlink(link) == "/dev/zero"
     other.remove()
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_lateness_has_quantiles_by_nearest_rank():
+    bus = SimpleNamespace(lateness_ns=[1000 * number for number in range(100, 0, -1)])
+    assert lateness_us([bus]) == {"median": 50.5, "p99": 99.0, "maximum": 100.0}

@@ -39,13 +39,17 @@ class Latency:
     share_over_150_us: float
     share_over_1_ms: float
     share_over_period: float
+    # Counted in steps of 0.1 us; earlier wake-ups count as 0
+    median_us: float = 0.0
+    p99_us: float = 0.0
+    p999_us: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """How long one step of the cycle, or one controller's update, took, us.
+    """Time that one step of the cycle, or the update of one controller, took, us.
 
-    Counted in steps of 0.1 us.
+    Counted in steps of 0.1 us; `counts.py` defines the quantiles.
     """
 
     name: str
@@ -206,6 +210,7 @@ class Punctuality:
         self._sum = self._squares = self._max_ns = 0
         self._over = [0, 0, 0]
         self._bins = np.zeros(LATE_BINS_US + 1, np.int64)
+        self._late = Counts()  # In steps of 0.1 us, one group
         self._rates: dict[int, None] = {}
         self.slowest: Slowest | None = None  # The cycle that exceeded its period most; None where none did
 
@@ -248,6 +253,7 @@ class Punctuality:
         for index, limit in enumerate((ROUGH_NS, _MS, each)):
             self._over[index] += int(np.count_nonzero(late > limit))
         self._bins += late_bins(late)
+        self._late.take(np.zeros(len(late), np.int64), np.maximum(late, 0) // _TENTH_NS)
         exceeded = cycles["written_ns"] - cycles["woken_ns"] - each
         worst = int(np.argmax(exceeded))
         if exceeded[worst] > (0 if self.slowest is None else self.slowest.exceeded_ns):
@@ -278,6 +284,7 @@ class Punctuality:
     def _latency(self) -> Latency:
         count = self._records
         mean = self._sum / count
+        tenths = self._late.of(0)
         return Latency(
             max_us=self._max_ns / 1e3,
             mean_us=mean / 1e3,
@@ -286,4 +293,7 @@ class Punctuality:
             share_over_150_us=self._over[0] / count,
             share_over_1_ms=self._over[1] / count,
             share_over_period=self._over[2] / count,
+            median_us=median(*tenths) / 10,
+            p99_us=quantile(*tenths, 0.99) / 10,
+            p999_us=quantile(*tenths, 0.999) / 10,
         )

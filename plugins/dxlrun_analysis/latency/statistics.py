@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun_analysis.counts import Numbers, median, quantile
 from dxlrun_analysis.cycles.latency import ROUGH_NS
 from dxlrun_analysis.latency.conditions import Condition, Settings
 
@@ -32,9 +33,15 @@ class Block:
     margin_ns: int = 0  # How long the clock was polled before each deadline
 
     @property
+    def late_ns(self) -> Numbers:
+        """Lateness of each wake-up, ns."""
+        late: Numbers = self.times[:, 1] - self.times[:, 0]
+        return late
+
+    @property
     def late_us(self) -> NDArray[np.float64]:
         """Lateness of each wake-up, us."""
-        late: NDArray[np.float64] = (self.times[:, 1] - self.times[:, 0]) / 1e3
+        late: NDArray[np.float64] = self.late_ns / 1e3
         return late
 
 
@@ -131,8 +138,8 @@ def _figures(
 ) -> Figures:
     own = [block for block in blocks if block.condition == condition.name]
     late_us = np.concatenate([block.late_us for block in own])
-    late_ns = np.concatenate([block.times[:, 1] - block.times[:, 0] for block in own])
-    median, p99, p999 = np.percentile(late_us, (50, 99, 99.9)).tolist()
+    late_ns = np.concatenate([block.late_ns for block in own])
+    seen = _seen(late_ns)
     values = _over_blocks(settings, own)
     other = (
         _over_blocks(settings, [block for block in blocks if block.condition == reference.name])
@@ -152,9 +159,9 @@ def _figures(
         mode_us=mode_us(late_ns),
         share_over_150_us=float(np.mean(late_ns > ROUGH_NS)),
         share_over_1_ms=float(np.mean(late_ns > _MS_NS)),
-        median_us=median,
-        p99_us=p99,
-        p999_us=p999,
+        median_us=median(*seen) / 1e3,
+        p99_us=quantile(*seen, 0.99) / 1e3,
+        p999_us=quantile(*seen, 0.999) / 1e3,
         processor_share=sum(block.cpu_ns for block in finished) / sum(block.wall_ns for block in finished)
         if finished
         else None,
@@ -184,8 +191,17 @@ def _over_blocks(settings: Settings, blocks: Sequence[Block]) -> dict[int, dict[
 
 
 def _of_block(block: Block) -> dict[str, float]:
-    median, p99 = np.percentile(block.late_us, (50, 99)).tolist()
-    return {"mean_us": float(block.late_us.mean()), "median_us": median, "p99_us": p99}
+    seen = _seen(block.late_ns)
+    return {
+        "mean_us": float(block.late_us.mean()),
+        "median_us": median(*seen) / 1e3,
+        "p99_us": quantile(*seen, 0.99) / 1e3,
+    }
+
+
+def _seen(late_ns: Numbers) -> tuple[Numbers, Numbers]:
+    values, counts = np.unique(late_ns, return_counts=True)
+    return values, counts
 
 
 def _skipped(times: Times, period_ns: int) -> int:

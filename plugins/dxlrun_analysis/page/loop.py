@@ -29,7 +29,8 @@ _COLOURS = {"read": BLUE, "update": GREEN, "write": ORANGE, "cycle": INK}
 def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[Plot, ...]:
     """Return the plots of the wake-ups of a run."""
     summary = (
-        f"{run.late_bins.sum()} wake-ups; mean {latency.mean_us:.2f} us, standard deviation "
+        f"{run.late_bins.sum()} wake-ups; median {latency.median_us:.1f} us, 99 % {latency.p99_us:.1f} us, "
+        f"99.9 % {latency.p999_us:.1f} us, mean {latency.mean_us:.2f} us, standard deviation "
         f"{latency.deviation_us:.2f} us, mode {latency.mode_us} us, maximum {microseconds(latency.max_us)}."
     )
     series = WakeUps(Line("late", "woken after the deadline", BLUE), run.late_bins)

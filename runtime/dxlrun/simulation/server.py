@@ -264,13 +264,16 @@ def _goal(registers: Memory) -> float | None:
 
 
 def lateness_us(buses: Sequence[SimulatedBus]) -> dict[str, float]:
-    """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first."""
+    """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first.
+
+    Quantiles by nearest rank: the smallest value that at least this share does not exceed.
+    """
     ordered = sorted(late_ns for bus in buses for late_ns in bus.lateness_ns)
     if not ordered:
         return {}
     picked = {
-        "median": ordered[len(ordered) // 2],
-        "p99": ordered[len(ordered) * 99 // 100],
+        "median": (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2,
+        "p99": ordered[-(-len(ordered) * 99 // 100) - 1],
         "maximum": ordered[-1],
     }
     return {name: late_ns / 1000 for name, late_ns in picked.items()}
