@@ -22,6 +22,7 @@ import yaml
 from dxlrun.description.document import KeyPath, node_mark, refusal
 from dxlrun.description.including import Source, read_sources
 from dxlrun.errors import InputError
+from dxlrun.output.target import unwritable
 
 
 class _Edit(NamedTuple):
@@ -99,7 +100,7 @@ class RobotText:
             for place, beside in besides.items():
                 beside.replace(place)
         except OSError as error:
-            raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
+            raise unwritable(Path(error.filename), error) from error
         finally:
             for beside in besides.values():
                 beside.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ import numpy as np
 from dxlrun import GoalState, RemoteRobot
 from dxlrun.cli.steering.goals import cancelled, sentence
 from dxlrun.errors import InputError, Refused, ServoFault, suggestion
-from dxlrun.log.target import new_target
+from dxlrun.output.target import write_target
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
@@ -102,8 +102,7 @@ class Teaching:
             )
         origin = f"Shown by hand to {self._robot.name}.\nWritten by `dxlrun teach`."
         text = taught.text_of(motion, self._plans, origin)
-        with new_target(target) as beside:
-            beside.write_text(text, encoding="utf-8")
+        write_target(target, text)
         self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
 
     def hold(self) -> None:

@@ -95,7 +95,7 @@ def test_a_directory_that_cannot_be_made_is_one_sentence(dxlrun: Callable, tmp_p
 
     assert said.code == 2
     assert len(said.errors) == 1
-    assert "cannot be written: Not a directory" in said.err
+    assert "is not a directory)" in said.err
 
 
 def test_an_installed_package_takes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

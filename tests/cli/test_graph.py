@@ -114,7 +114,7 @@ def test_a_picture_of_each_robot_has_all_in_it_and_nothing_over_another(
 
 def test_dot_has_each_node_and_each_edge(dxlrun: Dxlrun, chain: Path, tmp_path: Path) -> None:
     path = tmp_path / "graph.DOT"
-    path.write_text("an older one")
+    path.write_text('node [fontname="monospace"]; an older one')
     assert dxlrun("check", chain, "--graph", path).code == 0
     text = path.read_text()
     assert text.startswith('digraph "chain: controllers" {\n')
@@ -133,7 +133,7 @@ def test_what_cannot_be_a_picture_is_refused_in_one_sentence(
     for words, what in (
         ((tmp_path / "graph.png",), "the file's suffix must be .svg or .dot"),
         (("port:=sim",), "without a file --graph is the last word"),
-        ((tmp_path / "gone" / "graph.svg",), "cannot be written (No such file or directory)"),
+        ((tmp_path / "gone" / "graph.svg",), "cannot be written (there is no directory"),
     ):
         said = dxlrun("check", chain, "--graph", *words)
         assert said.code == 2
@@ -142,7 +142,7 @@ def test_what_cannot_be_a_picture_is_refused_in_one_sentence(
     (tmp_path / "folder.svg").mkdir()
     said = dxlrun("check", chain, "--graph", tmp_path / "folder.svg")
     assert (said.code, said.err.count("\n")) == (2, 1)
-    assert "is no regular file" in said.err
+    assert "it exists and is a directory" in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.yaml", "folder.svg"]
 
 

@@ -29,9 +29,9 @@ def test_the_log_of_a_run_is_what_its_buses_saw(dxlrun: Callable, torso: Path, *
     ("words", "sentence"),
     [
         (("port:=/dev/ttyUSB9", "--ledger", "seen.jsonl"), "what simulated buses saw"),
-        (("--ledger", "missing/seen.jsonl"), "--ledger missing/seen.jsonl cannot be written"),
+        (("--ledger", "missing/seen.jsonl"), "missing/seen.jsonl cannot be written"),
         (("--ledger", "."), "cannot be written"),
-        (("--ledger", "letter.txt"), "--ledger letter.txt exists, and is not written over"),
+        (("--ledger", "letter.txt"), "letter.txt cannot be written (it exists)"),
     ],
 )
 @pytest.mark.usefixtures("in_a_new_directory")

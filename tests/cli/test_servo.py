@@ -167,7 +167,7 @@ def test_a_backup_goes_into_a_file_and_back_into_another_servo(one, tmp_path, mo
     assert f"registers are in {path}" in servo(1, "backup", path, *words).out
     kept = json.loads(path.read_text())
     assert (kept["model"], kept["id"], kept["registers"]["return_delay_time"]) == (model, 1, 20)
-    assert "is there already" in servo(1, "backup", path, *words).err
+    assert "cannot be written (it exists)" in servo(1, "backup", path, *words).err
     back = servo(2, "restore", path, "--yes", *words)
     assert back.code == 0, back.err
     assert "Return Delay Time" in back.out

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import resource
 import select
 import signal
 import struct
@@ -244,8 +245,10 @@ def test_a_simulation_whose_process_dies_fails_with_a_sentence(start, tmp_path):
 
 
 def test_a_ledger_that_is_not_complete_fails_at_the_end(start):
-    sim = start("--servo", "AX-12A:1", "--json", "--ledger", "/dev/full")
+    sim = start("--servo", "AX-12A:1", "--json", "--ledger", "ledger.jsonl")
     port = json.loads(sim.line())["ports"]["main"]
+    (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
+    resource.prlimit(int(child), resource.RLIMIT_FSIZE, (1, 1))  # as a full disk
     assert hear(port, bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex("ff ff 01 02 00 fc")
     code, _, err = sim.stop()
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.cli.inputs import check_ledger
 from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -49,10 +48,9 @@ def _virtual_run(directory: Path) -> None:
         lambda directory: new_log(RecordingPlan(str(directory)), "pair"),
         lambda directory: LogFile(directory / "log.mcap").close(),
         lambda directory: Ledger(directory / "bus.jsonl").close(),
-        lambda directory: check_ledger(directory / "sim.jsonl"),
         _virtual_run,
     ],
-    ids=["name", "log", "ledger", "sim", "run"],
+    ids=["name", "log", "ledger", "run"],
 )
 def test_logs_and_ledgers_are_for_the_user_and_the_group(tmp_path, create):
     before = os.umask(0)

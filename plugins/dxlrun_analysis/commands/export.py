@@ -52,7 +52,7 @@ def export(
     if file_format != "ros2bag" and (missing := missing_extra(file_format, "logs", "pyarrow")):
         raise InputError(missing)
     from dxlrun.log.reader import open_log
-    from dxlrun.log.target import new_target
+    from dxlrun.output.target import new_target
 
     with err().status(f"exporting {log}"), new_target(output) as beside:
         count = _write(open_log(log), beside, file_format, topic)

@@ -40,13 +40,13 @@ def teach(
         How fast joints go from one pose to the next.
     """
     from dxlrun.description.units import angular_velocity
-    from dxlrun.log.target import check_new
+    from dxlrun.output.target import check_target
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.teaching import taught
 
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
-    check_new(motion)
+    check_target(motion)
     try:
         way_speed = angular_velocity(speed)
     except ValueError as error:

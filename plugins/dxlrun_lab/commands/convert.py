@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError, counted
+from dxlrun.output.target import check_target, write_target
 from dxlrun.output.terminal import show, show_json
 from dxlrun_lab.commands.recorded import ALL_OF_IT, RecordedPart
 
@@ -44,18 +45,16 @@ def convert(
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
     tolerance = part.tolerance_rad
-    from dxlrun.log.target import check_new, new_target
     from dxlrun_analysis.playback.motion_file import motion_file
     from dxlrun_analysis.playback.spline_path import tolerances
 
-    check_new(motion)
+    check_target(motion)
     recorded = part.read(log)
     allowed = tolerances(recorded, tolerance)
     nearest = f"at most {math.degrees(float(allowed.max())):.4g} deg from it"
     origin = f"Motion of {_where(recorded)}, {nearest}.\nWritten by `dxlrun convert`."
     written = motion_file(recorded, allowed, motion, controller, origin)
-    with new_target(motion) as beside:
-        beside.write_text(written.text, encoding="utf-8")
+    write_target(motion, written.text)
     if as_json:
         show_json(
             {

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Seconds, check_report, write_report
 from dxlrun.errors import InputError, missing_extra
+from dxlrun.output.target import check_target, write_target
 from dxlrun.output.terminal import err, print_error, show, show_json
 from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words
 
@@ -126,21 +127,14 @@ def _check_output(target: Path, joints: tuple[str, ...]) -> None:
     """Raise InputError where a motor file cannot be written, before anything moves."""
     if len(joints) != 1:
         raise InputError("--output takes the motor file of one joint; name that joint only")
-    if target.exists():
-        raise InputError(f"{target} exists, and is not overwritten; move it away, or write another file")
-    if not target.parent.is_dir():
-        raise InputError(f"there is no directory {target.parent} for the motor file; make it first")
+    check_target(target)
 
 
 def _write(target: Path, joint: str, found: Identified) -> None:
     from dxlrun.description.joints.motor_file import motor_text
 
     comment = "\n".join((f"{joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
-    try:
-        with target.open("x", encoding="utf-8") as stream:
-            stream.write(motor_text(found.motor, found.uncertainty, comment=comment))
-    except OSError as error:
-        raise InputError(f"{target} cannot be written: {error.strerror or error}") from error
+    write_target(target, motor_text(found.motor, found.uncertainty, comment=comment))
 
 
 def _show(found: list[JointResult], options: OnRobot, log: Path | None, output: Path | None) -> None:

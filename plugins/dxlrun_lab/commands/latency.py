@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
 from dxlrun.errors import InputError
+from dxlrun.output.target import check_target, unwritable
 from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
@@ -215,10 +216,7 @@ def _log_place(log: Path | None, no_record: bool) -> Path | None:
 
         return Path(Recording().directory)
     if log.suffix == ".mcap":
-        if log.exists():
-            raise InputError(f"--log {log}: there is such a file already; choose another name")
-        if not log.parent.is_dir():
-            raise InputError(f"--log {log}: there is no directory {log.parent}; make it first")
+        check_target(log)
     elif log.exists() and not log.is_dir():
         raise InputError(f"--log {log}: this is no directory, and a log's name ends in .mcap")
     return log
@@ -231,9 +229,9 @@ def _new_log(place: Path) -> Path:
     if place.suffix != ".mcap":
         return new_log(RecordingPlan(str(place)), "latency")
     try:
-        place.touch(exist_ok=False)
+        place.touch()
     except OSError as error:
-        raise InputError(f"--log {place} cannot be written: {error.strerror or error}") from None
+        raise unwritable(place, error) from None
     return place
 
 

@@ -21,8 +21,9 @@ from dxlrun.cli.inputs import (
     terminated_as_interrupted,
 )
 from dxlrun.errors import InputError, Mark, Problem, counted, missing_extra
+from dxlrun.output.target import check_target
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
-from dxlrun_lab.sweep import By
+from dxlrun_lab.sweep import PICTURE_MARK, By
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -158,10 +159,13 @@ def _mistakes(
         yield f"--picture {picture} has no format; end it in .svg, .png or .pdf"
     elif picture is not None and (missing := missing_extra("--picture", "sweep", "matplotlib")):
         yield missing
-    elif picture is not None and not picture.parent.is_dir():
-        yield f"--picture {picture}: there is no directory {picture.parent}; make it"
     elif picture is not None and len(over) > _MOST_DRAWN:
         yield f"--picture draws one or two parameters, and {len(over)} are swept; leave it out"
+    elif picture is not None:
+        try:
+            check_target(picture, PICTURE_MARK)
+        except InputError as error:
+            yield str(error)
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         yield f"--workers is {workers}; give from 1 to {_MOST_WORKERS}"
     if not 0 < time_limit <= _LONGEST_S:
@@ -211,7 +215,4 @@ def _draw(picture: Path, found: Sweep, by: By) -> None:
     from dxlrun_lab.sweep.picture import draw
 
     names = [parameter.name for parameter in found.grid.parameters]
-    try:
-        draw(picture, found.header, names, found.rows, by)
-    except OSError as error:
-        raise InputError(f"--picture {picture} cannot be written ({error.strerror or error})") from None
+    draw(picture, found.header, names, found.rows, by)

@@ -9,18 +9,26 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from dxlrun_lab.sweep import By
+from dxlrun.output.target import new_target
+from dxlrun_lab.sweep import PICTURE_MARK, By
 from dxlrun_lab.sweep.ranges import Value
 from dxlrun_lab.sweep.ranking import ranked, score, unit
 from dxlrun_lab.sweep.results import Row, SweepHeader
 
 _MOST_TICKS = 10
+_METADATA = {
+    ".png": {"Software": PICTURE_MARK},
+    ".svg": {"Creator": PICTURE_MARK, "Date": None},
+    ".pdf": {"Creator": PICTURE_MARK},
+}
 _SPREAD = 5.0
 """A worst score so many times the best makes the scale of colours logarithmic: good runs differ little."""
 
 
 def draw(path: Path, header: SweepHeader, names: Sequence[str], rows: Sequence[Row], by: By) -> None:
-    """Write the map of a sweep of one or two parameters, in the format of the file's name; raises OSError.
+    """Write the map of a sweep of one or two parameters, in the format of the file's name.
+
+    Raises InputError where that fails.
 
     Runs without a score are left blank, the best one is marked.
     """
@@ -45,7 +53,9 @@ def draw(path: Path, header: SweepHeader, names: Sequence[str], rows: Sequence[R
     axes.set_ylabel("".join(labels[1:]))
     axes.set_yticks(*_ticks(high))
     figure.colorbar(image, label=f"{by}, {unit(by)} (best: red)")
-    figure.savefig(path, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
+    kind = path.suffix.lower()
+    with new_target(path, PICTURE_MARK) as beside:
+        figure.savefig(beside, format=kind.removeprefix("."), metadata=_METADATA[kind])
 
 
 def _values(rows: Sequence[Row], index: int) -> list[Value]:

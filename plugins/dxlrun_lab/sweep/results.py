@@ -16,11 +16,13 @@ import pyarrow.parquet as pq
 from msgspec.structs import asdict, fields
 
 from dxlrun.errors import InputError, LogError
+from dxlrun.output.target import check_target, make_folder_of, new_target
 from dxlrun_lab.sweep.measuring import Measured
 from dxlrun_lab.sweep.ranges import Value
 from dxlrun_lab.sweep.scores import Scores
 
 _KEY = b"dxlrun.sweep"
+_PARQUET = "PAR1"  # magic number of the format; `read_results` judges the rest
 _RUN, _STATUS, _REASON = "run", "status", "reason"
 
 
@@ -99,14 +101,8 @@ def read_results(path: Path) -> tuple[SweepHeader, tuple[Row, ...]]:
 
 def check_output(path: Path) -> None:
     """Make the folder of a file; raises InputError where it cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _part(path).touch()
-        _part(path).unlink()
-    except OSError as error:
-        raise InputError(
-            f"--output {path} cannot be written ({error.strerror or error}); choose another"
-        ) from None
+    make_folder_of(path)
+    check_target(path, _PARQUET)
 
 
 @contextmanager
@@ -129,7 +125,7 @@ def only_writer(path: Path) -> Iterator[None]:
 def write_results(path: Path, header: SweepHeader, rows: Iterable[Row]) -> None:
     """Write a file in place of the one before: a reader finds either of them, whole, at every moment.
 
-    Raises OSError.
+    Raises InputError where that fails.
     """
     schema = _schema(header)
     columns: dict[str, list[object]] = {name: [] for name in schema.names}
@@ -145,16 +141,10 @@ def write_results(path: Path, header: SweepHeader, rows: Iterable[Row]) -> None:
         }
         for name, values in columns.items():
             values.append(flat.get(name))
-    part = _part(path)
-    with part.open("wb") as file:
+    with new_target(path, _PARQUET) as beside, beside.open("wb") as file:
         pq.write_table(pa.Table.from_pydict(columns, schema=schema), file)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
-
-
-def _part(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 
 def _schema(header: SweepHeader) -> pa.Schema:

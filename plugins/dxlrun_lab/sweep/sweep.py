@@ -66,7 +66,7 @@ class Sweep:
     ) -> None:
         """Measure what is missing, and keep it, however this ends; workers are used only if something is.
 
-        Raises OSError when the file cannot be written.
+        Raises InputError when the file cannot be written.
         """
         began = time.monotonic()
         tasks = self.missing()

@@ -70,7 +70,7 @@ def check(
     if log is not None and not online:
         raise InputError("--log keeps what --online sends and receives; give --online too")
     for file in graph or ():
-        _require_picture(file)
+        _check_picture(file)
     with BusesLog(log, f"dxlrun check {robot} --online") as packets:
         ask = partial(_asked, packets) if online else None
         result = compiled(robot, assignments, play, duration, ask)
@@ -99,10 +99,10 @@ def check(
     return 0 if found.as_declared else 1
 
 
-def _require_picture(file: Path) -> None:
-    from dxlrun.output.graph_picture import kind_of  # not above: most checks draw nothing
+def _check_picture(file: Path) -> None:
+    from dxlrun.output.graph_picture import check_picture  # not above: most checks draw nothing
 
-    kind_of(file)
+    check_picture(file)
 
 
 def _write(result: Compiled, file: Path) -> None:

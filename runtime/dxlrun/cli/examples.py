@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dxlrun.cli.inputs import DebugFlag, JsonFlag, examples_directory
 from dxlrun.errors import InputError
+from dxlrun.output.target import make_folder_of, write_target
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -154,7 +156,8 @@ def _about(text: str) -> str:
 def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
     """Copy files; raises InputError, before any is written, where another one has a name of theirs."""
     texts = {directory / file: (source / file).read_bytes() for file in files}
-    taken = [path for path, text in texts.items() if path.exists() and not _holds(path, text)]
+    missing = {path: text for path, text in texts.items() if not _holds(path, text)}
+    taken = [path for path in missing if os.path.lexists(path)]
     if taken:
         raise InputError(
             "\n".join(
@@ -162,16 +165,17 @@ def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
                 for path in taken
             )
         )
-    try:
-        for path, text in texts.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(text)
-    except OSError as error:
-        raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
+    for path, text in missing.items():
+        make_folder_of(path)
+        write_target(path, text)
 
 
 def _holds(path: Path, text: bytes) -> bool:
     return path.is_file() and path.read_bytes() == text
+
+
+_SCHEMA_MARK = '"$schema": "https://json-schema.org/'
+"""In each JSON Schema; only such a file is replaced by a new one."""
 
 
 def schema(
@@ -197,10 +201,7 @@ def schema(
     if output is None:
         sys.stdout.write(text)
         return 0
-    try:
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{output} cannot be written ({error.strerror}); choose another --output") from None
+    write_target(output, text, _SCHEMA_MARK)
     return 0
 
 

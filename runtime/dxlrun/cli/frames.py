@@ -54,9 +54,9 @@ def frames(
     if of is None and (at or relative_to):
         raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")
     if graph is not None:
-        from dxlrun.output.graph_picture import kind_of  # not above: most draw nothing
+        from dxlrun.output.graph_picture import check_picture  # not above: most draw nothing
 
-        kind_of(graph)
+        check_picture(graph)
     result = compiled(robot, assignments, (), None)
     tree = _tree(result.plan, robot)
     if of is None:

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli import verbs
 from dxlrun.errors import DxlrunError, InputError, missing_extra, suggestion
+from dxlrun.output.target import check_target, write_target
 
 if TYPE_CHECKING:
     from cyclopts import Token
@@ -59,6 +60,8 @@ Seconds = Annotated[float, _of("seconds")]
 Hertz = Annotated[float, _of("rate")]
 """A rate, Hz: `50`, `50Hz` or `1kHz`."""
 
+REPORT_MARK = '<script type="application/json" id="report">'
+"""In each report that `output.html` makes; only such a page is replaced by a new report."""
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
 """Of a run, s; 31 years still fit into the log's nanoseconds."""
 
@@ -128,20 +131,6 @@ def terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def check_ledger(ledger: Path) -> None:
-    """Raise InputError where no new ledger can be written, before anything starts."""
-    from dxlrun.simulation.bus.ledger import for_group
-
-    try:
-        with open(ledger, "ab", opener=for_group) as file:
-            taken = file.tell() > 0  # an empty one was left by a run that did not start
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"--ledger {ledger} cannot be written ({reason}); choose another file") from None
-    if taken:
-        raise InputError(f"--ledger {ledger} exists, and is not written over; choose another file")
-
-
 def check_report(target: Path, library: str = "matplotlib") -> None:
     """Raise InputError with what is wrong with the file of a page, before anything is measured.
 
@@ -149,18 +138,14 @@ def check_report(target: Path, library: str = "matplotlib") -> None:
     """
     if target.suffix.lower() not in {".html", ".htm"}:
         raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
-    if not target.parent.is_dir():
-        raise InputError(f"there is no directory {target.parent} for the report; make it first")
+    check_target(target, REPORT_MARK)
     if missing := missing_extra("a report", "report", library):
         raise InputError(missing)
 
 
 def write_report(target: Path, page: str) -> None:
-    """Write a page. Raises InputError where that fails."""
-    try:
-        target.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"the report {target} cannot be written: {error.strerror or error}") from error
+    """Write a page, also in place of an older one. Raises InputError where that fails."""
+    write_target(target, page, REPORT_MARK)
 
 
 def known_file(robot: Path) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.table import Column, Columns, Table, Value
+from dxlrun.output.target import make_folder_of, new_target
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -142,16 +143,13 @@ def new_plugin(
     """
     module = _module(name)
     place = Path(name) if directory is None else directory
-    if place.exists() or place.is_symlink():
-        raise InputError(f"{place} is there already, and stays; choose another directory")
     files = dict(_files(_template(), module))
-    try:
+    make_folder_of(place)
+    with new_target(place) as beside:
         for path, text in files.items():
-            target = place / path
+            target = beside / path
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
     made = [str(place / path) for path in files]
     if as_json:
         show_json({"directory": str(place), "files": made})

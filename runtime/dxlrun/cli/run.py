@@ -11,11 +11,11 @@ from dxlrun.cli.inputs import (
     Flag,
     Motions,
     Seconds,
-    check_ledger,
     compiled,
     read_models,
 )
 from dxlrun.errors import InputError, counted
+from dxlrun.output.target import check_target
 from dxlrun.output.terminal import out, print_error, print_warning, show
 from dxlrun.output.unblocked import leave_real_time, unblocked
 
@@ -93,7 +93,7 @@ def run(
                 f"a ledger records what simulated buses saw, and {result.plan.robot} has none: give the "
                 "argument port:=sim, or leave out --ledger"
             )
-        check_ledger(ledger)
+        check_target(ledger)
     if listen is not None:
         _check_listen(listen, result.plan, served=not (no_gateway or virtual))
     from dxlrun.run.run_summary import RunOptions

@@ -7,9 +7,10 @@ import os
 import sys
 from pathlib import Path
 
+from dxlrun.output.target import open_empty
+
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
-_FLAGS = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 
 class LogFile:
@@ -18,10 +19,7 @@ class LogFile:
     __slots__ = ("_descriptor", "_path", "_size")
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, _FLAGS, LOG_MODE)
-        if os.fstat(self._descriptor).st_size:  # empty is how a name is taken before a log begins
-            os.close(self._descriptor)
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        self._descriptor = open_empty(path, LOG_MODE)  # empty is how a name is taken before a log begins
         self._path = path
         self._size = 0
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
@@ -13,8 +11,11 @@ from xml.etree.ElementTree import Element
 from dxlrun.errors import InputError
 from dxlrun.output.escaping import escaped
 from dxlrun.output.graph import Graph, Node, placed
+from dxlrun.output.target import check_target, write_target
 
-KINDS = (".svg", ".dot")
+_FONT = 'node [fontname="monospace"];'
+_MARKS = {".svg": '<rect class="paper"', ".dot": _FONT}
+"""What a picture of each kind has; only such a file is replaced by a new picture."""
 _CHARACTER, _LINE = 7.25, 17.0
 """Of a monospaced font of 12 px: 0.6 em wide, with some room."""
 _PAD, _GAP, _ACROSS, _MARGIN = 12.0, 18.0, 74.0, 24.0
@@ -69,32 +70,23 @@ def _style() -> str:
 
 
 def write_picture(graph: Graph, path: Path) -> None:
-    """Write a graph as `.svg` or `.dot`, whole or not at all.
+    """Write a graph as `.svg` or `.dot`, also in place of an older one.
 
-    Raises InputError for another suffix, and where the file cannot be written.
+    Raises InputError as `check_picture`.
     """
-    text = (graph_svg if kind_of(path) == ".svg" else graph_dot)(graph)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path} is no regular file; choose another name")
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            unfinished.unlink()
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from None
+    text = (graph_svg if path.suffix.lower() == ".svg" else graph_dot)(graph)
+    write_target(path, text, _MARKS[path.suffix.lower()])
 
 
-def kind_of(path: Path) -> str:
-    """Return the suffix of a picture's file; raises InputError for one that is not known."""
+def check_picture(path: Path) -> None:
+    """Raise InputError for a suffix that is not known, and for a file that cannot be written."""
     suffix = path.suffix.lower()
-    if suffix not in KINDS:
+    if suffix not in _MARKS:
         raise InputError(
-            f"--graph {path}: the file's suffix must be {' or '.join(KINDS)}; without a file --graph is the "
+            f"--graph {path}: the file's suffix must be {' or '.join(_MARKS)}; without a file --graph is the "
             "last word, and draws in the terminal"
         )
-    return suffix
+    check_target(path, _MARKS[suffix])
 
 
 def graph_svg(graph: Graph) -> str:
@@ -142,7 +134,7 @@ def graph_svg(graph: Graph) -> str:
 def graph_dot(graph: Graph) -> str:
     """Return the graph in DOT (graphviz.org/doc/info/lang.html), for `dot -Tpdf`."""
     shapes = {"source": "note", "controller": "box", "joints": "box, style=rounded"}
-    rows = [f"digraph {_quoted(graph.title)} {{", "  rankdir=LR;", '  node [fontname="monospace"];']
+    rows = [f"digraph {_quoted(graph.title)} {{", "  rankdir=LR;", f"  {_FONT}"]
     for node in graph.nodes:
         label = "\n".join(filter(None, (*node.lines, node.about)))
         style = "" if node.active else ", style=dashed"

@@ -15,7 +15,7 @@ from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
-from dxlrun.log.target import new_target
+from dxlrun.output.target import new_target
 from dxlrun.testing import simulated_robot
 
 Export = Callable[..., tuple[int, str, list[str]]]
@@ -140,7 +140,7 @@ def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
     there.write_text("precious")
     code, _, (error,) = export(run, there, "--format", to)
     assert (code, there.read_text()) == (2, "precious")
-    assert "there exists, and nothing is written over" in error
+    assert "there cannot be written (it exists" in error
 
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"not a log")
@@ -158,7 +158,7 @@ def test_what_came_meanwhile_is_not_written_over(tmp_path: Path) -> None:
     context = new_target(target)
     context.__enter__().write_text("new")
     target.write_text("came meanwhile")
-    with pytest.raises(InputError, match="nothing is written over"):
+    with pytest.raises(InputError, match="it exists"):
         context.__exit__(None, None, None)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert target.read_text() == "came meanwhile"
@@ -173,7 +173,7 @@ def test_a_full_disk_leaves_nothing(
     monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
     code, _, (error,) = export(run, tmp_path / "out", "--format", "parquet")
     assert (code, list(tmp_path.iterdir())) == (2, [])
-    assert error.endswith("out cannot be written: No space left on device")
+    assert error.endswith("out cannot be written (No space left on device); choose another name")
 
 
 def test_logs_md_its_exports_are_made(

@@ -140,7 +140,7 @@ def _only(line: str, joint: str, *, speed: bool) -> str:
     ("words", "said"),
     [
         (["a.mcap"], "a motion file is YAML, so its name ends in .yaml, not as a.mcap does"),
-        (["none/a.yaml"], "there is no directory none for a.yaml; make it first"),
+        (["none/a.yaml"], "there is no directory none"),
         (["a.yaml", "--joint", "pan"], "both moves tilt too, and a motion file needs all its joints"),
         (
             ["a.yaml", "--joint", "pan", "--map", "pan=arm"],

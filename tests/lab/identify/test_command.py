@@ -42,7 +42,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     text = motor.read_text()
     again = dxlrun("identify", ROBOT, "joint", "--virtual", "--output", motor)
     assert again.code == 2
-    assert "exists, and is not overwritten" in again.err
+    assert "cannot be written (it exists)" in again.err
     assert motor.read_text() == text
 
 

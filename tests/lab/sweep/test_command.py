@@ -78,11 +78,15 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep):
 
 def test_a_file_that_is_no_sweep_stays_as_it_is(sweep):
     other = Path("other.parquet")
-    other.write_text("something else")
-    said = sweep("--over", "gains.p=1,2", "--output", "other.parquet")
-    assert said.code == 2
-    assert said.errors[0].startswith("dxlrun: other.parquet is no file of a sweep (")
-    assert other.read_text() == "something else"
+    for text, sentence in (
+        ("PAR1, but no table", "other.parquet is no file of a sweep ("),
+        ("something else", "other.parquet cannot be written (it exists, and is not from dxlrun)"),
+    ):
+        other.write_text(text)
+        said = sweep("--over", "gains.p=1,2", "--output", "other.parquet")
+        assert said.code == 2
+        assert said.errors[0].startswith(f"dxlrun: {sentence}")
+        assert other.read_text() == text
 
 
 def test_two_sweeps_do_not_write_one_file(sweep, no_workers):

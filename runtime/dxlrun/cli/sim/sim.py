@@ -11,7 +11,7 @@ import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, check_ledger, compiled
+from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, compiled
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
     Mistakes,
@@ -22,6 +22,7 @@ from dxlrun.cli.sim.sim_inputs import (
     with_adapter,
 )
 from dxlrun.errors import InputError
+from dxlrun.output.target import check_target
 from dxlrun.output.terminal import out, print_error, print_warning, show
 from dxlrun.output.unblocked import leave_real_time, unblocked
 
@@ -112,7 +113,7 @@ def sim(
         planned = read_faults(fault, faults)
     with mistakes.collected():
         if ledger is not None:
-            check_ledger(ledger)
+            check_target(ledger)
     with mistakes.collected():
         latency_ns = read_latency(latency_timer)
     with mistakes.collected():

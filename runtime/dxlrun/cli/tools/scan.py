@@ -15,6 +15,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
+from dxlrun.output.target import check_target, write_target
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def scan(
 
     search = read_search(protocol, baud, ids)
     if output is not None:
-        check_target(output)
+        check_draft(output)
     load_models()
     with (
         TunablePort(port) as line,
@@ -195,23 +196,17 @@ def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: 
     Raises InputError where it is there or cannot be written, ServoFault where these servos cannot be one bus:
     one port is one bus, of one protocol and one rate.
     """
-    check_target(path)
+    check_draft(path)
     text = draft(path.stem, port, servos, latency_ns)
-    try:
-        path.write_text(text)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from None
+    write_target(path, text)
     return text
 
 
-def check_target(path: Path) -> None:
+def check_draft(path: Path) -> None:
     """Raise InputError where `draft_file` would write nothing, whatever the servos are."""
-    if path.exists():
-        raise InputError(f"{path} is there already and is not overwritten; choose another file")
+    check_target(path)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(f"{path} is no name for a robot file; end it in .yaml")
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no directory {path.parent}; make it first")
 
 
 def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:

@@ -16,6 +16,7 @@ from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag
 from dxlrun.cli.tools.scan import HIGHEST_ID, load_models, read_search
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
+from dxlrun.output.target import check_target
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
@@ -407,8 +408,8 @@ def _backup(one: OneServo, asked: Asked) -> None:
 
 
 def _new_file(asked: Asked) -> None:
-    if asked.words and Path(asked.words[0]).exists():
-        raise InputError(f"{asked.words[0]} is there already and is not overwritten; choose another file")
+    if asked.words:
+        check_target(Path(asked.words[0]))
 
 
 def _restore(one: OneServo, asked: Asked) -> None:

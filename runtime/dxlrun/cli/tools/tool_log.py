@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.errors import InputError
+from dxlrun.output.target import check_target, unwritable
 from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
@@ -35,16 +35,15 @@ def tool_log(
     from dxlrun.log.identity import HOST, IDENTITY_NAME, code_hashes
     from dxlrun.log.log_writer import LogWriter
     from dxlrun.log.schemas import LogHeader
-    from dxlrun.log.target import check_new
     from dxlrun.run.run_log import epoch_offset_ns, incomplete_log
 
-    check_new(path)
+    check_target(path)
     metadata = {TOOL_NAME: {"command": command}, IDENTITY_NAME: {**code_hashes(), HOST: platform.node()}}
     header = LogHeader("tool", (), tuple(buses), (), 1_000_000_000, epoch_offset_ns(), metadata=metadata)
     try:
         writer = LogWriter(path, header)
     except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise unwritable(path, error) from error
     packets = PacketBatch(Handover(writer.take))
     try:
         yield packets

@@ -10,6 +10,7 @@ import msgspec
 
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.errors import InputError
+from dxlrun.output.target import write_target
 from dxlrun.plan.bus_plan import RegisterValue
 
 FORMAT: Literal["dxlrun servo backup 1"] = "dxlrun servo backup 1"
@@ -47,13 +48,7 @@ def kept_items(table: ControlTable) -> tuple[str, ...]:
 def write_backup(path: Path, backup: ServoBackup) -> None:
     """Write a file that is not there yet; raises InputError where it is, or cannot be written."""
     text = msgspec.json.format(msgspec.json.encode(backup), indent=2) + b"\n"
-    try:
-        with path.open("xb") as file:
-            file.write(text)
-    except FileExistsError:
-        raise InputError(f"{path} is there already and is not overwritten; choose another file") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from None
+    write_target(path, text)
 
 
 def read_backup(path: Path) -> ServoBackup:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Annotated, Literal, NamedTuple
@@ -11,10 +10,11 @@ from typing import IO, Annotated, Literal, NamedTuple
 import msgspec
 
 from dxlrun.errors import LogError
+from dxlrun.output.target import open_empty
 
 Direction = Literal["in", "out", "note"]
 
-_MODE = 0o640
+_MODE = 0o640  # Of a new file: it can be read by its user and group only
 _BUFFER = 1 << 16  # Bytes that are written out together
 
 FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
@@ -52,11 +52,6 @@ class _Line(msgspec.Struct, omit_defaults=True):
 _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 
 
-def for_group(path: str, flags: int) -> int:
-    """Open a file for `open`; a new one can be read by its user and group only."""
-    return os.open(path, flags, _MODE)
-
-
 class Ledger:
     """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
 
@@ -70,7 +65,7 @@ class Ledger:
         self._keep = keep
         self._file: IO[bytes] | None = None
         if path is not None:
-            self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
+            self._file = open(open_empty(path, _MODE), "wb", _BUFFER)  # noqa: SIM115  `close` closes it
         self._unflushed_ns: int | None = None
 
     def add(

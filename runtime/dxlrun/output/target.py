@@ -1,0 +1,141 @@
+"""Files and directories that a user names for writing.
+
+A target appears whole or not at all. It never takes the place of a directory, a pipe, a device, or a file
+that dxlrun did not write.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+
+from dxlrun.errors import InputError
+
+_FLAGS = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
+def unwritable(target: Path, reason: OSError | str) -> InputError:
+    """Return the error for a target that cannot be written."""
+    text = reason if isinstance(reason, str) else reason.strerror or str(reason)
+    return InputError(f"{target} cannot be written ({text}); choose another name")
+
+
+def make_folder_of(target: Path) -> None:
+    """Make the directory in which a target will be. Raises InputError where that fails."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise unwritable(target, f"{target.parent} is not a directory") from None
+    except OSError as error:
+        raise unwritable(target, error) from error
+
+
+def check_target(target: Path, replaces: str | None = None) -> None:
+    """Refuse a target that cannot be written, before the work for it begins.
+
+    An empty file may be replaced: nothing in it is lost.
+
+    Args:
+        target: The file or directory that the user named.
+        replaces: A text that every older file of this kind has; such a file is replaced. None: no file is.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    try:
+        status = target.stat()
+    except OSError as error:
+        if os.path.lexists(target):
+            raise unwritable(target, "it is a link that leads nowhere") from None
+        folder = target.parent
+        if not isinstance(error, FileNotFoundError):
+            raise unwritable(target, error) from None
+        if not folder.is_dir():
+            raise unwritable(target, f"there is no directory {folder}") from None
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise unwritable(target, f"the directory {folder} is read-only") from None
+        return
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+        raise unwritable(target, f"it exists and is {kind}")
+    if not os.access(target, os.W_OK):
+        raise unwritable(target, "it is read-only")
+    if status.st_size and not (replaces and _contains(target, replaces.encode())):
+        raise unwritable(target, "it exists" if replaces is None else "it exists, and is not from dxlrun")
+
+
+@contextmanager
+def new_target(target: Path, replaces: str | None = None) -> Iterator[Path]:
+    """Provide a path next to the target for a file or a directory, which is renamed to the target on success.
+
+    On failure, the file or directory is removed.
+
+    Args:
+        target: The file or directory that the user named.
+        replaces: As of `check_target`.
+
+    Raises:
+        InputError: The target cannot be written.
+    """
+    check_target(target, replaces)
+    place = target.resolve()  # a link to a file that is replaced stays a link
+    beside = place.with_name(f".{place.name}.{os.getpid()}")
+    try:
+        yield beside
+        check_target(target, replaces)  # the user may have made one in the meantime
+        if target.is_file():
+            shutil.copymode(place, beside)
+        beside.rename(place)
+    except OSError as error:
+        raise unwritable(target, error) from error
+    finally:
+        if beside.is_dir():
+            shutil.rmtree(beside, ignore_errors=True)
+        else:
+            beside.unlink(missing_ok=True)
+
+
+def write_target(target: Path, content: str | bytes, replaces: str | None = None) -> None:
+    """Write a file that the user named.
+
+    Args:
+        target: The file that the user named.
+        content: Its content; a text is written as UTF-8.
+        replaces: As of `check_target`.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    with new_target(target, replaces) as beside:
+        beside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def open_empty(path: str | Path, mode: int) -> int:
+    """Open a file that grows while it is read, such as a log; it must be new, or empty.
+
+    Args:
+        path: The file.
+        mode: Its permissions where it is created.
+
+    Returns:
+        A file descriptor for writing.
+
+    Raises:
+        OSError: It cannot be opened, has content, or is a pipe.
+    """
+    descriptor = os.open(path, _FLAGS, mode)
+    if os.fstat(descriptor).st_size:
+        os.close(descriptor)
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    return descriptor
+
+
+def _contains(path: Path, text: bytes) -> bool:
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return data.find(text) >= 0
