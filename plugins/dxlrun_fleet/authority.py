@@ -85,7 +85,7 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     root = issuer.public_bytes(Encoding.PEM)
     held = there.exists() and _is_named(there, name)
     if not held and (there.exists() or (kept.exists() and to == keys_place())):
-        raise InputError(f"{there} is not of {name}: give --to DIRECTORY for another computer's files")
+        raise InputError(f"{there} is not of {name}: give --output DIRECTORY for another computer's files")
     if (to / "ca.crt").exists() and (to / "ca.crt").read_bytes() != root:
         raise InputError(f"{to / 'ca.crt'} is of another authority: give another directory")
     key = ec.generate_private_key(ec.SECP256R1())

@@ -28,7 +28,7 @@ def keys(
     *,
     role: Literal["observe", "command", "admin"] | None = None,
     days: int | None = None,
-    to: Path | None = None,
+    output: Path | None = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
@@ -48,9 +48,9 @@ def keys(
         controllers, too.
     days
         How long the certificate is valid, 365 if left out.
-    to
-        Write it to this directory, to be copied to `~/.config/dxlrun/keys` of another computer; without, this
-        computer uses it.
+    output
+        Write the result to this directory, to be copied to `~/.config/dxlrun/keys` of another computer;
+        without it this computer uses it.
     """
     try:
         from dxlrun_fleet import authority
@@ -58,7 +58,7 @@ def keys(
         raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
     from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
 
-    _refuse_unused(action, {"--role": role, "--days": days, "--to": to, "a name": name})
+    _refuse_unused(action, {"--role": role, "--days": days, "--output": output, "a name": name})
     if action != "list":
         if name is None or not _NAME.fullmatch(name) or name in (CLIENT, "ca"):
             raise InputError(
@@ -68,7 +68,7 @@ def keys(
         if not 0 < days <= MOST_DAYS:
             raise InputError(f"--days {days} is no time from 1 to {MOST_DAYS}")
         known = {one.name: one for one in authority.issued()}
-        directory = keys_place() if to is None else to
+        directory = keys_place() if output is None else output
         if action in ("robot", "client"):
             if name in known:
                 raise InputError(
@@ -86,7 +86,7 @@ def keys(
             )
         else:
             one = authority.issue(name, chosen, days, directory)
-            where = "" if to is None else f"; copy it to ~/.config/dxlrun/keys of {name}'s computer"
+            where = "" if output is None else f"; copy it to ~/.config/dxlrun/keys of {name}'s computer"
             sentence = f"{directory} has the certificate of {name} ({one.role}, {days} days){where}"
         if not as_json:
             show(sentence)
@@ -116,7 +116,7 @@ def keys(
 _ACTIONS_WITH = {
     "--role": ("client",),
     "--days": ("robot", "client", "renew"),
-    "--to": ("robot", "client", "renew"),
+    "--output": ("robot", "client", "renew"),
     "a name": ("robot", "client", "renew", "revoke"),
 }
 

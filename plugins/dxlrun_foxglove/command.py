@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 PORT = 8765
 NICENESS = 10
 """As the gateway's: viewers get the processor time that the robot leaves."""
-LOOPBACK = "127.0.0.1"
 APP = "https://app.foxglove.dev"
 """The viewer on the web, the one page that may connect without `--origin`."""
 
@@ -34,8 +33,7 @@ def foxglove(
     *,
     robot: RobotName = None,
     control: Flag = False,
-    port: int | None = None,
-    listen: str = LOOPBACK,
+    listen: str = "127.0.0.1",
     cert: Path | None = None,
     key: Path | None = None,
     origin: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = (),
@@ -49,11 +47,10 @@ def foxglove(
     Parameters
     ----------
     control
-        Viewers may change parameters, switch controllers and torque, and halt the robot.
-    port
-        Listen on this port; without it on 8765, or if that is taken on a free one.
+        Let viewers steer the robot: change parameters, switch controllers and torque, and halt it.
     listen
-        Listen on this address. Another one than 127.0.0.1 needs `--cert` and `--key`.
+        Listen at HOST:PORT, HOST or :PORT. Another host than 127.0.0.1 needs `--cert` and `--key`; without a
+        port it is 8765, or if that is taken a free one.
     cert
         Certificate of this computer (PEM), for TLS.
     key
@@ -61,11 +58,12 @@ def foxglove(
     origin
         Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
     """
-    if port is not None and not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: a port is a number up to 65535")
+    from dxlrun.remote.network.listener import LOOPBACK, Place
+
+    place = Place.parse(listen)
     if cert is None and key is not None:
         raise InputError(f"--key {key}: add its certificate, --cert FILE")
-    if listen != LOOPBACK and cert is None:
+    if place.host != LOOPBACK and cert is None:
         raise InputError(
             f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
         )
@@ -74,12 +72,10 @@ def foxglove(
         from dxlrun_foxglove.server import FoxgloveServer
     except ImportError as error:
         raise InputError("Foxglove needs the extra of this name: pip install 'dxlrun[foxglove]'") from error
-    from dxlrun.remote.network.listener import listening
-
     with connect(robot, "dxlrun foxglove") as running:
         name = running.name
     served = FoxgloveServer(name, (APP, *origin), control=control)
-    tls, listener = tls_of(cert, key), listening(listen, port, PORT)
+    tls, listener = tls_of(cert, key), place.listener(PORT)
     with suppress(OSError):
         os.nice(NICENESS)
     asyncio.run(_serve(served, listener, tls))

@@ -39,7 +39,7 @@ def teleop(
     device
         Drive with this gamepad or keyboard, such as /dev/input/event5.
     speed
-        How fast, as a factor: 0.5 is half as fast.
+        Factor of the speed: 0.5 takes twice as long.
     """
     from dxlrun.output.terminal import show
     from dxlrun_teleop.bank import banks_of

@@ -43,7 +43,7 @@ def test_a_command_is_imported_alone():
         "dxlrun.cli.verbs",
         *("dxlrun.cli.tools", "dxlrun.cli.tools.tool_log"),
         *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
-        "dxlrun.output.escaping",
+        *("dxlrun.output.escaping", "dxlrun.output.target"),
         "dxlrun.output.unblocked",
         "dxlrun.errors",
     }

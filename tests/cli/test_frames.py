@@ -70,7 +70,18 @@ def test_the_tree_as_json_has_what_the_drawing_has(dxlrun: Dxlrun, pair: Path) -
 
 
 def test_a_pose_is_printed_and_as_json(dxlrun: Dxlrun, pair: Path) -> None:
-    words = ("frames", str(pair), "--of", "jaw", "--in", "base", "--at", "pan=90deg", "--at", "jaw=5 mm")
+    words = (
+        "frames",
+        str(pair),
+        "--of",
+        "jaw",
+        "--relative-to",
+        "base",
+        "--at",
+        "pan=90deg",
+        "--at",
+        "jaw=5 mm",
+    )
     printed = dxlrun(*words).out
     found = json.loads(dxlrun(*words, "--json").out)
 
@@ -90,7 +101,7 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--at", "pan=1rad"], "--at and --in are for one frame; name it by --of"),
+        (["--at", "pan=1rad"], "--at and --relative-to are for one frame; name it by --of"),
         (["--of", "jam"], "there is no frame jam; did you mean jaw?"),
         (["--of", "jaw", "--at", "pan"], "--at pan is no position; write a joint and its position, such as"),
         (["--of", "jaw", "--at", "pan=1"], "--at pan=1: '1' has no unit; write an angle with its unit"),

@@ -116,7 +116,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
     assert "talks at 2000000 bit/s; it did at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
     fast = ("--protocol", "2.0", "--baud", "2000000")
     assert "started anew, and holds no torque" in servo(9, "reboot", *fast).out
-    reset = servo(9, "factory-reset", "--keep", "id", "--yes", *fast)
+    reset = servo(9, "factory-reset", "--except", "id", "--yes", *fast)
     assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
     missing = servo(9, "get", *fast)
     assert missing.code == 1

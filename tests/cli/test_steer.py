@@ -149,6 +149,14 @@ def test_the_list_draws_the_controllers_with_those_that_are_inactive(dxlrun, tor
     assert re.search(r"│ left_arm +│", said.out)
 
 
+def test_list_draws_the_controllers_into_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
+    file = tmp_path / "torso.svg"
+    said = dxlrun("list", "--graph", str(file))
+    assert (said.code, said.out.splitlines()[1]) == (0, f"the controller graph is in {file}")
+    assert "whole_body_position" in file.read_text()
+    assert dxlrun("list", "--graph", "torso.png").code == 2
+
+
 def test_a_robot_that_has_ended_is_an_error(
     dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -103,7 +103,7 @@ def test_the_page_by_its_commands_roles_by_the_ledger_and_a_client_by_the_descri
     here = computers.at("lab3")
     computers.typed(command_of("dxlrun keys robot"))
     computers.typed(command_of("dxlrun keys client anna"))
-    computers.typed("dxlrun keys client olga --role observe --to olga")
+    computers.typed("dxlrun keys client olga --role observe --output olga")
     assert "anna" in computers.typed("dxlrun keys")
     for name in ("anna", "olga"):
         keys = computers.at(name) / "settings/dxlrun/keys"
@@ -268,12 +268,12 @@ def test_keys_write_over_nothing_that_is_anothers(computers):
         "robot arm --role admin",
         "revoke anna --days 3",
         "list anna",
-        "list --to elsewhere",
+        "list --output elsewhere",
     ):
         assert main(["keys", *line.split()]) == 2, line
-    assert main(["keys", "client", "bert", "--to", "bert"]) == 0
+    assert main(["keys", "client", "bert", "--output", "bert"]) == 0
     assert main(["keys", "renew", "bert"]) == 2
-    assert main(["keys", "renew", "bert", "--to", "bert"]) == 0
+    assert main(["keys", "renew", "bert", "--output", "bert"]) == 0
     assert main(["keys", "revoke", "bert"]) == 0
     assert len((keys / "revoked").read_text().split()) == 2
     rows = computers.capsys.readouterr() and json.loads(computers.typed("dxlrun keys --json"))
@@ -284,5 +284,5 @@ def test_keys_write_over_nothing_that_is_anothers(computers):
     ]
     assert {path: path.read_bytes() for path in kept} == kept
     computers.at("other")
-    assert main(["keys", "robot", "arm", "--to", str(computers.place / "lab3/bert")]) == 2
+    assert main(["keys", "robot", "arm", "--output", str(computers.place / "lab3/bert")]) == 2
     assert "is of another authority" in computers.capsys.readouterr().err

@@ -61,7 +61,7 @@ def test_a_log_is_served_until_ctrl_c(view: View, log: Path, tmp_path: Path, hos
     (tmp_path / "logs").mkdir()
     shutil.copy(log, tmp_path / "logs/bioloid_torso.mcap")
     (command,) = [one for one in COMMANDS if one.endswith(".mcap")]
-    process = view(*command.split()[1:], "--no-browser", "--port", "0", "--listen", host.strip("[]"))
+    process = view(*command.split()[1:], "--no-browser", "--listen", f"{host}:0")
     assert process.stdout is not None
     line = process.stdout.readline()
     address = re.search(rf"{re.escape(host)}:(\d+)/\?token=\S{{20}}", line)
@@ -95,7 +95,7 @@ def test_without_a_robot_it_says_how_one_starts(view: View, command: str) -> Non
         (("gone.yaml",), 2, "gone.yaml"),
         ((str(ROOT / "robots/bioloid_torso.yaml"),), 1, "start it in another terminal"),
         (("bad.mcap",), 2, "bad.mcap"),
-        (("--port", "99999999"), 2, "port"),
+        (("--listen", ":99999999"), 2, "HOST:PORT"),
         (("{log}", "--listen", "192.0.2.1"), 2, "another --listen"),
     ],
 )
@@ -110,5 +110,5 @@ def test_what_cannot_be_shown_is_refused(
 def test_a_port_that_is_taken_is_named(view: View, log: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        code, said = refused(view(str(log), "--no-browser", "--port", port))
-    assert (code, port in said, "--port" in said) == (2, True, True)
+        code, said = refused(view(str(log), "--no-browser", "--listen", f":{port}"))
+    assert (code, port in said, "--listen" in said) == (2, True, True)

@@ -49,9 +49,8 @@ def analyze(
         The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
         logs. Several logs get one line each. s3://BUCKET/LOG is read from a store, as a whole.
     report
-        Also write a page with all numbers and plots to this file, such as report.html. A zoom in one plot
-        is one in all; the page loads nothing from anywhere, and prints. Needs bokeh:
-        `pip install 'dxlrun[report]'`.
+        Write a report to this HTML file, with all numbers and plots. A zoom in one plot is one in all; the
+        page loads nothing from anywhere, and prints. Needs bokeh: `pip install 'dxlrun[report]'`.
     worst
         Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
         expected it.

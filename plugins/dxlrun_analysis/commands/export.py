@@ -43,7 +43,7 @@ def export(
         commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set in the
         layout of LeRobotDataset v3.0.
     topic
-        For csv: /events, /commands, /bus/NAME or a controller's topic instead of /cycle.
+        Topic for csv: /events, /commands, /bus/NAME or one of a controller, instead of /cycle.
     """
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")

@@ -33,7 +33,7 @@ def calibrate(
     Parameters
     ----------
     joint
-        Only these joints, or the joints of these groups.
+        Only this joint, or the joints of this group; may be given several times.
     """
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Dialogue

@@ -34,7 +34,7 @@ def setup(
     Parameters
     ----------
     joint
-        Only the servos of these joints, or of the joints of these groups.
+        Only this joint, or the joints of this group; may be given several times.
     find_port
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     """

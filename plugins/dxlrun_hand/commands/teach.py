@@ -19,7 +19,7 @@ def teach(
     motion: Annotated[Path, Parameter(name="motion")],
     /,
     *joints: Joints,
-    speed: str = "30 deg/s",
+    velocity: str = "30 deg/s",
     robot: RobotName = None,
     debug: DebugFlag = False,
 ) -> int:
@@ -36,8 +36,8 @@ def teach(
     joints
         Joints that become limp; the name of a group or controller means its joints. Without any: all that an
         active controller plays motions for.
-    speed
-        How fast joints go from one pose to the next.
+    velocity
+        Velocity of the joints on the way from one pose to the next.
     """
     from dxlrun.description.units import angular_velocity
     from dxlrun.output.target import check_target
@@ -48,10 +48,10 @@ def teach(
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
     check_target(motion)
     try:
-        way_speed = angular_velocity(speed)
+        way_speed = angular_velocity(velocity)
     except ValueError as error:
-        raise InputError(f"--speed: {error}") from None
+        raise InputError(f"--velocity: {error}") from None
     if way_speed <= 0:
-        raise InputError(f"--speed {speed}: write a speed above 0, such as 30 deg/s")
+        raise InputError(f"--velocity {velocity}: write a velocity above 0, such as 30 deg/s")
     with robot_of(Chosen(robot), "teach") as running:
         return taught(running, Dialogue("teach"), joints, motion, way_speed)

@@ -34,7 +34,7 @@ def bench_rate(
     Parameters
     ----------
     duration
-        How long each run lasts, s.
+        Run for this time, s, at each rate.
     """
     if not robot.is_file():
         raise InputError(f"there is no robot file {robot}; check the path")

@@ -35,7 +35,7 @@ def characterize(
     measure
         Only this; may be given several times. Without it: all five.
     tolerance
-        How far a joint may leave its path when commands lie apart.
+        Largest deviation of a joint from its path when commands lie apart.
     """
     from dxlrun.description.units import angle
     from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize

@@ -45,9 +45,9 @@ def identify(
     words
         A robot file with its arguments, or none: the robot that runs; and the joints.
     recorded
-        Take an earlier run instead of moving anything; without joints all of the log.
+        Use this log, of an earlier run, instead of moving anything; without joints all of the log.
     duration
-        How long each joint is moved.
+        Run for this time, s, with each joint.
     load_inertia
         Inertia of what the joint moves, kg m^2; what is left is the motor's own.
     load_gravity
@@ -56,7 +56,8 @@ def identify(
     voltage
         Voltage of the supply, V, instead of what the servo reports.
     output
-        Write the motor file of the joint, which its key `motor` in the robot file names.
+        Write the result to this file: the motor file of the joint, which its key `motor` in the robot file
+        names.
     """
     from dxlrun_lab.commands.on_robot import Chosen, run_on_robot
 

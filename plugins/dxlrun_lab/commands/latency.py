@@ -6,7 +6,16 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
+from dxlrun.cli.inputs import (
+    DebugFlag,
+    Flag,
+    JsonFlag,
+    RecordFlag,
+    StressFlag,
+    check_report,
+    terminated_as_interrupted,
+    write_report,
+)
 from dxlrun.errors import InputError
 from dxlrun.output.target import check_target, unwritable
 from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
@@ -26,12 +35,12 @@ def latency(
     priority: int = 31,
     compare: str | None = None,
     blocks: int = 5,
-    stress: Flag = False,
+    stress: StressFlag = False,
     polling: str = "auto",
     cores: str | None = None,
     idle_latency: Flag = False,
     log: Path | None = None,
-    no_record: Flag = False,
+    record: RecordFlag = True,
     report: Path | None = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
@@ -43,7 +52,7 @@ def latency(
     Parameters
     ----------
     count
-        Wake-ups of each condition, in all blocks together.
+        End after this number of wake-ups of each condition, in all blocks together.
     period
         Time between two deadlines, 10 us to 1 s.
     policy
@@ -57,7 +66,7 @@ def latency(
     blocks
         Into how many blocks the wake-ups of a condition are divided.
     stress
-        Load all cores, memory and disk meanwhile, as other programs would.
+        Load all cores, memory and disk, as other programs would.
     polling
         Longest time that the clock is polled before a deadline; auto: a tenth of the period.
     cores
@@ -65,11 +74,11 @@ def latency(
     idle_latency
         Keep the processor cores from deep idle states meanwhile.
     log
-        The log's file (.mcap), or the directory for it; without it the directory logs, as for runs.
-    no_record
-        Write no log.
+        Write a log to this new file (.mcap), or into this directory; without it into logs, as runs do.
+    record
+        Write a log; --no-record: none.
     report
-        Also write a page with all numbers and plots to this file, such as latency.html. Needs bokeh:
+        Write a report to this HTML file, with all numbers and plots. Needs bokeh:
         `pip install 'dxlrun[report]'`.
     """
     import os
@@ -89,9 +98,9 @@ def latency(
     settings.check(frozenset(os.sched_getaffinity(0)))
     if report is not None:
         check_report(report, "bokeh")
-    if log is not None and no_record:
+    if log is not None and not record:
         raise InputError("--log and --no-record contradict each other; give one of them")
-    return _measured(settings, stress, _log_place(log, no_record), report, as_json=as_json)
+    return _measured(settings, stress, _log_place(log, record), report, as_json=as_json)
 
 
 def _measured(
@@ -207,9 +216,9 @@ def _cores(text: str | None) -> tuple[int, ...]:
     return tuple(sorted({int(word) for word in words}))
 
 
-def _log_place(log: Path | None, no_record: bool) -> Path | None:
+def _log_place(log: Path | None, record: bool) -> Path | None:
     """Return where the log goes, a file or a directory; None: nowhere."""
-    if no_record:
+    if not record:
         return None
     if log is None:
         from dxlrun.description.robot import Recording

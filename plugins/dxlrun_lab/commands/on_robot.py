@@ -54,13 +54,13 @@ class OnRobot:
         Where a joint may move: JOINT=-30deg..30deg. Without it: 30 deg to each side of where it is, within
         its limits.
     robot
-        Name of the running robot, where several run and no robot file is given.
+        Name of the robot, where several run and no robot file is given.
     virtual
-        Simulated servos on virtual time, in a second; with a robot file.
+        Run on virtual time, with simulated servos: in a second; with a robot file.
     yes
         Do not ask before a real joint moves; the countdown stays.
     report
-        Write the result as one HTML page, with its plots.
+        Write a report to this HTML file, with all numbers and plots.
     """
 
     range: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()

@@ -35,19 +35,19 @@ class RecordedPart:
         The goals that were sent, or the states that were measured. Without it the goals of joints that were
         sent a path of positions, and the states of the others.
     from_
-        Begin so many seconds after the recording's beginning.
+        Begin so many seconds after the beginning of the recording.
     to
-        End so many seconds after the recording's beginning.
+        End so many seconds after the beginning of the recording.
     joint
-        Only this recorded joint; may be given several times.
+        Only this joint of the recording; may be given several times.
     map
         A recorded joint is another one now: RECORDED=JOINT; RECORDED= leaves it out. May be given several
         times.
     topic
         Topic of a foreign recording that has several.
     tolerance
-        How far the motion may be from the recording; what is smaller is taken for noise. Without it 0.1 deg
-        from goals, 0.5 deg from states.
+        Largest deviation from the recording; what is smaller is taken for noise. Without it 0.1 deg from
+        goals, 0.5 deg from states.
     """
 
     what: Literal["goals", "states"] | None = None
@@ -106,9 +106,9 @@ class PlayedOn:
     on
         Play the recorded motion on the robot of this robot file, instead of running controllers again.
     speed
-        How fast, as a factor: 0.5 takes twice as long.
+        Factor of the speed: 0.5 takes twice as long.
     virtual
-        On simulated servos on virtual time.
+        Run on virtual time, with simulated servos.
     yes
         Do not ask before a real joint moves; the countdown stays.
     """

@@ -72,9 +72,9 @@ def sweep(
         (evenly spaced in their logarithm), gains.p=1,2,5, 'limits.acceleration=5 rad/s^2..20 rad/s^2x4'. May
         be given several times: every combination is run.
     sort
-        The score by which runs are ordered, the lowest first.
+        Order of the rows: by this score, the lowest first.
     output
-        The Parquet file, or the directory for it; without it the directory sweeps.
+        Write the result to this file (.parquet), or into this directory; without it into sweeps.
     picture
         Also draw the score over one or two parameters, as a map: an .svg, .png or .pdf file.
     workers

@@ -10,8 +10,8 @@ from cyclopts import App
 from dxlrun.cli.inputs import (
     Assignment,
     DebugFlag,
-    Flag,
     JsonFlag,
+    StressFlag,
     check_report,
     compiled,
     examples_directory,
@@ -41,7 +41,7 @@ def tracking(
     *assignments: Assignment,
     play: Path | None = None,
     setups: str = _NAMES,
-    no_stress: Flag = False,
+    stress: StressFlag = True,
     report: Path | None = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
@@ -56,14 +56,14 @@ def tracking(
     robot
         The robot file; without it single_joint.yaml of `dxlrun examples`.
     play
-        The motion file, of one joint; without it the thesis' motion for single_joint.yaml, 30 s.
+        Play this motion file, of one joint; without it the thesis' motion for single_joint.yaml, 30 s.
     setups
         Only these, with commas between them.
-    no_stress
-        Do not load the machine.
+    stress
+        Load all cores, memory and disk, as other programs would; --no-stress: load nothing.
     report
-        Also write a page with the table and a figure for each set-up to this file, such as tracking.html.
-        Needs matplotlib: `pip install 'dxlrun[report]'`.
+        Write a report to this HTML file, with all numbers and plots. Needs matplotlib:
+        `pip install 'dxlrun[report]'`.
     """
     words = list(assignments)
     if robot is not None and ":=" in robot:
@@ -91,7 +91,7 @@ def tracking(
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()
     with terminated_as_interrupted():
-        result = run_experiment(prepared.plan, desired, found, Stress(wanted=not no_stress), console)
+        result = run_experiment(prepared.plan, desired, found, Stress(wanted=stress), console)
     _show(result, report, as_json=as_json)
     return result.exit_code
 

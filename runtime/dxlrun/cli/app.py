@@ -249,6 +249,11 @@ def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequ
         if option == name or option in options:
             words.append(f"{option}{sign}{value}")
             continue
+        if verbs.new_words(verb, option, ""):
+            if not sign and rest and rest[0][:1] != "-":
+                value = rest.pop(0)
+            words += verbs.new_words(verb, option, value)
+            continue
         ours = next((f"--{our}" for our, theirs in _OPTION_WORDS.items() if name in theirs.split()), "")
         if not sign and rest and rest[0][:1] != "-" and ours != "--virtual":
             value = rest.pop(0)
@@ -290,7 +295,9 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
         long = [name for name in names if names[name].startswith("--")]
         letter = option.lstrip("-") if len(option.lstrip("-")) == 1 else ""
         short = [name for name in long if letter and name.startswith(letter)]
-        if meant := near(option.lstrip("-"), long) or short:
+        if new := verbs.new_words(error.command_chain or (), option, ""):
+            what = f"{option} is {new[0]} now"
+        elif meant := near(option.lstrip("-"), long) or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
     if line := _right_form(error, tokens):
         fix = f"write `{line}`"

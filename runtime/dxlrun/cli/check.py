@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from dxlrun.cli.inputs import (
     Assignment,
     DebugFlag,
     Flag,
+    GraphFile,
     JsonFlag,
     Motions,
     RobotPath,
@@ -33,9 +32,6 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.inspection import DeviationRow, Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
 
-_OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
-"""An option with a value or without one."""
-
 
 def check(
     robot: RobotPath,
@@ -44,7 +40,7 @@ def check(
     play: Motions = (),
     duration: Seconds | None = None,
     online: Flag = False,
-    graph: Annotated[tuple[Path, ...] | None, _OPTIONAL] = None,
+    graph: GraphFile = None,
     log: Path | None = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
@@ -57,15 +53,15 @@ def check(
     Parameters
     ----------
     play
-        Check this motion file too; may be given several times.
+        Play this motion file, as far as it is checked; may be given several times.
     duration
-        As for a run: stop after this time, s.
+        Run for this time, s, or with its unit: 500ms, 2min.
     online
         Read the servos too, and compare their registers with those of the file; nothing is written.
     graph
-        Draw the controllers, what they read and what they command: here, or into a file, .svg or .dot.
+        Draw a graph here, or into a file, .svg or .dot: the controllers, what they read and command.
     log
-        Write every packet of --online into this new file, a log.
+        Write a log to this new file, with every packet of --online.
     """
     if log is not None and not online:
         raise InputError("--log keeps what --online sends and receives; give --online too")

@@ -195,7 +195,7 @@ def schema(
     kind
         Which files: robot, motion, motor, or fragment (what a robot file includes).
     output
-        Write it into this file instead.
+        Write the result to this file.
     """
     text = schema_text(kind)
     if output is None:

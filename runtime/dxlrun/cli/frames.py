@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, DebugFlag, JsonFlag, RobotPath, compiled
+from dxlrun.cli.inputs import Assignment, DebugFlag, GraphFile, JsonFlag, RobotPath, compiled
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
 
@@ -30,9 +30,9 @@ def frames(
     /,
     *assignments: Assignment,
     of: str | None = None,
-    relative_to: Annotated[str, Parameter(name="--in")] = "",
+    relative_to: str = "",
     at: _Positions = (),
-    graph: Path | None = None,
+    graph: GraphFile = None,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
@@ -45,28 +45,30 @@ def frames(
     of
         Print where this frame lies, instead of the tree.
     relative_to
-        In this frame; without it in the root of the tree.
+        The frame in which it lies; without it the root of the tree.
     at
         Position of a joint, for example elbow=30deg or jaw=5mm; may be given several times. The others rest.
     graph
-        Draw the tree into a file, .svg or .dot.
+        Draw a graph here, or into a file, .svg or .dot: the tree, which is drawn without it, too.
     """
     if of is None and (at or relative_to):
-        raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")
-    if graph is not None:
+        raise InputError(
+            "--at and --relative-to are for one frame; name it by --of, without it the tree is drawn"
+        )
+    for file in graph or ():
         from dxlrun.output.graph_picture import check_picture  # not above: most draw nothing
 
-        check_picture(graph)
+        check_picture(file)
     result = compiled(robot, assignments, (), None)
     tree = _tree(result.plan, robot)
     if of is None:
         _show_tree(result.plan, tree, as_json=as_json)
     else:
         _show_pose(tree, of, relative_to, at, as_json=as_json)
-    if graph is not None:
-        _draw(result.plan, tree, graph)
+    for file in graph or ():
+        _draw(result.plan, tree, file)
         if not as_json:
-            show(f"the tree is in {graph}")
+            show(f"the tree is in {file}")
     for warning in result.warnings:
         if not as_json and "URDF" in warning.what:
             print_warning(str(warning))

@@ -29,6 +29,25 @@ JsonFlag = Annotated[JsonOfItsOwn, Parameter(help="Print the result as JSON.")]
 """`--json`; `JsonOfItsOwn` where the docstring of a verb tells more of it."""
 DebugFlag = Annotated[Flag, Parameter(help="Print the traceback of an error.")]
 """`--debug`."""
+
+
+def _switch(name: str) -> Parameter:
+    """Return an option with both forms, `--wait` and `--no-wait`; the help shows which is the default."""
+    return Parameter(
+        name=f"--{name}",
+        negative=f"--no-{name}",
+        show_default=lambda on: f"--{name}" if on else f"--no-{name}",
+    )
+
+
+WaitFlag = Annotated[bool, _switch("wait")]
+RecordFlag = Annotated[bool, _switch("record")]
+StressFlag = Annotated[bool, _switch("stress")]
+GatewayFlag = Annotated[bool, _switch("gateway")]
+GraphFile = Annotated[
+    tuple[Path, ...] | None, Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
+]
+"""`--graph`, with a file or without one."""
 RobotPath = Annotated[Path, Parameter(help="The robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, where several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 from dxlrun.cli.inputs import (
     Assignment,
     Flag,
+    GatewayFlag,
     Motions,
+    RecordFlag,
     Seconds,
     compiled,
     read_models,
@@ -39,11 +41,11 @@ def run(
     *assignments: Assignment,
     duration: Seconds | None = None,
     play: Motions = (),
-    no_record: Flag = False,
+    record: RecordFlag = True,
     take_over: Flag = False,
     virtual: Flag = False,
     ledger: Path | None = None,
-    no_gateway: Flag = False,
+    gateway: GatewayFlag = True,
     listen: str | None = None,
     verbose: Flag = False,
     debug: Flag = False,
@@ -55,24 +57,23 @@ def run(
     robot
         The robot file, for example robots/bioloid_torso.yaml.
     duration
-        Stop after this time, s; or with its unit: 500ms, 2min.
+        Run for this time, s, or with its unit: 500ms, 2min.
     play
         Play this motion file; may be given several times.
-    no_record
-        Write no log.
+    record
+        Write a log; --no-record: none.
     take_over
         Start although a servo has its torque on already.
     virtual
         Run on virtual time, as fast as the processor can; only with simulated buses, and with --duration or
         --play.
     ledger
-        Write what the simulated buses saw to this file; without it a run writes it beside its log, one on
-        virtual time not at all.
-    no_gateway
-        Run without a gateway: the run cannot be steered.
+        Write what the simulated buses saw to this file: every byte with its time, and every fault.
+    gateway
+        Take commands while it runs; --no-gateway: the run cannot be steered.
     listen
-        Serve clients of other computers, too, at [NAME@]HOST:PORT, by mutual TLS with certificates of `dxlrun
-        keys`; NAME is that of the robot's certificate, by default the robot's.
+        Listen at [NAME@]HOST:PORT for clients of other computers, too, by mutual TLS with certificates of
+        `dxlrun keys`; NAME is that of the robot's certificate, by default the robot's.
     verbose
         Print all that the operating system granted for real time, not only what it refused.
     debug
@@ -95,16 +96,16 @@ def run(
             )
         check_target(ledger)
     if listen is not None:
-        _check_listen(listen, result.plan, served=not (no_gateway or virtual))
+        _check_listen(listen, result.plan, served=gateway and not virtual)
     from dxlrun.run.run_summary import RunOptions
 
     options = RunOptions(
-        record=not no_record,
+        record=record,
         take_over=take_over,
         debug=debug,
         verbose=verbose,
         ledger=ledger,
-        gateway=not no_gateway,
+        gateway=gateway,
         listen=listen or "",
     )
     console = out()

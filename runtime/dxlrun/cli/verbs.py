@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
@@ -103,6 +103,23 @@ _OTHER_WORDS = {
 def verb_for(word: str) -> str | None:
     """Return the verb, or the beginning of a command line, that a word of other programs means."""
     return next((verb for verb, words in _OTHER_WORDS.items() if word in words.split()), None)
+
+
+RENAMED: Mapping[str, Mapping[str, str]] = {
+    "foxglove": {"--port": "--listen :VALUE"},
+    "frames": {"--in": "--relative-to VALUE"},
+    "keys": {"--to": "--output VALUE"},
+    "servo": {"--keep": "--except VALUE"},
+    "teach": {"--speed": "--velocity VALUE"},
+    "view": {"--port": "--listen :VALUE"},
+}
+"""By verb and option of an earlier version: the words that mean the same now."""
+
+
+def new_words(verb: Sequence[str], option: str, value: str) -> list[str]:
+    """Return the words that replace a renamed option and its value; empty: it was not renamed."""
+    words = RENAMED.get(" ".join(verb), {}).get(option, "").split()
+    return [word.replace("VALUE", value or "VALUE") for word in words]
 
 
 def is_verb(word: str) -> bool:

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 def view(
     what: Annotated[str | None, Parameter(name="robot")] = None,
+    /,
     *,
     control: Annotated[bool, Parameter(negative="")] = False,
     browser: bool = True,
-    port: int | None = None,
     listen: str = "127.0.0.1",
 ) -> int:
     """Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers.
@@ -39,26 +39,25 @@ def view(
         Name of a running robot, its robot file, or a log (.mcap, or a directory of parts). Without one: the
         only robot that runs.
     control
-        The page may steer: a slider for each joint, and buttons. STOP is there always.
+        Let viewers steer the robot: a slider for each joint, and buttons. STOP is there always.
     browser
         Open the page in a browser.
-    port
-        Serve the page on this port; without it on 8765, or if that is taken on a free one.
     listen
-        Serve it on this address. On another one than 127.0.0.1 the page is open to every machine of the
-        network that is given its address with the token.
+        Listen at HOST:PORT, HOST or :PORT. On another host than 127.0.0.1 the page is open to every machine
+        of the network that is given its address with the token; without a port it is 8765, or if that is
+        taken a free one.
     """
-    if port is not None and not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: a port is a number up to 65535")
+    from dxlrun.remote.network.listener import LOOPBACK, Place, in_url
+
+    place = Place.parse(listen)
     leave_real_time()
-    from dxlrun.remote.network.listener import in_url, listening
     from dxlrun_view.server import ANY, PORT, Page, hosts_of, server_of
 
     source = _source(what)
     try:
-        with listening(listen, port, PORT) as listener:
+        with place.listener(PORT) as listener:
             address, taken = listener.getsockname()[:2]
-            page = Page(source, listener, hosts=hosts_of(listen, taken), control=control)
+            page = Page(source, listener, hosts=hosts_of(place.host, taken), control=control)
             host = in_url("127.0.0.1" if address == ANY else address)
             url = f"http://{host}:{taken}/?token={page.token}"
             server = server_of(page)
@@ -68,8 +67,8 @@ def view(
 
             signal.signal(signal.SIGINT, end)
             signal.signal(signal.SIGTERM, end)
-            if listen != "127.0.0.1":
-                print_warning(f"{listen}: every machine that is given this address can open the page")
+            if place.host != LOOPBACK:
+                print_warning(f"{place.host}: every machine that is given this address can open the page")
             show(f"{source.shown().info.robot}: {url}", "Ctrl-C ends the page, not the robot.")
             sys.stdout.flush()
             if browser:

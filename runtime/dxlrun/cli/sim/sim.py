@@ -77,11 +77,11 @@ def sim(
         Servos on one bus without a robot file, MODEL:IDS, for example XL430-W250:1-3 or AX-12A:1,4; may be
         given several times.
     baud
-        Baud rate of that bus, bit/s; without it the one that the servos are shipped with.
+        Baud rate, bit/s, of that bus; without it the one that the servos are shipped with.
     protocol
-        Protocol of that bus, 1.0 or 2.0; needed only by models that exist with both.
+        Protocol, 1.0 or 2.0, of that bus; needed only by models that exist with both.
     recorded
-        Answer a host as the servos of this log answered theirs, instead of simulating any.
+        Use this log: answer a host as its servos answered theirs, instead of simulating any.
     link
         A symbolic link to the pseudo-terminal, which gets another name at each start; with several buses
         LINK.NAME for each bus.
@@ -92,7 +92,7 @@ def sim(
     seed
         What is random in faults and adapter is drawn from this number (0 without it).
     ledger
-        Write every byte on the buses with its time, and every fault, into this file.
+        Write what the simulated buses saw to this file: every byte with its time, and every fault.
     latency_timer
         The adapter keeps replies back for so long, for example "4 ms", as FTDI adapters do.
     split
@@ -103,7 +103,7 @@ def sim(
         What the servos after one that is missing do in a sync or bulk read: answer never (silent), or later
         (slot).
     as_json
-        Print the ports as JSON, then a line of JSON for each fault.
+        Print the result as JSON: the ports, then a line for each fault.
     debug
         Print the traceback of an error, and the output of the servos' process.
     """

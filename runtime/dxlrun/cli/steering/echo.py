@@ -37,7 +37,7 @@ def echo(
     topic
         Name of the topic; the first / may be left out.
     count
-        End after so many messages.
+        End after this number of messages.
     rate
         Print at most so many messages a second, the newest each time, Hz.
     """

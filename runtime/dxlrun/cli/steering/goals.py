@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from msgspec import to_builtins
 
-from dxlrun.cli.inputs import Flag
+from dxlrun.cli.inputs import WaitFlag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
 from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
@@ -36,7 +36,7 @@ def send(
     *words: Words,
     file: Path | None = None,
     in_: Annotated[str | None, Parameter(name="--in")] = None,
-    wait: Flag = False,
+    wait: WaitFlag = False,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
     """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
@@ -58,7 +58,8 @@ def send(
     in_
         Time for joints by name to get there, such as 2s; of controllers that take trajectories.
     wait
-        Show the progress of a goal, and return with its result. Ctrl-C cancels it.
+        Return when the goal has ended, with its result, and show its progress; Ctrl-C cancels it. --no-wait:
+        as soon as the controller has accepted it.
     """
     from dxlrun.channels.answers import Code
     from dxlrun.cli.steering.written import Written
@@ -93,7 +94,7 @@ def send(
         return follow(robot, chosen, done, [done.goal.number])
 
 
-def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_ONE) -> int:
     """Cancel goals of a running robot: their controllers bring the joints to rest.
 
     Parameters
@@ -101,7 +102,7 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
     goal
         Number of a goal, or the name of a controller; without it all goals that run.
     wait
-        Return when the joints are at rest.
+        Return when the joints are at rest; --no-wait: as soon as the loop has accepted it.
     """
     from dxlrun.channels.answers import Code
 

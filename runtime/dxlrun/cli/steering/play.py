@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag
+from dxlrun.cli.inputs import Flag, WaitFlag
 from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, follow
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
 from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
@@ -51,7 +51,7 @@ def play(
     speed: float = 1.0,
     loop: int = 1,
     listed: Annotated[Flag, Parameter(name="--list")] = False,
-    no_wait: Flag = False,
+    wait: WaitFlag = True,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
     """Play motions on a running robot: `dxlrun play wave bow`.
@@ -65,15 +65,15 @@ def play(
         A motion file, or the name of one beside the robot file or in motions beside it, or of a motion that a
         keyframe_player has; its controllers must be active.
     speed
-        How fast, as a factor: 0.5 takes twice as long.
+        Factor of the speed: 0.5 takes twice as long.
     loop
         How often all of them are played.
     listed
         List the motions that the robot has by name, with their joints and lengths.
-    no_wait
-        Return when the motion has begun.
+    wait
+        Return when all are played; --no-wait: when the motion has begun.
     """
-    _check(motions, loop, listed=listed, no_wait=no_wait)
+    _check(motions, loop, listed=listed, wait=wait)
     with robot_of(chosen, "play") as robot:
         if listed:
             _list(robot, chosen)
@@ -83,19 +83,19 @@ def play(
             _check_forms(robot, [each.path for each in found if not each.player])
         for _ in range(loop):
             for each in found:
-                if code := _play(robot, each, speed, chosen, no_wait=no_wait):
+                if code := _play(robot, each, speed, chosen, wait=wait):
                     return code
     return 0
 
 
-def _check(motions: Sequence[str], loop: int, *, listed: bool, no_wait: bool) -> None:
+def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> None:
     if listed and motions:
         raise InputError(f"--list shows what there is to play; leave {' '.join(motions)} out")
     if not (listed or motions):
         raise InputError("name a motion; `dxlrun play --list` shows those of the robot")
     if not 1 <= loop <= MOST_LOOPS:
         raise InputError(f"--loop {loop}: give how often all is played, from 1 to {MOST_LOOPS}")
-    if no_wait and loop * len(motions) > 1:
+    if not wait and loop * len(motions) > 1:
         raise InputError("--no-wait returns when one motion has begun; leave it out to play several")
     for motion in motions:
         path = Path(motion)
@@ -103,11 +103,11 @@ def _check(motions: Sequence[str], loop: int, *, listed: bool, no_wait: bool) ->
             raise InputError(f"there is no motion file {motion}; check the path")
 
 
-def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, no_wait: bool) -> int:
+def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wait: bool) -> int:
     """Play one motion until its end, and return the exit code."""
     motion, path, player = found
     try:
-        with begun_or_cancelled(robot, "play", waited=not no_wait):
+        with begun_or_cancelled(robot, "play", waited=wait):
             if player:
                 done = robot.send(player, PLAY, {"motion": motion, "speed": speed})
             else:
@@ -115,7 +115,7 @@ def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, no_
     except Refused as refused:
         raise _located(refused, path) from None
     numbers = [goal.number for goal in done.goals]
-    if no_wait:
+    if not wait:
         shown = ", ".join(map(str, numbers))
         goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
         return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, Flag, Hertz, JsonFlag
+from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
@@ -51,16 +51,17 @@ ONLY_ONE = Chosen()
 
 
 def list_robots(
-    *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: DebugFlag = False
+    *, robot: str | None = None, graph: GraphFile = None, as_json: JsonFlag = False, debug: DebugFlag = False
 ) -> int:
     """List the robots that run: their controllers, devices and sensors, and the commands these take.
 
     Parameters
     ----------
     robot
-        Only the robot of this name.
+        Name of the robot, where several run; only this one is listed.
     graph
-        Draw the controllers, what they read and what they command, with those that are active now.
+        Draw a graph here, or into a file, .svg or .dot: the controllers, what they read and command, with
+        those that are active now. A file takes one robot.
     """
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
@@ -71,6 +72,8 @@ def list_robots(
     unsteered = {run.name: run for run in unsteered_runs() if run.is_ours}
     names = dict.fromkeys((*here, *known_robots(), *unsteered))
     _require_known(robot, names)
+    if graph:
+        _check_graph(graph, [*here] if robot is None else [robot])
     found, code = [], 0
     for name in names if robot is None else (robot,):
         if name in unsteered:
@@ -83,16 +86,37 @@ def list_robots(
         except DxlrunError as error:  # it may have ended meanwhile; the others are listed
             print_error(f"dxlrun: {error}")
             code |= robot is not None or name in here
+    for file in graph or ():
+        for info in found:
+            _write_graph(info, file)
     if as_json:
         show_json(found)
         return code
     for info in found:
-        show(
-            headline(info), *([drawing(info)] if graph else [controllers(info), sources(info), groups(info)])
-        )
+        if graph is None:
+            show(headline(info), controllers(info), sources(info), groups(info))
+        elif graph:
+            show(headline(info), *(f"the controller graph is in {file}" for file in graph))
+        else:
+            show(headline(info), drawing(info))
     if not found and not code and not unsteered:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
+
+
+def _check_graph(files: Sequence[Path], names: Sequence[str]) -> None:
+    """Raise InputError for files that hold no graph, or more robots than one file holds."""
+    from dxlrun.output.graph_picture import check_picture  # not above: most lists draw nothing
+
+    for file in files:
+        check_picture(file)
+    _require_one(names)
+
+
+def _write_graph(info: Row, file: Path) -> None:
+    from dxlrun.output.graph_picture import write_picture  # as above
+
+    write_picture(drawing(info), file)
 
 
 def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
@@ -201,26 +225,26 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
 
 
-def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
     """End a running robot in order, by its policy on_exit.
 
     Parameters
     ----------
-    no_wait
-        Return as soon as the loop has accepted it.
+    wait
+        Return when it has ended; --no-wait: as soon as the loop has accepted it.
     """
     from dxlrun.run.unsteered import end_run
 
     if (run := unsteered_of(chosen)) is not None:
-        sentence = end_run(run, wait=not no_wait)
+        sentence = end_run(run, wait=wait)
         if chosen.as_json:
             show_json({"robot": run.name, "ended": sentence})
         else:
             show(sentence)
         return 0
     with robot_of(chosen, "stop") as robot:
-        robot.stop(wait=not no_wait)
-        return report_done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
+        robot.stop(wait=wait)
+        return report_done(robot, chosen, None, f"{robot.name} {'has ended' if wait else 'is ending'}")
 
 
 def unsteered_of(chosen: Chosen) -> UnsteeredRun | None:

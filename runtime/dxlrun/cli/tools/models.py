@@ -46,7 +46,7 @@ def models(
     name
         A model, for example AX-12A; without it all are listed.
     protocol
-        Only those of this protocol, 1.0 or 2.0.
+        Protocol, 1.0 or 2.0; only its models.
     """
     from dxlrun.control.controllers.plugins import load_plugins
 

@@ -59,15 +59,15 @@ def scan(
     port
         The adapter, for example /dev/ttyUSB0; `dxlrun doctor` lists those that are plugged in.
     protocol
-        Only this protocol, 1.0 or 2.0.
+        Protocol, 1.0 or 2.0; only this one.
     baud
-        Only this rate, bit/s; may be given several times.
+        Baud rate, bit/s; only this one. May be given several times.
     ids
         Only these IDs, for example 1-20 or 1,4,7.
     output
-        Write a robot file for the servos that were found, to be completed by hand.
+        Write the result to this file: a robot file for the servos that were found, to be completed by hand.
     log
-        Write every packet into this new file, a log.
+        Write a log to this new file, with every packet.
     """
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort

@@ -51,7 +51,7 @@ def servo(
     *words: Annotated[str, Parameter(name="WORD", allow_leading_hyphen=False)],
     protocol: float | None = None,
     baud: int | None = None,
-    keep: Keep | None = None,
+    keep: Annotated[Keep | None, Parameter(name="--except")] = None,
     yes: Flag = False,
     log: Path | None = None,
     as_json: JsonFlag = False,
@@ -75,15 +75,16 @@ def servo(
     words
         What the verb needs.
     protocol
-        Protocol of the servo, 1.0 or 2.0; without it both are tried.
+        Protocol, 1.0 or 2.0; without it both are tried.
     baud
-        Its rate, bit/s; without it all are tried.
+        Baud rate, bit/s; without it all are tried.
     keep
-        What a factory reset keeps; without it ID and baud rate (Protocol 2.0), or nothing (Protocol 1.0).
+        What a factory reset does not change; without it ID and baud rate (Protocol 2.0), or nothing (Protocol
+        1.0).
     yes
         Do not ask before the EEPROM is changed.
     log
-        Write every packet into this new file, a log.
+        Write a log to this new file, with every packet.
     """
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -123,7 +124,7 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
         given = " ".join(asked.words) or "nothing"
         raise InputError(f"{verb} takes {found.usage or 'no words'}, not {given}")
     if asked.keep is not None and verb != "factory-reset":
-        raise InputError(f"--keep belongs to factory-reset, not to {verb}; leave it out")
+        raise InputError(f"--except belongs to factory-reset, not to {verb}; leave it out")
     found.check(asked)
 
 
@@ -379,7 +380,7 @@ def _factory_reset(one: OneServo, asked: Asked) -> None:
 
     old = one.table.protocol == 1.0
     if old and asked.keep not in (None, "nothing"):
-        raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --keep nothing")
+        raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --except nothing")
     keep = asked.keep or ("nothing" if old else "id-and-baud")
     kept = {
         "nothing": "ID and baud rate too",
@@ -483,7 +484,7 @@ VERBS: Mapping[str, Verb] = MappingProxyType(
         "id": Verb("NEW", 1, 1, _id, _whole("ID", 0, 253)),
         "baud": Verb("RATE", 1, 1, _baud, _whole("baud rate", 9_600, 10_500_000)),
         "reboot": Verb("", 0, 0, _reboot),
-        "factory-reset": Verb("[--keep nothing|id|id-and-baud]", 0, 0, _factory_reset),
+        "factory-reset": Verb("[--except nothing|id|id-and-baud]", 0, 0, _factory_reset),
         "backup": Verb("[FILE]", 0, 1, _backup, _new_file),
         "restore": Verb("[FILE]", 0, 1, _restore, _old_file),
         "blink": Verb("[TIMES]", 0, 1, _blink, _whole("number of times", 1, 1000)),

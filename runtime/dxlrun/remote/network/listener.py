@@ -8,16 +8,19 @@ from __future__ import annotations
 import asyncio
 import errno
 import gc
+import re
 import socket
 import ssl
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from typing import NamedTuple
 
 from dxlrun.errors import InputError
 from dxlrun.remote.network.certificates import server_context
 from dxlrun.remote.sockets import Address
 
+LOOPBACK = "127.0.0.1"
 MOST_UNPROVED = 64
 """Connections at once; one more ends the oldest of the computer that has most."""
 HANDSHAKE_S = 5.0
@@ -79,16 +82,29 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def listening(host: str, port: int | None, usual: int) -> Listener:
-    """Return a listening socket; without a port on the usual one, or if that is taken on any.
+class Place(NamedTuple):
+    """Host and port of `--listen`."""
 
-    For verbs with the options --port and --listen: raises InputError, with the one that helps.
-    """
-    try:
-        return Listener(host, usual if port is None else port)
-    except OSError as error:
-        if port is None and error.errno == errno.EADDRINUSE:
-            return listening(host, 0, usual)
-        other = "--port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "--listen"
-        why = f"{host}:{usual if port is None else port} cannot be listened on: {error.strerror or error}"
-        raise InputError(f"{why}; give another {other}") from error
+    host: str = LOOPBACK
+    port: int | None = None
+    """None: the usual one of the command, or if that is taken a free one."""
+
+    @classmethod
+    def parse(cls, text: str) -> Place:
+        """Return the place that `HOST:PORT`, `HOST` or `:PORT` means. Raises InputError."""
+        found = re.fullmatch(r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([0-9a-fA-F:]+)", text)
+        if not text or not found or int(found[2] or 0) > 65535:
+            raise InputError(f"--listen {text}: write HOST:PORT, HOST or :PORT, such as :9000, up to :65535")
+        host = (found[3] or found[1]).strip("[]")
+        return cls(host or LOOPBACK, int(found[2]) if found[2] else None)
+
+    def listener(self, usual: int) -> Listener:
+        """Return a socket that listens here; without a port on the usual one. Raises InputError."""
+        port = usual if self.port is None else self.port
+        try:
+            return Listener(self.host, port)
+        except OSError as error:
+            if self.port is None and error.errno == errno.EADDRINUSE:
+                return Place(self.host, 0).listener(usual)
+            why = f"{in_url(self.host)}:{port} cannot be listened on: {error.strerror or error}"
+            raise InputError(f"{why}; give another --listen HOST:PORT") from error
