@@ -89,6 +89,7 @@ class Report(msgspec.Struct, frozen=True):
     gaps: int  # Records that the recorder did not get
     complete: bool
     damage: tuple[str, ...]
+    being_written: bool = False  # By a run that goes on: the report is about the run so far
 
 
 def analyze_log(path: str | Path) -> Report:
@@ -136,6 +137,7 @@ def analyze(
         gaps=totals.gaps,
         complete=about.complete,
         damage=about.damage,
+        being_written=about.being_written,
     )
 
 
@@ -234,7 +236,8 @@ def _loop(report: Report) -> Table:
             ("  later than 1 ms", f"{late.share_over_1_ms:.3%}"),
             ("  later than one period", f"{late.share_over_period:.3%}"),
         ]
-    rows += [("records lost", report.gaps), ("log complete", "yes" if report.complete else "no")]
+    unfinished = "no, a run is writing it" if report.being_written else "no"
+    rows += [("records lost", report.gaps), ("log complete", "yes" if report.complete else unfinished)]
     title = f"{report.robot}, {periods.rates}, {periods.seconds:.1f} s"
     return Table.of(title, [Column("loop", "name"), Column("")], rows)
 

@@ -9,9 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.held_logs import being_written
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 """Of one joint, because a page has a figure for each."""
+FOOTER_BYTES = 37  # mcap.dev/spec: a record of 20 bytes, and the magic at the end of the file
 
 
 @pytest.fixture
@@ -90,6 +92,32 @@ def test_without_an_argument_the_newest_log_of_the_directory_is_analyzed(dxlrun:
     assert said.code == 0
     assert said.out.splitlines()[0] == f"log: {newest.relative_to(Path.cwd())}"
     assert json.loads(dxlrun("analyze", "--json").out)["log"] == str(newest.relative_to(Path.cwd()))
+
+
+def test_without_an_argument_a_log_that_is_being_written_is_not_analyzed(dxlrun: Callable, log: Path):
+    newest, older = two_logs(log)
+    with being_written(newest):
+        assert dxlrun("analyze").out.splitlines()[0] == f"log: {older.relative_to(Path.cwd())}"
+        older.unlink()
+        said = dxlrun("analyze")
+    assert said.code == 2
+    assert said.errors == [
+        f"dxlrun: {newest.relative_to(Path.cwd())} is being written; end the run, or give this path to "
+        "analyze it so far"
+    ]
+
+
+def test_a_log_that_is_being_written_is_called_so(dxlrun: Callable, log: Path):
+    os.truncate(log, log.stat().st_size - FOOTER_BYTES)
+    with being_written(log):
+        said = dxlrun("analyze", log)
+        report = json.loads(dxlrun("analyze", log, "--json").out)
+        assert ": being written; so far: " in dxlrun("analyze", log, log).out
+    assert (said.code, report["being_written"], report["complete"]) == (1, True, False)
+    assert "has no end yet: a run is writing it; its last cycle is at " in said.out
+    assert "no, a run is writing it" in said.out
+    ended = dxlrun("analyze", log)
+    assert "its recorder was killed, or could write no more; its last cycle is at " in ended.out
 
 
 def test_without_a_log_in_the_directory_one_sentence_names_the_directory(

@@ -210,10 +210,16 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
     while len(read_log(recording.path).cycles) < 20:  # until a flush, which needs no help from here
         assert recording.process.poll() is None
+    assert read_log(recording.path).being_written
     recording.process.send_signal(signal.SIGKILL)
     recording.process.wait()
     log = read_log(recording.path)
     assert not log.complete
+    assert not log.being_written
+    assert log.damage == (
+        "the file has no end: its recorder was killed, or could write no more; its last cycle is at "
+        f"{(int(log.cycles[-1]['written_ns']) - int(log.cycles[0]['scheduled_ns'])) / 1e9:.1f} s of the run",
+    )
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
 
 

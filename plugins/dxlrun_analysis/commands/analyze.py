@@ -46,8 +46,9 @@ def analyze(
     Parameters
     ----------
     logs
-        The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
-        logs. Several logs get one line each. s3://BUCKET/LOG is read from a store, as a whole.
+        The log of a run, an .mcap file or a directory of parts; without one that of the newest run in the
+        directory logs that has ended. Several logs get one line each. s3://BUCKET/LOG is read from a store,
+        as a whole.
     report
         Write a report to this HTML file, with all numbers and plots. A zoom in one plot is one in all; the
         page loads nothing from anywhere, and prints. Needs bokeh: `pip install 'dxlrun[report]'`.
@@ -140,23 +141,27 @@ def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) 
 
 
 def newest_log() -> Path:
-    """Return the newest log in the directory where runs that were started here leave theirs.
+    """Return the newest log of a run that has ended, in the directory where runs started here leave theirs.
 
     It is the default of `recording: {directory: ...}`, from the working directory. Raises InputError when
     there is none.
     """
     from dxlrun.description.robot import Recording
     from dxlrun.log.parts import is_log_directory
+    from dxlrun.log.stored import is_being_written
 
     directory = Path(Recording().directory)
     found = [*directory.glob("*.mcap"), *(path for path in directory.glob("*/") if is_log_directory(path))]
-    logs = sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
-    if not logs:
-        raise InputError(
-            f"there is no log in {directory.absolute()}; give the path of one, or change to the directory "
-            "where the robot was run"
-        )
-    return logs[-1]
+    logs = sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
+    ended = next((log for log in logs if not is_being_written(log) and log.stat().st_size), None)
+    if ended is not None:
+        return ended
+    if logs:
+        raise InputError(f"{logs[0]} is being written; end the run, or give this path to analyze it so far")
+    raise InputError(
+        f"there is no log in {directory.absolute()}; give the path of one, or change to the directory where "
+        "the robot was run"
+    )
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
@@ -179,6 +184,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
                 report = analyze_log(reader)
                 results.append(report)
                 words = report.verdict.sentences[0]
+                words = f"being written; so far: {words}" if report.being_written else words
                 code = code if report.verdict.good else max(code, 1)
         except LogError as error:
             code = error.exit_code

@@ -94,8 +94,8 @@ def logs(
 def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.
 
-    Logs that are there as a whole are left out, and so is one that changed within the last 10 s; what an
-    ended connection left is done the next time. Nothing is deleted, and no other run is written over. Needs
+    Logs that are there as a whole are left out, and so is one that a run is writing; what an ended
+    connection left is done the next time. Nothing is deleted, and no other run is written over. Needs
     `pip install 'dxlrun[store]'`. The exit code is 1 when a log could not be copied.
 
     Parameters
@@ -121,7 +121,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     for name in result.others:
         print_error(f"{store} has another run named {name}; give each robot a prefix of its own")
     for name in result.written:
-        print_warning(f"{name} changed within the last 10 s: a run may write it still, so it was left out")
+        print_warning(f"{name} was left out: a run is writing it")
     uploaded = counted(len(result.uploaded), "log was", "logs were")
     show(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there")
     return 1 if result.others else 0
@@ -250,6 +250,8 @@ def _number(value: object) -> float | None:
 def _verdict(row: Row) -> Cell:
     if row["unreadable"]:
         return Cell("unreadable", "error")
+    if row["being_written"]:
+        return Cell("being written", "warning")
     return Cell("good", "good") if row["good"] else Cell("not good", "warning")
 
 

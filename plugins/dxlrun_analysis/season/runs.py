@@ -22,6 +22,7 @@ from dxlrun.errors import InputError, LogError
 from dxlrun.log.identity import HOST, IDENTITY_NAME, RUNTIME, code_hashes
 from dxlrun.log.parts import is_log_directory, log_files
 from dxlrun.log.reader import Log, open_log
+from dxlrun.log.stored import is_being_written
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.finding import ROBOT
 from dxlrun_analysis.joints.bins import Series
@@ -99,6 +100,7 @@ COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "worst_error_rad": (_NUMBER, lambda report, _: _farthest(report)[0]),
     "records_lost": (_WHOLE, lambda report, _: report.gaps),
     "complete": (_YES, lambda report, _: report.complete),
+    "being_written": (_YES, lambda report, _: report.being_written),
     "virtual": (_YES, lambda _, log: on_virtual_time(log)),
     "host": (_TEXT, lambda _, log: log.metadata.get(IDENTITY_NAME, {}).get(HOST)),
     "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),
@@ -125,12 +127,12 @@ class FoundLog(NamedTuple):
 
     @property
     def stamp(self) -> str:
-        """How its files are now; empty: they changed so lately that they may change unseen."""
+        """State of its files; empty while they may change unseen, or a run writes them."""
         try:
             found = [file.stat() for file in self.files]
         except OSError:  # it is gone, or may not be looked at: reading it says so
             return ""
-        if any(time_ns() - one.st_mtime_ns < _SETTLED_NS for one in found):
+        if any(time_ns() - one.st_mtime_ns < _SETTLED_NS for one in found) or is_being_written(self.path):
             return ""
         return " ".join(f"{one.st_size}-{one.st_ino}-{one.st_mtime_ns}-{one.st_ctime_ns}" for one in found)
 

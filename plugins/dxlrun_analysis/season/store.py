@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from tempfile import mkdtemp
-from time import time_ns
 from typing import NamedTuple
 
 import fsspec
@@ -23,6 +22,7 @@ import pyarrow as pa
 from pyarrow import json
 
 from dxlrun.errors import DxlrunError, InputError, missing_extra
+from dxlrun.log.stored import is_being_written
 from dxlrun_analysis.season.runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
 
 _ROW, _LOG = ".run.json", ".mcap"
@@ -30,8 +30,6 @@ UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot goes on wit
 DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it anew"
 _AT_ONCE = 500
 """Rows that are asked for together."""
-_QUIET_NS = 10_000_000_000
-"""A log that changed so lately may be written still: a recorder writes twice a second."""
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "s3": {
         "skip_instance_cache": True,
@@ -125,12 +123,12 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
     Raises DxlrunError when the store cannot be reached; the next call goes on behind the last whole log.
     """
     store = find_store(url)
-    quiet = folder._replace(logs=tuple(log for log in folder.logs if _is_quiet(log)))
+    ended = folder._replace(logs=tuple(log for log in folder.logs if not is_being_written(log.path)))
     known = {row["log"]: row for row in store.table(progress)[0].to_pylist()}
-    rows = table_of(quiet, progress)[0].to_pylist() if quiet.logs else []
+    rows = table_of(ended, progress)[0].to_pylist() if ended.logs else []
     uploaded, there, others = [], [], []
-    written = [log.name for log in folder.logs if log not in quiet.logs]
-    for done, (log, row) in enumerate(zip(quiet.logs, rows, strict=True)):
+    written = [log.name for log in folder.logs if log not in ended.logs]
+    for done, (log, row) in enumerate(zip(ended.logs, rows, strict=True)):
         progress(log.name, done / len(rows))
         before = known.get(log.name, {"unreadable": UNFINISHED})
         if before["unreadable"] not in (UNFINISHED, DAMAGED):
@@ -156,14 +154,6 @@ def _put(store: Store, file: Path, log: FoundLog) -> int:
     to = f"{store.root}/{log.name}" + ("" if file == log.path else f"/{file.name}")
     store.files.put_file(str(file), to)
     return int(store.files.info(to)["size"])
-
-
-def _is_quiet(log: FoundLog) -> bool:
-    """Return whether a log has not changed for some time; a clock may have been set back since."""
-    try:
-        return all(abs(time_ns() - file.stat().st_mtime_ns) > _QUIET_NS for file in log.files)
-    except OSError:
-        return False
 
 
 def _row(name: str, data: bytes) -> Row:

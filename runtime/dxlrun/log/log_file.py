@@ -1,16 +1,49 @@
-"""The file of a log: bytes that are on the disk, or an error."""
+"""The file of a log: bytes that are on the disk, or an error; who writes it holds a lock on it."""
 
 from __future__ import annotations
 
 import errno
 import os
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 from dxlrun.output.target import open_empty
 
+try:
+    import fcntl
+except ImportError:  # Windows, where logs are read
+    fcntl = None  # type: ignore[assignment]  # a module, or none
+
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
+_LATELY_S = 10.0  # Without locks, a file counts as being written for so long after its last change
+_HELD = (errno.EWOULDBLOCK, errno.EACCES)
+
+
+def has_writer(path: Path) -> bool:
+    """Return whether a process has this file of a log open for writing.
+
+    The writer holds a lock (flock(2)), which ends with the process however that ends. On a file system
+    without locks, a file that changed within 10 s counts as being written.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+    except OSError as error:
+        if error.errno in _HELD:
+            return True
+    finally:
+        os.close(descriptor)
+    with suppress(OSError):
+        return time.time() - path.stat().st_mtime < _LATELY_S
+    return False
 
 
 class LogFile:
@@ -20,6 +53,9 @@ class LogFile:
 
     def __init__(self, path: Path) -> None:
         self._descriptor = open_empty(path, LOG_MODE)  # empty is how a name is taken before a log begins
+        if fcntl is not None:
+            with suppress(OSError):  # A file system without locks
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._path = path
         self._size = 0
 
@@ -62,5 +98,8 @@ class LogFile:
         return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the lock and close the file. A forked child that still has the descriptor keeps no lock."""
+        if fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
         os.close(self._descriptor)

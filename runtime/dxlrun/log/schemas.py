@@ -20,6 +20,8 @@ from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.recording_plan import RecordingPlan
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dxlrun.plan.robot_plan import Plan
 
 PROFILE = "ros2"
@@ -305,6 +307,33 @@ class LogHeader(msgspec.Struct, frozen=True):
         """Of the cycles' records."""
         names = [controller.name for controller in self.controllers]
         return CycleLayout(self.joints, names, self.references, self.sources, self.device_commands)
+
+
+class CycleSpan:
+    """Time of a run that the cycles in a log cover: from the first deadline to the last cycle."""
+
+    __slots__ = ("begin_ns", "last_ns")
+
+    def __init__(self, begin_ns: int | None = None, last_ns: int | None = None) -> None:
+        self.begin_ns, self.last_ns = begin_ns, last_ns
+
+    def add(self, record: np.void, period_ns: int) -> None:
+        """Extend the span by a record of /cycle or /activation, which has number -1 and the first deadline.
+
+        The first cycle may not be the first of the run, in a later part: its number gives the deadline.
+        """
+        number = int(record["cycle"])
+        if self.begin_ns is None:
+            self.begin_ns = int(record["scheduled_ns"]) - max(0, number) * period_ns
+        if number >= 0:
+            self.last_ns = int(record["written_ns"])
+
+    @property
+    def last_cycle_text(self) -> str:
+        """A clause about the last cycle of a log that is not whole."""
+        if self.begin_ns is None or self.last_ns is None:
+            return "it has no cycle"
+        return f"its last cycle is at {(self.last_ns - self.begin_ns) / 1e9:.1f} s of the run"
 
 
 class RecorderJob(msgspec.Struct, frozen=True):

@@ -1,9 +1,8 @@
-"""Stored logs: how much disk the logs of runs take, and which are the oldest."""
+"""Stored logs: which are being written, how much disk the logs of runs take, and which are the oldest."""
 
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -11,13 +10,12 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import LogError
+from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import is_log_directory, log_files
 
 MUCH_BYTES = 10 * 10**9
 """From here on the end of a run says how much its folder has."""
 _NAME = re.compile(r"\w+_\d{8}_\d{6}(_\d+)?")
-_WRITTEN_S = 10.0
-"""A log that changed so lately may be one of a run that goes on."""
 
 
 class StoredLog(msgspec.Struct, frozen=True):
@@ -27,6 +25,13 @@ class StoredLog(msgspec.Struct, frozen=True):
     bytes: int
     changed_s: float
     """When it was written last, s since 1970."""
+
+
+def is_being_written(log: Path) -> bool:
+    """Return whether a run is writing a log, a file or a directory of parts; False where there is none."""
+    with suppress(LogError):
+        return has_writer(log_files(log).files[-1])
+    return False
 
 
 def stored_logs(folder: Path) -> tuple[StoredLog, ...]:
@@ -52,15 +57,15 @@ def bytes_of(log: Path) -> int:
 def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tuple[StoredLog, ...]:
     """Return the oldest logs without which the others fit into `keep_bytes`.
 
-    `but` and logs that may still be written are none of them.
+    `but` and logs that are being written are not among them.
     """
     logs, spared = stored_logs(folder), set(but)
-    left, youngest_s = sum(one.bytes for one in logs), time.time() - _WRITTEN_S
+    left = sum(one.bytes for one in logs)
     found: list[StoredLog] = []
     for one in logs:
         if left <= keep_bytes:
             break
-        if one.path not in spared and one.changed_s < youngest_s:
+        if one.path not in spared and not is_being_written(one.path):
             found.append(one)
             left -= one.bytes
     return tuple(found)

@@ -13,6 +13,7 @@ import fsspec
 import pytest
 from msgspec.structs import replace
 from tests.kit.commands import Dxlrun
+from tests.kit.held_logs import being_written
 
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
@@ -145,8 +146,8 @@ def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
     logs: Path, there: Path, dxlrun: Dxlrun
 ) -> None:
     url = f"file://{there}"
-    os.utime(logs / "one.mcap")
-    assert told(dxlrun, logs, url) == {"uploaded": ["may/second.mcap", "parts"], "written": ["one.mcap"]}
+    with being_written(logs / "one.mcap"):
+        assert told(dxlrun, logs, url) == {"uploaded": ["may/second.mcap", "parts"], "written": ["one.mcap"]}
 
     shutil.copy(logs / "one.mcap", logs / "may" / "second.mcap")  # of another run
     old(logs)
@@ -160,7 +161,6 @@ def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
     assert rows(dxlrun, url)[0][1]["unreadable"] == stores.DAMAGED
     (there / "parts.run.json").unlink()
     assert rows(dxlrun, url)[0][2]["unreadable"] == stores.UNFINISHED
-    os.utime(logs / "one.mcap", (4e9, 4e9))  # before the clock was set back
     again = told(dxlrun, logs, url, code=1)
     assert again == {"uploaded": ["one.mcap", "parts"], "others": ["may/second.mcap"]}
     row = there / "one.mcap.run.json"

@@ -23,7 +23,7 @@ from dxlrun.log.packing.bus_messages import read_packets
 from dxlrun.log.reading.chunks import Messages
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
-from dxlrun.log.schemas import LoggedController, LogHeader
+from dxlrun.log.schemas import CycleSpan, LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
 from dxlrun.messages.cdr_columns import pieces
 from dxlrun.messages.definition import MessageType
@@ -70,6 +70,8 @@ class Log:
     """True when the recorder finished the file and nothing in it is damaged."""
     damage: tuple[str, ...]
     """A sentence for each thing that is missing or could not be read."""
+    being_written: bool = False
+    """True when a run was writing the file as it was read."""
     packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
     """Every packet of every bus, bus by bus as recorded."""
     activation: NDArray[np.void] | None = None
@@ -137,6 +139,7 @@ class Slicer:
         self._packets = _NO_PACKETS
         self._activation: NDArray[np.void] | None = None
         self._names: dict[int, str] = {}
+        self._span = CycleSpan()
         self.wrong = 0
         """Messages of packets that are not what their definition says."""
 
@@ -173,6 +176,9 @@ class Slicer:
                 self._layout, message, np.zeros(1, np.int64), np.array([len(message)])
             )
         cycles = _cycles(self._layout, messages.data, messages.start[cycle_rows], messages.size[cycle_rows])
+        for record in (activation, cycles[:1], cycles[-1:]):
+            if record is not None and len(record):
+                self._span.add(record[0], self._header.period_ns)
         cycles = joined_cycles([self._cycles, cycles])
         return replace(
             self._slice(cycles, packets, last=not self._with_packets),
@@ -193,12 +199,13 @@ class Slicer:
             them = counted(self.wrong, "message of packets is", "messages of packets are")
             damage.append(f"{them} damaged and left out")
         if not self._file.finished:
-            damage.append(self._walk.no_end)
+            damage.append(f"{self._walk.no_end}; {self._span.last_cycle_text}")
         empty = self._log(self._cycles[:0], _NO_PACKETS)
         return replace(
             empty,
             damage=tuple(damage),
             complete=not damage,
+            being_written=self._walk.is_being_written,
             activation=self._activation,
             topics={
                 name: LoggedTopic(name, self._file.channels[channel].type, np.zeros(0, np.int64), ())

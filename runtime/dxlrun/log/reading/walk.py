@@ -11,6 +11,7 @@ from typing import IO
 
 from dxlrun.description.mistakes.foreign import LONGEST_MAGIC, kind_of_bytes
 from dxlrun.errors import LogError
+from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import log_files, missing_parts
 from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
 from dxlrun.log.schemas import METADATA_NAME
@@ -83,9 +84,17 @@ class LogWalk:
             found.damage.append(f"the parts behind {found.name} are missing")
 
     @property
+    def is_being_written(self) -> bool:
+        """True while a run writes the file in which the walk ended."""
+        return not self.file.finished and self._file is not None and has_writer(self._file)
+
+    @property
     def no_end(self) -> str:
-        """The sentence for a file that its recorder did not finish."""
-        return f"{self.file.name or 'the file'} has no end: its recorder was killed, or could write no more"
+        """The sentence for a file without an end."""
+        name = self.file.name or "the file"
+        if self.is_being_written:
+            return f"{name} has no end yet: a run is writing it"
+        return f"{name} has no end: its recorder was killed, or could write no more"
 
     def _take_metadata(self, name: str, record: dict[str, str]) -> None:
         if name == METADATA_NAME and self.file.metadata.get(name) not in (None, record):
