@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -64,8 +65,8 @@ def live(run: Run) -> Iterator[LiveRobot]:
 def serve() -> Iterator[Callable[..., Served]]:
     served: list[Served] = []
 
-    def make(source: Source, *, control: bool = False) -> Served:
-        served.append(Served(source, control=control))
+    def make(source: Source, *, control: bool = False, tls: ssl.SSLContext | None = None) -> Served:
+        served.append(Served(source, control=control, tls=tls))
         return served[-1]
 
     yield make

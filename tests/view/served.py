@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import http.client
 import json
+import ssl
 import threading
+from contextlib import closing
 from typing import Any
 
 from dxlrun.remote.network.listener import Listener
@@ -15,10 +17,12 @@ from dxlrun_view.shown import Source
 class Served:
     """A page that is served, and what a browser would ask of it."""
 
-    def __init__(self, source: Source, *, control: bool = False) -> None:
-        self.listener = Listener("127.0.0.1", 0)
+    def __init__(self, source: Source, *, control: bool = False, tls: ssl.SSLContext | None = None) -> None:
+        self.listener = Listener("127.0.0.1", 0, tls)
         self.port = self.listener.getsockname()[1]
         self.page = Page(source, self.listener, hosts=hosts_of("127.0.0.1", self.port), control=control)
+        self.browser: ssl.SSLContext | None = None
+        """What a browser shows by TLS."""
         self.server = server_of(self.page)
         self._thread = threading.Thread(target=self.server.run, kwargs={"sockets": [self.listener]})
         self._thread.start()
@@ -28,15 +32,18 @@ class Served:
         return f"http://127.0.0.1:{self.port}/?token={self.page.token}"
 
     def ask(self, path: str, content: object = None, **headers: str) -> tuple[int, bytes]:
-        """Return status and answer; `headers` replace those of the page."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
-        body = None if content is None else json.dumps(content)
+        """Return status and answer; `headers` replace those of the page, bytes are sent as they are."""
+        connection = (
+            http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+            if self.browser is None
+            else http.client.HTTPSConnection("127.0.0.1", self.port, timeout=20, context=self.browser)
+        )
+        body = content if content is None or isinstance(content, bytes) else json.dumps(content)
         given = {HEADER: self.page.token} | {name.replace("_", "-"): text for name, text in headers.items()}
-        connection.request("GET" if body is None else "POST", path, body, given)
-        answer = connection.getresponse()
-        found = answer.status, answer.read()
-        connection.close()
-        return found
+        with closing(connection):
+            connection.request("GET" if body is None else "POST", path, body, given)
+            answer = connection.getresponse()
+            return answer.status, answer.read()
 
     def look(self, **asked: object) -> Any:
         status, answer = self.ask("/look", asked)

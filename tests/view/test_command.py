@@ -27,6 +27,7 @@ View = Callable[..., subprocess.Popen[str]]
 def view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[View]:
     """Starts the command where no robot runs."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     # as if the package was installed, which would fetch what its page is made of
     installed = tmp_path / "dxlrun_view-0.1.0.dist-info"
@@ -96,7 +97,9 @@ def test_without_a_robot_it_says_how_one_starts(view: View, command: str) -> Non
         ((str(ROOT / "robots/bioloid_torso.yaml"),), 1, "start it in another terminal"),
         (("bad.mcap",), 2, "bad.mcap"),
         (("--listen", ":99999999"), 2, "HOST:PORT"),
-        (("{log}", "--listen", "192.0.2.1"), 2, "another --listen"),
+        (("{log}", "--listen", "127.0.0.99999"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
+        (("{log}", "--listen", "192.0.2.1"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
+        (("{log}", "--listen", "::"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(

@@ -16,11 +16,54 @@ from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, set
 from tests.view.served import Served
 
 from dxlrun import Refused, RemoteRobot
-from dxlrun_view.actions import stopped
+from dxlrun_view.actions import Stop
 from dxlrun_view.live import LiveRobot
 from dxlrun_view.server import HEADER
 
 Serve = Callable[..., Served]
+ACTIONS: tuple[dict[str, object], ...] = (
+    {"verb": "halt"},
+    {"verb": "pause"},
+    {"verb": "resume"},
+    {"verb": "torque", "joints": [JOINT], "on": True},
+    {"verb": "switch", "controller": "left_arm", "on": True},
+    {"verb": "goal", "joint": JOINT, "position": 0.2},
+    {"verb": "play", "motion": "three_parts.yaml"},
+    {"verb": "set_parameter", "controller": "left_arm", "parameter": "p", "value": 0.2},
+)
+"""A message of each action that steers."""
+WRONG: tuple[object, ...] = (
+    None,
+    "stop",
+    [],
+    {},
+    {"verb": "fly"},
+    {"verb": ["stop"]},
+    {"verb": "goal"},
+    {"verb": "goal", "joint": JOINT},
+    {"verb": "goal", "joint": JOINT, "position": "far"},
+    {"verb": "goal", "joint": JOINT, "position": True},
+    {"verb": "goal", "joint": [JOINT], "position": 0.2},
+    {"verb": "goal", "joint": "", "position": 0.2},
+    {"verb": "goal", "joint": JOINT, "position": 1e400},
+    {"verb": "torque", "joints": [], "on": True},
+    {"verb": "torque", "joints": JOINT, "on": True},
+    {"verb": "torque", "joints": [JOINT], "on": "yes"},
+    {"verb": "torque", "joints": ["no\nbody/../x"], "on": False},
+    {"verb": "switch", "controller": "", "on": True},
+    {"verb": "switch", "controller": "left_arm"},
+    {"verb": "play", "motion": None},
+    {"verb": "play", "motion": "/etc/passwd"},
+    {"verb": "parameters", "controller": "../../robot"},
+    {"verb": "parameters", "controller": ""},
+    {"verb": "parameters"},
+    {"verb": "set_parameter", "controller": "left_arm"},
+    {"verb": "set_parameter", "controller": "left_arm", "parameter": "", "value": 1},
+    {"verb": "set_parameter", "controller": "left_arm", "parameter": "a.b", "value": {"deep": 1}},
+    {"verb": "set_parameter", "controller": "nobody", "parameter": "p", "value": "x" * 9000},
+    {"verb": "stop", "names": ["all"]},
+    {"verb": "halt", "on": False},
+)
 
 
 def column(served: Served, name: str) -> Any:
@@ -53,13 +96,32 @@ def test_a_page_that_may_not_steer_only_stops(live: LiveRobot, serve: Serve, run
         robot.torque("all", on=True)
     until(lambda: run.written(TORQUE_ENABLE)[SERVO] == 1)
     served = serve(live)
-    for verb in ("halt", "torque", "switch", "goal", "play", "pause", "resume", "set_parameter"):
-        status, answer = served.ask("/act", {"verb": verb, "names": [JOINT], "value": 0.2})
-        assert (status, b"--control" in answer) == (403, True)
-    assert served.ask("/act", {"verb": "parameters", "names": ["left_arm"]})[0] == 200
+    for action in ACTIONS:
+        status, answer = served.ask("/act", action)
+        assert (status, b"--control" in answer) == (403, True), action
+    assert served.ask("/act", {"verb": "parameters", "controller": "left_arm"})[0] == 200
     status, answer = served.ask("/act", {"verb": "stop"})
     assert (status, b"limp" in answer) == (200, True)
     until(lambda: run.limp)
+
+
+def test_a_wrong_message_is_refused_with_a_sentence(live: LiveRobot, serve: Serve) -> None:
+    served = serve(live, control=True)
+    for message in WRONG:
+        status, answer = served.ask("/act", message if message is not None else "null")
+        assert status == 409, (message, answer)
+        assert json.loads(answer)["refused"], message
+    for raw in (b"", b"{", b"\xff\xfe", b'{"verb": "goal", "joint": "\xed\xa0\x80"}', b"[" * 60_000):
+        for path in ("/act", "/look"):
+            status, answer = served.ask(path, raw)
+            assert (status, b"this is not a request of this page" in answer) == (409, True), raw[:20]
+    for look in ({"time": "now"}, {"spans": [{"names": ["x"]}]}, {"after": 1.5}, {"spans": {}}):
+        assert served.ask("/look", look)[0] == 409, look
+    for span in ({"points": -1}, {"points": 0}, {"begin": 9.0, "end": -9.0}, {"begin": -1e308, "end": 1e308}):
+        whole = {"names": ["loop/cycle", "nothing", ":", "/x:y[9]"], "begin": 0.0, "end": 1.0} | span
+        assert served.ask("/look", {"spans": [whole]})[0] == 200, span
+    for path in ("/mesh", "/mesh?name=..%2F..%2Fetc%2Fpasswd", "/mesh?name=%00"):
+        assert served.ask(path)[0] == 404, path
 
 
 @pytest.mark.campaign
@@ -76,7 +138,7 @@ def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
         f"{host}{token}Origin: http://evil.example\r\n",
         f"Host: evil.example:{served.port}\r\n{token}",
     )
-    clicks = ({"verb": "torque", "names": ["all"]}, {"verb": "stop"}, {"verb": "halt"})
+    clicks = ({"verb": "torque", "joints": ["all"], "on": True}, {"verb": "stop"}, {"verb": "halt"})
     seeds = [
         Said(method, path, json.dumps(click).encode(), guard)
         for guard in guards
@@ -90,24 +152,24 @@ def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
 
 def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run: Run) -> None:
     served = serve(live, control=True)
-    assert served.ask("/act", {"verb": "torque", "names": ["all"], "on": True})[0] == 200
+    assert served.ask("/act", {"verb": "torque", "joints": ["all"], "on": True})[0] == 200
     arms = ["left_arm", "right_arm", "head"]
     for name in arms:
-        served.ask("/act", {"verb": "switch", "names": [name], "on": True})
+        served.ask("/act", {"verb": "switch", "controller": name, "on": True})
     until(lambda: run.written(TORQUE_ENABLE)[SERVO] == 1)
-    status, answer = served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 0.4})
+    status, answer = served.ask("/act", {"verb": "goal", "joint": JOINT, "position": 0.4})
     assert (status, b"right_arm" in answer) == (200, True)
     # 0.4 rad are 78 ticks of 1023 in 300 deg
     until(lambda: abs(abs(run.written(GOAL_POSITION)[SERVO] - 512) - 78) <= 2)
     assert until(lambda: abs((column(served, f"{JOINT}/position") or 0.0) - 0.4) < 0.03)
-    status, answer = served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 9.0})
+    status, answer = served.ask("/act", {"verb": "goal", "joint": JOINT, "position": 9.0})
     assert status == 409
-    assert served.ask("/act", {"verb": "play", "names": ["/etc/passwd"]})[0] == 409
-    assert served.ask("/act", {"verb": "switch", "names": ["right_arm"], "on": False})[0] == 200
+    assert served.ask("/act", {"verb": "play", "motion": "/etc/passwd"})[0] == 409
+    assert served.ask("/act", {"verb": "switch", "controller": "right_arm", "on": False})[0] == 200
     rows = {row["name"]: row["active"] for row in until(lambda: fresh(served))["info"]["controllers"]}
     assert rows["left_arm"]
     assert not rows["right_arm"]
-    assert served.ask("/act", {"verb": "goal", "names": [JOINT], "value": 0.0})[0] == 409
+    assert served.ask("/act", {"verb": "goal", "joint": JOINT, "position": 0.0})[0] == 409
     assert served.ask("/act", {"verb": "halt"})[0] == 200
 
 
@@ -162,6 +224,6 @@ def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
         def stop(self, wait: bool) -> None:
             asked.append("stop")
 
-    said = stopped(cast("RemoteRobot", Robot()))
+    said = Stop().perform(cast("RemoteRobot", Robot())).said
     assert asked == ["torque of all: False", *(["stop"] if refused else [])]
     assert ("the run ends" in said) is refused

@@ -28,7 +28,7 @@ export function drawControllers(element, shown, act) {
         const button = text("button", controller.active ? "deactivate" : "activate");
         button.type = "button";
         button.setAttribute("aria-label", `${button.textContent} ${controller.name}`);
-        button.onclick = () => act({ verb: "switch", names: [controller.name], on: !controller.active });
+        button.onclick = () => act({ verb: "switch", controller: controller.name, on: !controller.active });
         row.append(button);
       }
       const more = text("button", "parameters");
@@ -74,7 +74,7 @@ async function parameters(element, shown, name, act) {
   element.querySelector(".parameters")?.remove();
   element.dataset.open = name;
   for (const node of element.querySelectorAll(".node")) node.classList.toggle("chosen", node.querySelector("strong").textContent === name);
-  const found = await act({ verb: "parameters", names: [name] }, true);
+  const found = await act({ verb: "parameters", controller: name }, true);
   if (!found) return;
   const table = document.createElement("table");
   table.className = "parameters";
@@ -91,7 +91,7 @@ async function parameters(element, shown, name, act) {
       input.onchange = async () => {
         const number = Number(input.value);
         const value = input.value.trim() && Number.isFinite(number) ? number : input.value === "true" ? true : input.value === "false" ? false : input.value;
-        if (!(await act({ verb: "set_parameter", names: [name], parameter, value }))) input.value = now;
+        if (!(await act({ verb: "set_parameter", controller: name, parameter, value }))) input.value = now;
       };
     } else cell.textContent = now;
   }

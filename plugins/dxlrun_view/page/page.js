@@ -136,13 +136,13 @@ function buildButtons() {
   if (motions.length) {
     const list = document.createElement("select");
     list.append(new Option("play …", ""), ...motions.map((file) => new Option(file.replace(/^.*\/|\.ya?ml$/g, ""), file)));
-    list.onchange = () => { if (list.value) act({ verb: "play", names: [list.value] }); list.value = ""; };
+    list.onchange = () => { if (list.value) act({ verb: "play", motion: list.value }); list.value = ""; };
     $("buttons").append(list);
   }
   add("halt", { verb: "halt" }, "Bring every joint to rest within its limits, and hold");
   add(paused ? "resume" : "pause", { verb: paused ? "resume" : "pause" }, "Stop or go on with the controllers' time");
-  add("torque on", { verb: "torque", names: ["all"], on: true }, "Of all joints; each holds where it stands");
-  add("torque off", { verb: "torque", names: ["all"], on: false }, "Of all joints: they are limp");
+  add("torque on", { verb: "torque", joints: ["all"], on: true }, "Of all joints; each holds where it stands");
+  add("torque off", { verb: "torque", joints: ["all"], on: false }, "Of all joints: they are limp");
 }
 
 // ---- joints
@@ -180,7 +180,7 @@ function buildJoints() {
     }
     const tag = torque.appendChild(document.createElement(slider ? "button" : "span"));
     tag.className = "tag";
-    if (slider) tag.onclick = () => act({ verb: "torque", names: [joint.name], on: tag.textContent !== "on" });
+    if (slider) tag.onclick = () => act({ verb: "torque", joints: [joint.name], on: tag.textContent !== "on" });
     tbody.insertRow().append(...cells);
     rows.set(joint.name, { joint, slider, is, to, position, goal, load, heat, volts, tag });
   }
@@ -199,7 +199,7 @@ async function led() {
   while (goals.size) {
     const [[name, to]] = goals;
     goals.delete(name);
-    if (!(await act({ verb: "goal", names: [name], value: to }, true))) goals.clear();
+    if (!(await act({ verb: "goal", joint: name, position: to }, true))) goals.clear();
   }
 }
 

@@ -1,8 +1,8 @@
-"""What the buttons of a page do with a running robot."""
+"""Messages of the page's buttons and sliders: one type per action, which performs it on a running robot."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, ClassVar
 
 import msgspec
 
@@ -11,95 +11,152 @@ from dxlrun.remote.requests.replies import Parameter
 from dxlrun_view.live import LiveRobot, info_of
 from dxlrun_view.shown import Source
 
-Verb = Literal[
-    "stop", "halt", "torque", "switch", "goal", "play", "pause", "resume", "parameters", "set_parameter"
-]
 LEAD_S = 0.3
 """A trajectory controller leads a joint to where its slider is in this time."""
-
-
-class Action(msgspec.Struct, frozen=True):
-    """One click."""
-
-    verb: Verb
-    names: tuple[str, ...] = ()
-    """Joints, controllers or groups that it is about."""
-    on: bool = True
-    value: float | bool | str = 0.0
-    """Of a slider: rad or m. Of a parameter: as in the robot file."""
-    parameter: str = ""
-
-    @property
-    def always(self) -> bool:
-        """True when a page may do it that may not steer."""
-        return self.verb in ("stop", "parameters")
+Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
 
 class Done(msgspec.Struct, frozen=True):
-    """What became of a click."""
+    """Result of an action."""
 
     said: str
     """For the page's line of messages."""
     parameters: tuple[Parameter, ...] = ()
 
 
+class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="verb"):
+    """An action; `verb` in the message is the tag of its type."""
+
+    always: ClassVar[bool] = False
+    """True when a page may send it that may not steer."""
+
+
+class Stop(_Message, frozen=True, tag="stop"):
+    """Disable the torque of all joints."""
+
+    always = True
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Where the run refuses that, end the run: its policy disables the torque then."""
+        try:
+            robot.torque("all", on=False, release=True)
+        except DxlrunError as error:
+            robot.stop(wait=False)
+            return Done(f"the run ends: torque off was refused ({error})")
+        return Done("STOP: torque is off, all joints are limp")
+
+
+class Halt(_Message, frozen=True, tag="halt"):
+    """Bring all joints to rest."""
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Halt the robot."""
+        halted = robot.halt().halted
+        return Done("halted" if halted is None else f"halted in {halted.seconds:.2f} s")
+
+
+class Pause(_Message, frozen=True, tag="pause"):
+    """Pause the controllers."""
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Pause the robot."""
+        robot.pause()
+        return Done("paused")
+
+
+class Resume(_Message, frozen=True, tag="resume"):
+    """Resume the controllers."""
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Resume the robot."""
+        robot.resume()
+        return Done("resumed")
+
+
+class SetTorque(_Message, frozen=True, tag="torque"):
+    """Enable or disable the torque of joints, groups or `all`."""
+
+    joints: Names
+    on: bool
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Enable the torque, or disable it and release the controllers."""
+        robot.torque(self.joints, self.on, release=not self.on)
+        return Done(f"torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
+
+
+class Switch(_Message, frozen=True, tag="switch"):
+    """Activate or deactivate a controller."""
+
+    controller: str
+    on: bool
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Switch the controller."""
+        names = (self.controller,)
+        robot.switch(names if self.on else (), () if self.on else names)
+        return Done(f"{self.controller} is {'active' if self.on else 'not active'}")
+
+
+class Goal(_Message, frozen=True, tag="goal"):
+    """Move a joint to a position, rad or m."""
+
+    joint: str
+    position: float
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Send the goal to the active controller that commands the joint's position."""
+        for row in info_of(robot).controllers:
+            if row.active and self.joint in row.joints and "position" in row.command:
+                seconds = LEAD_S if "trajectory" in row.goals else None
+                robot.send(row.name, "position", {self.joint: self.position}, seconds=seconds)
+                return Done(f"{self.joint} to {self.position:.3f} by {row.name}")
+        raise InputError(f"no active controller commands the position of {self.joint}; activate one")
+
+
+class Play(_Message, frozen=True, tag="play"):
+    """Play a motion file from the folder of the robot file."""
+
+    motion: str
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Play the motion."""
+        goals = robot.play(self.motion).goals
+        return Done(f"plays {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
+
+
+class ListParameters(_Message, frozen=True, tag="parameters"):
+    """List the parameters of a controller."""
+
+    always = True
+    controller: str
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Return the parameters."""
+        return Done("", robot.parameter_table(self.controller))
+
+
+class SetParameter(_Message, frozen=True, tag="set_parameter"):
+    """Change a live parameter of a controller, with a value as in the robot file."""
+
+    controller: str
+    parameter: str
+    value: float | bool | str
+
+    def perform(self, robot: RemoteRobot) -> Done:
+        """Change the parameter."""
+        changed = robot.set_parameters(self.controller, {self.parameter: self.value})
+        return Done(", ".join(f"{self.controller}: {name} is {new}" for name, (_, new) in changed.items()))
+
+
+Action = Stop | Halt | Pause | Resume | SetTorque | Switch | Goal | Play | ListParameters | SetParameter
+
+
 def act(source: Source, action: Action) -> Done:
-    """Do what a button asks. Raises DxlrunError with the reason when it cannot be done."""
+    """Perform an action. Raises DxlrunError with the reason when it cannot be done."""
     if not isinstance(source, LiveRobot):
         raise InputError("this is a log: nothing can be steered in it")
-    if action.verb == "play" and not set(action.names) <= {*source.shown().motions}:
+    if isinstance(action, Play) and action.motion not in source.shown().motions:
         raise InputError("only a motion beside the robot file is played from here")
     with source.asking() as robot:
-        return _done(robot, action)
-
-
-def _done(robot: RemoteRobot, action: Action) -> Done:
-    name = action.names[0] if action.names else ""
-    said = f"{action.verb} {', '.join(action.names)}".strip()
-    match action.verb:
-        case "stop":
-            return Done(stopped(robot))
-        case "halt":
-            halted = robot.halt().halted
-            said = "halted" if halted is None else f"halted in {halted.seconds:.2f} s"
-        case "torque":
-            robot.torque(action.names, action.on, release=not action.on)
-            said = f"torque {'on' if action.on else 'off'}: {', '.join(action.names)}"
-        case "switch":
-            robot.switch(action.names if action.on else (), () if action.on else action.names)
-            said = f"{name} is {'active' if action.on else 'not active'}"
-        case "goal":
-            said = _goal(robot, name, float(action.value))
-        case "pause":
-            robot.pause()
-        case "resume":
-            robot.resume()
-        case "play":
-            goals = robot.play(name).goals
-            said = f"plays {name}" + (f" (goal {goals[0].number})" if goals else "")
-        case "parameters":
-            return Done("", robot.parameter_table(name))
-        case "set_parameter":
-            (new,) = robot.set_parameters(name, {action.parameter: action.value}).values()
-            said = f"{name}: {action.parameter} is {new[1]}"
-    return Done(said)
-
-
-def stopped(robot: RemoteRobot) -> str:
-    """Take the torque of all joints; where the run refuses that, end it: its policy takes the torque then."""
-    try:
-        robot.torque("all", on=False, release=True)
-    except DxlrunError as error:
-        robot.stop(wait=False)
-        return f"the run ends: torque off was refused ({error})"
-    return "STOP: torque is off, all joints are limp"
-
-
-def _goal(robot: RemoteRobot, joint: str, value: float) -> str:
-    """Bring a joint to a position by the active controller that commands it."""
-    for row in info_of(robot).controllers:
-        if row.active and joint in row.joints and "position" in row.command:
-            leads = "trajectory" in row.goals
-            robot.send(row.name, "position", {joint: value}, seconds=LEAD_S if leads else None)
-            return f"{joint} to {value:.3f} by {row.name}"
-    raise InputError(f"no active controller commands the position of {joint}; activate one")
+        return action.perform(robot)

@@ -2,7 +2,8 @@
 
 Each request must name this server as its host (no foreign name that points to 127.0.0.1 gets through), come
 from this page if it says from where, and show the token of the page's address. STOP
-works without `--control`.
+works without `--control`. On another address than one of this computer itself, both ends show a certificate
+of `dxlrun keys`, and the role in that of the browser decides whether it may steer.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager
+from functools import partial
 from importlib.resources import files
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 import uvicorn
+from msgspec.json import Decoder
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -25,8 +28,11 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun import DxlrunError, InputError
+from dxlrun.remote.asked import client_of
 from dxlrun.remote.network.listener import Listener, in_url
-from dxlrun_view.actions import Action, act
+from dxlrun.remote.requests.table import Role
+from dxlrun.remote.server import Connection
+from dxlrun_view.actions import Action, ListParameters, act
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.shown import LiveEvent, Shown, Source
 
@@ -56,7 +62,7 @@ _SECURITY = {
 _MESHES = (".stl", ".dae", ".obj")
 
 
-class Span(msgspec.Struct, frozen=True):
+class Span(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Curves that one plot of the page needs."""
 
     names: tuple[str, ...]
@@ -65,7 +71,7 @@ class Span(msgspec.Struct, frozen=True):
     points: int = 600
 
 
-class Look(msgspec.Struct, frozen=True):
+class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the page asks for, some 25 times a second."""
 
     time: float | None = None
@@ -86,7 +92,9 @@ class Seen(msgspec.Struct, frozen=True):
     shown: Shown | None = None
 
 
-Asked = TypeVar("Asked")
+_LOOK: Decoder[Look] = Decoder(Look)
+_ACTION: Decoder[Action] = Decoder(Action)
+Message = TypeVar("Message")
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -97,9 +105,10 @@ class Page:
         self, source: Source, listener: Listener, *, hosts: tuple[str, ...], control: bool = False
     ) -> None:
         """`hosts`: names of this server with its port, as browsers send them."""
-        self.source, self.control, self._listener = source, control, listener
+        self.source, self.control, self.listener = source, control, listener
         self.token = secrets.token_urlsafe(16)
         self._hosts = frozenset(hosts)
+        self._origins = (None, *(f"{scheme_of(listener)}://{host}" for host in hosts))
 
     def app(self) -> Starlette:
         """Return the application."""
@@ -119,13 +128,13 @@ class Page:
         async def answer(request: Request) -> Response:
             host = request.headers.get("host", "")
             origin = request.headers.get("origin")
-            if host not in self._hosts or origin not in (None, *(f"http://{one}" for one in self._hosts)):
+            if host not in self._hosts or origin not in self._origins:
                 return _refused(403, "this page answers itself alone, and no other web site")
             given = request.headers.get(HEADER, "")
             if token and not secrets.compare_digest(given.encode(), self.token.encode()):
                 return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")
-            if token and request.client:
-                self._listener.admit(request.client)
+            if token and request.client and self.listener.tls is None:
+                self.listener.admit(request.client)
             try:
                 response = await handler(request)
             except DxlrunError as error:
@@ -147,14 +156,14 @@ class Page:
 
     async def look(self, request: Request) -> Response:
         """Return what the page draws."""
-        asked = await _body(request, Look)
-        return _json(await run_in_threadpool(self._seen, asked))
+        asked = await _message(request, _LOOK)
+        return _json(await run_in_threadpool(self._seen, asked, self._may_steer(request)))
 
-    def _seen(self, asked: Look) -> Seen:
+    def _seen(self, asked: Look, may_steer: bool) -> Seen:
         moment = self.source.at(asked.time)
         shown = None
         if asked.shown:
-            shown = msgspec.structs.replace(self.source.shown(), control=self.control)
+            shown = msgspec.structs.replace(self.source.shown(), control=may_steer)
         return Seen(
             moment,
             self.source.events(asked.after),
@@ -192,10 +201,19 @@ class Page:
 
     async def act(self, request: Request) -> Response:
         """Do what a button asks; without `--control` only STOP."""
-        action = await _body(request, Action)
+        action = await _message(request, _ACTION)
+        if not isinstance(action, ListParameters) and self._role(request) < Role.COMMAND:
+            return _refused(403, "the certificate of this browser has the role observe; it may only look")
         if not action.always and not self.control:
             return _refused(403, "this page only shows the robot: start `dxlrun view --control` to steer it")
         return _json(await run_in_threadpool(act, self.source, action))
+
+    def _may_steer(self, request: Request) -> bool:
+        return self.control and self._role(request) >= Role.COMMAND
+
+    def _role(self, request: Request) -> Role:
+        """Return the role of a browser: by its certificate; without TLS it is one of this computer."""
+        return Role.ADMIN if self.listener.tls is None else client_of(request).role
 
 
 def mesh_file(folder: Path, name: str) -> Path | None:
@@ -212,9 +230,14 @@ def mesh_file(folder: Path, name: str) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def hosts_of(address: str, port: int) -> tuple[str, ...]:
-    """Return the names under which a browser may reach a server."""
-    names: list[str] = []
+def scheme_of(listener: Listener) -> str:
+    """Return how the address of a page begins."""
+    return "http" if listener.tls is None else "https"
+
+
+def hosts_of(address: str, port: int, *others: str) -> tuple[str, ...]:
+    """Return the names under which a browser may reach a server; `others`: those in its certificate."""
+    names = [*others]
     if address in ("127.0.0.1", "localhost", ANY):
         names += ["localhost", "127.0.0.1"]
     if address == ANY:
@@ -224,7 +247,15 @@ def hosts_of(address: str, port: int) -> tuple[str, ...]:
 
 
 class Server(uvicorn.Server):
-    """Leaves signals to the command."""
+    """Leaves signals to the command; a listener with TLS makes its connections, as that of the gateway."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve the sockets of `run`."""
+        secured = [one for one in sockets or () if isinstance(one, Listener) and one.tls]
+        for listener in secured:
+            make = partial(Connection, self.config, self.server_state, {"listener": listener})
+            await listener.serve(make)
+        await super().startup([one for one in sockets or () if one not in secured])
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -248,17 +279,17 @@ def server_of(page: Page) -> Server:
     return Server(config)
 
 
-async def _body(request: Request, kind: type[Asked]) -> Asked:
-    """Return a request's body. Raises InputError."""
+async def _message(request: Request, decoder: Decoder[Message]) -> Message:
+    """Return the message in a request's body. Raises InputError for one that is not of its kind."""
     data = b""
     async for piece in request.stream():
         data += piece
         if len(data) > MOST_BYTES:
             raise InputError(f"a request has at most {MOST_BYTES} bytes")
     try:
-        return msgspec.json.decode(data, type=kind)
-    except msgspec.MsgspecError as error:
-        raise InputError(f"no request of this page: {error}") from error
+        return decoder.decode(data)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise InputError(f"this is not a request of this page: {error}") from error
 
 
 def _json(content: object) -> Response:

@@ -43,23 +43,27 @@ def view(
     browser
         Open the page in a browser.
     listen
-        Listen at HOST:PORT, HOST or :PORT. On another host than 127.0.0.1 the page is open to every machine
-        of the network that is given its address with the token; without a port it is 8765, or if that is
-        taken a free one.
+        Listen at HOST:PORT, HOST or :PORT. Beyond this computer both ends show a certificate of `dxlrun
+        keys`: the robot's, and the browser's, whose role decides whether it may steer. Without a port it is
+        8765, or if that is taken a free one.
     """
-    from dxlrun.remote.network.listener import LOOPBACK, Place, in_url
+    from dxlrun.remote.network.listener import Place, in_url
 
     place = Place.parse(listen)
     leave_real_time()
-    from dxlrun_view.server import ANY, PORT, Page, hosts_of, server_of
+    from dxlrun.remote.network.certificates import server_context
+    from dxlrun_view.server import PORT, Page, hosts_of, scheme_of, server_of
 
     source = _source(what)
     try:
-        with place.listener(PORT) as listener:
+        # the name in the robot's certificate, under which a browser has to reach the page
+        names = () if place.is_loopback else (source.shown().info.robot,)
+        tls = server_context(*names) if names else None
+        with place.listener(PORT, tls) as listener:
             address, taken = listener.getsockname()[:2]
-            page = Page(source, listener, hosts=hosts_of(place.host, taken), control=control)
-            host = in_url("127.0.0.1" if address == ANY else address)
-            url = f"http://{host}:{taken}/?token={page.token}"
+            page = Page(source, listener, hosts=hosts_of(place.host, taken, *names), control=control)
+            host = names[0] if names else in_url(address)
+            url = f"{scheme_of(listener)}://{host}:{taken}/?token={page.token}"
             server = server_of(page)
 
             def end(number: int, frame: FrameType | None) -> None:
@@ -67,11 +71,9 @@ def view(
 
             signal.signal(signal.SIGINT, end)
             signal.signal(signal.SIGTERM, end)
-            if place.host != LOOPBACK:
-                print_warning(f"{place.host}: every machine that is given this address can open the page")
             show(f"{source.shown().info.robot}: {url}", "Ctrl-C ends the page, not the robot.")
             sys.stdout.flush()
-            if browser:
+            if browser and not names:
                 threading.Thread(target=_open, args=(url,), daemon=True).start()
             server.run(sockets=[listener])
     finally:

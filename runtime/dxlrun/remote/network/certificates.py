@@ -41,7 +41,7 @@ def keys_place() -> Path:
 
 def server_context(name: str) -> ssl.SSLContext:
     """Return TLS as a robot's gateway has it; raises InputError where its certificate would be refused."""
-    context = _context(ssl.PROTOCOL_TLS_SERVER, name)
+    context = _context(ssl.PROTOCOL_TLS_SERVER, name, f"`dxlrun keys robot {name}` makes it")
     context.num_tickets = 0  # no byte is sent that answers no request, and no session is resumed
     _try(context, name)
     context.verify_mode = ssl.CERT_REQUIRED
@@ -50,15 +50,16 @@ def server_context(name: str) -> ssl.SSLContext:
 
 def client_context() -> ssl.SSLContext:
     """Return TLS as a client has it; raises InputError."""
-    return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT)
+    made = "`dxlrun keys client NAME --to DIRECTORY` on the robot's computer makes it, to be copied here"
+    return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT, made)
 
 
-def _context(protocol: int, name: str) -> ssl.SSLContext:
+def _context(protocol: int, name: str, remedy: str) -> ssl.SSLContext:
     place = keys_place()
     authority, certificate, key = (place / file for file in ("ca.crt", f"{name}.crt", f"{name}.key"))
     for file in (authority, certificate, key):
         if not file.is_file():
-            raise InputError(f"{file} is missing; `dxlrun keys` makes certificates")
+            raise InputError(f"{file} is missing; {remedy}")
     if key.stat().st_mode & 0o077:
         raise InputError(f"{key} can be read by other users: chmod 600 {key}, or renew it")
     context = ssl.SSLContext(protocol)

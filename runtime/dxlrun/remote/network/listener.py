@@ -14,6 +14,7 @@ import ssl
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from ipaddress import ip_address
 from typing import NamedTuple
 
 from dxlrun.errors import InputError
@@ -98,13 +99,21 @@ class Place(NamedTuple):
         host = (found[3] or found[1]).strip("[]")
         return cls(host or LOOPBACK, int(found[2]) if found[2] else None)
 
-    def listener(self, usual: int) -> Listener:
+    @property
+    def is_loopback(self) -> bool:
+        """True where only this computer reaches it."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    def listener(self, usual: int, tls: ssl.SSLContext | None = None) -> Listener:
         """Return a socket that listens here; without a port on the usual one. Raises InputError."""
         port = usual if self.port is None else self.port
         try:
-            return Listener(self.host, port)
+            return Listener(self.host, port, tls)
         except OSError as error:
             if self.port is None and error.errno == errno.EADDRINUSE:
-                return Place(self.host, 0).listener(usual)
+                return Place(self.host, 0).listener(usual, tls)
             why = f"{in_url(self.host)}:{port} cannot be listened on: {error.strerror or error}"
             raise InputError(f"{why}; give another --listen HOST:PORT") from error
