@@ -40,8 +40,12 @@ def asked(monkeypatch):
 def may(monkeypatch):
     """Set what this process may: capabilities, and the limits of memory and priority."""
 
-    def set_rights(*capabilities, memlock=8 << 20, rtprio=0):
-        limits = {resource.RLIMIT_MEMLOCK: memlock, resource.RLIMIT_RTPRIO: rtprio}
+    def set_rights(*capabilities, memlock=8 << 20, rtprio=0, nice=0):
+        limits = {
+            resource.RLIMIT_MEMLOCK: memlock,
+            resource.RLIMIT_RTPRIO: rtprio,
+            resource.RLIMIT_NICE: nice,
+        }
         monkeypatch.setattr(realtime, "has_capability", lambda bit: bit in capabilities)
         monkeypatch.setattr(resource, "getrlimit", lambda which: (limits[which],) * 2)
 
@@ -166,6 +170,26 @@ def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
 def test_the_highest_priority_is_what_limit_and_capability_allow(may, capabilities, rtprio, highest):
     may(*capabilities, rtprio=rtprio)
     assert realtime.highest_priority() == highest
+
+
+def test_a_share_is_raised_as_far_as_the_limit_allows(may):
+    may()
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+
+        def raised(nice):
+            realtime.raise_share(process.pid, nice)
+            return os.getpriority(os.PRIO_PROCESS, process.pid)
+
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert raised(-10) == own
+        may(nice=20 - own + 1)
+        assert realtime.lowest_nice() == own - 1
+        may(realtime.SYS_NICE)
+        if os.geteuid() == 0:  # the right itself, not what this process believes of it
+            assert raised(own - 3) == own - 3
+            assert raised(own - 1) == own - 3
+        assert process.communicate(b"\n")[0] is None
+    realtime.raise_share(process.pid, -10)
 
 
 def test_capabilities_are_read_from_the_kernels_mask(tmp_path):

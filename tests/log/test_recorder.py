@@ -12,9 +12,11 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from dxlrun.channels import ring
@@ -26,7 +28,7 @@ from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.clock import VirtualClock
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
-from dxlrun.log.schemas import MACHINE_TOPIC, LogHeader, RecorderJob
+from dxlrun.log.schemas import MACHINE_TOPIC, CycleSpan, LogHeader, RecorderJob
 
 Cycle = Callable[[int], bytes]
 
@@ -37,6 +39,7 @@ class Recording:
 
     path: Path
     process: subprocess.Popen[bytes]
+    span: int
     control: socket.socket
     cycles: RingWriter
     packets: PacketBatch
@@ -58,6 +61,11 @@ class Recording:
 Start = Callable[..., Recording]
 
 
+def clock_module(clock: VirtualClock) -> SimpleNamespace:
+    """Stand in for the module `time`."""
+    return SimpleNamespace(monotonic=lambda: clock.now_ns() / 1e9, monotonic_ns=clock.now_ns)
+
+
 @pytest.fixture
 def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[Start]:
     descriptors: list[int] = []
@@ -75,21 +83,23 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
         job_fd = os.memfd_create("job")
         ours, theirs = socket.socketpair()
         ours.settimeout(60)
-        os.write(job_fd, msgspec.json.encode(RecorderJob(str(path), header, rings)))
+        span = os.memfd_create("span")
+        os.write(job_fd, msgspec.json.encode(RecorderJob(str(path), header, rings, span=span)))
         os.lseek(job_fd, 0, os.SEEK_SET)
-        descriptors.extend([*rings.values(), job_fd])
+        descriptors.extend([*rings.values(), job_fd, span])
         cycles = RingWriter(rings["loop/cycles"])
         if before is not None:
             before(cycles)
         words = ["--job-fd", str(job_fd), "--control-fd", str(theirs.fileno())]
         process = subprocess.Popen(
             [sys.executable, "-m", "dxlrun.log.recorder", *words],
-            pass_fds=[*rings.values(), job_fd, theirs.fileno()],
+            pass_fds=[*rings.values(), job_fd, span, theirs.fileno()],
         )
         theirs.close()
         recording = Recording(
             path,
             process,
+            span,
             ours,
             cycles,
             PacketBatch(RingWriter(rings["loop/packets"])),
@@ -208,7 +218,7 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     assert next(recording.lines) == {"type": "Ready"}
     for number in range(20):
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
-    while len(read_log(recording.path).cycles) < 20:  # until a flush, which needs no help from here
+    while CycleSpan.load(recording.span).last_ns is None:  # until a flush, which needs no help from here
         assert recording.process.poll() is None
     assert read_log(recording.path).being_written
     recording.process.send_signal(signal.SIGKILL)
@@ -216,11 +226,46 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     log = read_log(recording.path)
     assert not log.complete
     assert not log.being_written
-    assert log.damage == (
-        "the file has no end: its recorder was killed, or could write no more; its last cycle is at "
-        f"{(int(log.cycles[-1]['written_ns']) - int(log.cycles[0]['scheduled_ns'])) / 1e9:.1f} s of the run",
-    )
+    last = CycleSpan(int(log.cycles["scheduled_ns"][0]), int(log.cycles["written_ns"][-1])).last_cycle_text
+    assert log.damage == (f"the file has no end: its recorder was killed, or could write no more; {last}",)
+    assert CycleSpan.load(recording.span).last_cycle_text == last
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
+
+
+def test_a_recorder_that_is_short_of_processor_time_flushes_every_half_second(
+    tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each record takes 5 ms, a hundred times as long as usual, and 3000 wait in three rings."""
+    clock = VirtualClock(0)
+    monkeypatch.setattr("dxlrun.log.recorder.time", clock_module(clock))
+    rings = {name: ring.create(name, 1000 * record_size(layout.size), layout.size) for name in "abc"}
+    for memory in rings.values():
+        writer = RingWriter(memory)
+        for number in range(1000):
+            writer.append(RecordKind.CYCLE, cycle(number))
+    flushed: list[int] = []
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        job = RecorderJob(str(tmp_path / "run.mcap"), header, rings)
+        recorder = Recorder(job, MessageChannel(theirs, REQUESTS))
+        take, flush = recorder._log.take, recorder._log.flush
+
+        def take_slowly(kind: int, payload: ring.Payload) -> None:
+            clock.wait_until(clock.now_ns() + 5_000_000)
+            take(kind, payload)
+
+        def note_flush() -> None:
+            flushed.append(clock.now_ns())
+            flush()
+
+        monkeypatch.setattr(recorder._log, "take", take_slowly)
+        monkeypatch.setattr(recorder._log, "flush", note_flush)
+        recorder.run(lambda: True)
+    for memory in rings.values():
+        os.close(memory)
+    assert len(read_log(tmp_path / "run.mcap").cycles) == 3000
+    assert max(np.diff([0, *flushed])) <= 505_000_000
+    assert len(flushed) >= 29
 
 
 @pytest.mark.parametrize("end", ["SIGTERM", "the supervisor is gone"])

@@ -12,7 +12,8 @@ import pytest
 from rich.console import Console
 
 from dxlrun.channels.events import EventCode
-from dxlrun.control.realtime import Grant, highest_priority
+from dxlrun.control.realtime import Grant, highest_priority, lowest_nice
+from dxlrun.run.run_processes import RECORDER_NICE
 from dxlrun.run.run_summary import granted_text, refusals, show_grants
 
 GRANTS = (
@@ -132,9 +133,11 @@ def test_nothing_but_what_asked_for_it_has_the_real_time_of_the_terminal(start):
         }
         for name, pid in run.processes().items()
     }
+    nice = os.getpriority(os.PRIO_PROCESS, run.child("dxlrun.log.recorder"))
     run.signal(signal.SIGTERM)
     run.finish()
     ours = {"run.guardian", "run.loop_process", "simulation"}
     assert found.keys() - ours == {"dxlrun", "log.recorder", "remote"}
+    assert nice == max(RECORDER_NICE, min(0, lowest_nice()))
     assert all(found[name] == {os.SCHED_OTHER} for name in found.keys() - ours)
     assert all(os.SCHED_OTHER not in found[name] for name in ours)

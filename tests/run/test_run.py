@@ -89,7 +89,9 @@ def test_killing_the_recorder_does_not_stop_the_robot(start, all_limp, wait_for)
     before = len(goals(run))
     code, out, err = run.finish()
     assert code == 1
-    assert "recorder" in err
+    (sentence,) = [line for line in err.splitlines() if "the recorder ended before the run did" in line]
+    assert run.log().damage[0].endswith(sentence.partition("can be read: ")[2])
+    assert "its last cycle is at" in sentence
     assert "pair: failed: ran for 3." in out
     assert run.ledger()[-1].t_ns - run.ledger()[0].t_ns > 3_000_000_000  # by the log 0.5 s
     assert len(goals(run)) > before

@@ -124,6 +124,8 @@ class RunMemory:
     stderr: int
     kept: int
     """What controllers kept in earlier runs."""
+    span: int
+    """Which cycles the log has on the disk, written by the recorder at each flush."""
     sensors: tuple[int, ...] = ()
     """Slots of the sensors, in the order of the plan."""
     shafts: int = -1

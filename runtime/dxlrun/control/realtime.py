@@ -264,6 +264,20 @@ def allow_idle_latency(account: str = "") -> str:
     )
 
 
+def raise_share(process: int, nice: int) -> None:
+    """Give an ordinary process a larger share of a busy processor, as far as its user may; never raises.
+
+    Without CAP_SYS_NICE or a limit (RLIMIT_NICE), a process keeps its share. Linux may divide a processor
+    among sessions first (sched_autogroup, sched(7)): each process of a run is a session of its own, so the
+    nice value of the group counts there, which has the same limit.
+    """
+    lowest = max(nice, lowest_nice())
+    with suppress(OSError):
+        if lowest < os.getpriority(os.PRIO_PROCESS, process):
+            os.setpriority(os.PRIO_PROCESS, process, lowest)
+            Path(f"/proc/{process}/autogroup").write_text(f"{lowest}")
+
+
 # Memory
 
 HEAP = 8 << 20
@@ -402,6 +416,19 @@ def highest_priority() -> int:
         return 99
     limit = getattr(resource, "RLIMIT_RTPRIO", None)
     return 0 if limit is None else _finite(resource.getrlimit(limit)[0], 99)
+
+
+def lowest_nice() -> int:
+    """Return the lowest nice value that this process may take by its limit (RLIMIT_NICE, getrlimit(2)).
+
+    -20 with CAP_SYS_NICE; 20: none lower than its own.
+    """
+    import resource
+
+    if has_capability(SYS_NICE):
+        return -20
+    limit = getattr(resource, "RLIMIT_NICE", None)
+    return 20 if limit is None else 20 - _finite(resource.getrlimit(limit)[0], 40)
 
 
 def lockable_bytes() -> int:

@@ -17,7 +17,7 @@ from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.run_messages import RunMessages
-from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
+from dxlrun.log.schemas import CycleSpan, LogHeader, LogSummary, to_metadata
 from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
@@ -37,8 +37,10 @@ class LogWriter(RunMessages):
     or begun raises OSError.
     """
 
-    def __init__(self, path: Path, header: LogHeader) -> None:
+    def __init__(self, path: Path, header: LogHeader, span: CycleSpan | None = None) -> None:
+        """`span`: of the earlier parts of the same log, which is extended."""
         super().__init__(header)
+        self.span = span or self.span
         self.error: str | None = None
         self.late_metadata: dict[str, dict[str, str]] = {}
         """Written at the end, beside the header's: what became known in the run."""
@@ -46,6 +48,7 @@ class LogWriter(RunMessages):
         self._messages = self._lost = self._unwritten = 0
         self.first_ns = self.last_ns = 0  # Of the messages so far
         self._whole_bytes = self._whole_messages = 0
+        self._whole_last_ns: int | None = None
         self._summary: LogSummary | None = None
         self._writer = Writer(
             cast("IO[bytes]", self._file), chunk_size=sys.maxsize, compression=CompressionType.ZSTD
@@ -109,6 +112,7 @@ class LogWriter(RunMessages):
         self._write_packets()
         self._writer.flush()
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
+        self._whole_last_ns = self.span.last_ns
         self._chunk_bytes = 0
 
     def _guarded(self, write: Callable[[Written], None], what: Written) -> None:
@@ -126,6 +130,9 @@ class LogWriter(RunMessages):
             self._file.truncate(self._whole_bytes)
         except OSError:
             return  # what lies behind the last whole chunk stays; a reader stops there
+        self.span.last_ns = self._whole_last_ns
+        if self.span.last_ns is not None and self._file.tell() == self._whole_bytes:
+            self.error += f"; {self.span.last_cycle_text}"
 
     def take(self, kind: int, payload: Payload) -> None:
         """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
@@ -149,16 +156,21 @@ class LogWriter(RunMessages):
         event = Event(self.last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
         self._guarded(self.event, event)
 
-    def flush(self, *, sync: bool = False) -> None:
-        """Finish the chunk in progress, so that a reader finds it; with `sync`, wait for the disk."""
-        if self.error is not None:
-            return
-        try:
-            self._end_chunk()
-            if sync:
+    def flush(self) -> None:
+        """Finish the chunk in progress: a reader finds it, also when this process is killed."""
+        if self.error is None:
+            try:
+                self._end_chunk()
+            except OSError as error:
+                self._give_up(error)
+
+    def sync(self) -> None:
+        """Wait until the disk has what was flushed: a reader finds it also after a loss of power."""
+        if self.error is None:
+            try:
                 self._file.sync()
-        except OSError as error:
-            self._give_up(error)
+            except OSError as error:
+                self._give_up(error)
 
     def close(self) -> LogSummary:
         """Finish the file and return what is in it; a second call returns the same.

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.schemas import LogHeader, LogSummary
+from dxlrun.log.schemas import CycleSpan, LogHeader, LogSummary
 from dxlrun.plan.recording_plan import (
     PART_END_NAME,
     PART_NAME,
@@ -42,6 +42,8 @@ class PartWriter:
         self._plan = recording
         self.late_metadata: dict[str, dict[str, str]] = {}
         """Of the run: written at the end of each part that ends from now on."""
+        self.span = CycleSpan()
+        """Of the cycles that were taken, in all parts."""
         self._error: str | None = None
         self._unwritten = 0
         """Records that came when the last part that could be written was closed."""
@@ -63,7 +65,7 @@ class PartWriter:
         self._path = self._folder / part_name(index)
         try:
             header = replace(self._header, metadata={**self._header.metadata, PART_NAME: part})
-            log = LogWriter(self._path, header)
+            log = LogWriter(self._path, header, self.span)
         except FileExistsError:
             raise
         except OSError:
@@ -130,10 +132,15 @@ class PartWriter:
         if self._error is None:
             self._log.gap(source, lost)
 
-    def flush(self, *, sync: bool = False) -> None:
-        """Finish the chunk in progress, so that a reader finds it; with `sync`, wait for the disk."""
+    def flush(self) -> None:
+        """Finish the chunk in progress: a reader finds it, also when this process is killed."""
         if self._error is None:
-            self._log.flush(sync=sync)
+            self._log.flush()
+
+    def sync(self) -> None:
+        """Wait until the disk has what was flushed."""
+        if self._error is None:
+            self._log.sync()
 
     def close(self) -> LogSummary:
         """Finish the last part, and return what was in all of them; a second call returns the same."""

@@ -1,4 +1,8 @@
-"""The recorder: a process that reads the rings and writes the log, at its own pace beside the loop."""
+"""The recorder: a process that reads the rings and writes the log, at its own pace beside the loop.
+
+A record is in the file FLUSH_S after the recorder has read it, plus the time that the disk takes. A recorder
+that gets too little of the processor falls behind: records then wait in the rings, which hold RING_SECONDS.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,7 @@ from dxlrun.plan.machine_load import SAMPLE_PERIOD_NS, LoadMeter, MachineLoad
 POLL_S = 0.005
 FLUSH_S = 0.5
 SYNC_S = 2.0
-_MOST_PER_TURN = 2000
+_MOST_PER_TURN = 100  # Of one ring, so that no ring waits long for another
 
 
 Request = LateMetadata | LoopRuns | Finish
@@ -46,6 +50,7 @@ class Recorder:
         self._supervisor = supervisor
         self._log = open_writer(Path(job.path), job.header, job.recording)
         self._rings = [(name, RingReader(descriptor)) for name, descriptor in job.rings.items()]
+        self._span = job.span
         self._reported = False
         self._layout = job.header.layout
         self._codec = Codec(MACHINE)
@@ -92,15 +97,24 @@ class Recorder:
         full = [self._drain(name, ring) for name, ring in self._rings]
         if isinstance(self._log, PartWriter):
             self._log.settle()
-        now = time.monotonic()
-        if now >= self._next_flush:
-            sync = now >= self._next_sync
-            self._log.flush(sync=sync)
-            self._next_flush = now + FLUSH_S
-            self._next_sync = now + SYNC_S if sync else self._next_sync
+        if time.monotonic() >= self._next_flush:
+            self._flush()
         self._sample_machine()
         self._report()
         return any(full)
+
+    def _flush(self) -> None:
+        """Finish the chunk in progress, and set when the next one is due: counted from the end of this flush.
+
+        A disk that takes longer than FLUSH_S would leave no time for the rings otherwise.
+        """
+        self._log.flush()
+        if self._span >= 0 and self._log.error is None:
+            self._log.span.store(self._span)
+        if time.monotonic() >= self._next_sync:
+            self._log.sync()
+            self._next_sync = time.monotonic() + SYNC_S
+        self._next_flush = time.monotonic() + FLUSH_S
 
     def _sample_machine(self) -> None:
         """Write what the machine did since the last sample; a run with processes has the monotonic clock."""
@@ -117,11 +131,18 @@ class Recorder:
                     meter.add(sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
-        """Write what is in a ring, at most _MOST_PER_TURN records; return whether there may be more."""
-        lost, record = 0, None
+        """Write the records of a ring, at most _MOST_PER_TURN, until a flush is due.
+
+        Returns:
+            True when there may be more records.
+        """
+        lost, more = 0, True
         for _ in range(_MOST_PER_TURN):
+            if time.monotonic() >= self._next_flush:
+                break
             record = ring.read()
             if record is None:
+                more = False
                 break
             if isinstance(record, Gap):
                 lost += record.lost
@@ -134,7 +155,7 @@ class Recorder:
                 lost += 1  # whole, but not what the log can hold: declared like any other loss
         if lost:
             self._log.gap(name, lost)
-        return record is not None
+        return more
 
     def _begin_run(self, payload: Payload) -> None:
         """Begin to measure the load of the run at its first deadline; activation is part of start-up."""

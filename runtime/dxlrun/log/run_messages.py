@@ -18,7 +18,7 @@ from dxlrun.log import schemas
 from dxlrun.log.packing.bus_messages import pack_packets
 from dxlrun.log.packing.diagnostics import Diagnostics
 from dxlrun.log.packing.frame_messages import Stamp, frame_messages
-from dxlrun.log.schemas import LogHeader
+from dxlrun.log.schemas import CycleSpan, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 
@@ -33,6 +33,8 @@ class RunMessages(ABC):
 
     def __init__(self, header: LogHeader) -> None:
         self.header = header
+        self.span = CycleSpan()
+        """Of the cycles that were taken."""
         self._layout = header.layout
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
         """Channels with one message, and what makes it of the time of the first record."""
@@ -111,6 +113,7 @@ class RunMessages(ABC):
         """
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
+        self.span.add(record, self.header.period_ns)
         written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
         if int(record["cycle"]) < 0:
             self._add(self._activation_channel, written_ns, ENCAPSULATION + data)

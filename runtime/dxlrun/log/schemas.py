@@ -7,6 +7,8 @@ PlotJuggler and Rerun open a log without conversion. Every channel carries the R
 
 from __future__ import annotations
 
+import os
+import struct
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -309,6 +311,9 @@ class LogHeader(msgspec.Struct, frozen=True):
         return CycleLayout(self.joints, names, self.references, self.sources, self.device_commands)
 
 
+_SPAN = struct.Struct("=qq")
+
+
 class CycleSpan:
     """Time of a run that the cycles in a log cover: from the first deadline to the last cycle."""
 
@@ -316,6 +321,17 @@ class CycleSpan:
 
     def __init__(self, begin_ns: int | None = None, last_ns: int | None = None) -> None:
         self.begin_ns, self.last_ns = begin_ns, last_ns
+
+    @classmethod
+    def load(cls, descriptor: int) -> CycleSpan:
+        """Return the span that a recorder has stored in a nameless file; an empty one before that."""
+        data = os.pread(descriptor, _SPAN.size, 0)
+        return cls(*_SPAN.unpack(data)) if len(data) == _SPAN.size else cls()
+
+    def store(self, descriptor: int) -> None:
+        """Store the span in a nameless file, where it outlives this process."""
+        if self.begin_ns is not None and self.last_ns is not None:
+            os.pwrite(descriptor, _SPAN.pack(self.begin_ns, self.last_ns), 0)
 
     def add(self, record: np.void, period_ns: int) -> None:
         """Extend the span by a record of /cycle or /activation, which has number -1 and the first deadline.
@@ -344,6 +360,8 @@ class RecorderJob(msgspec.Struct, frozen=True):
     rings: dict[str, int]
     """Descriptors of the rings that it reads, by their names."""
     recording: RecordingPlan = RecordingPlan()
+    span: int = -1
+    """Descriptor of the nameless file for the CycleSpan of what was flushed; -1: none."""
 
 
 class LogSummary(msgspec.Struct, frozen=True):

@@ -20,9 +20,8 @@ from dxlrun.channels.messages import LONGEST_RECORD, message_capacity, usual_mes
 from dxlrun.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
-from dxlrun.control.realtime import Grant, guardian_priority
+from dxlrun.control.realtime import Grant, guardian_priority, raise_share
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
-from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.guardian import GuardianJob, GuardianMessage
@@ -37,6 +36,7 @@ GatewayMessage = Listening | Failed
 
 Message = TypeVar("Message")
 
+RECORDER_NICE = -10  # Nine times the share of an ordinary program (sched(7)); it needs 6 % of a core at 1 kHz
 _GUARDIAN_CAPACITY = 2 << 20
 """Bytes: it sends and receives little, and reports little."""
 _LONGEST_TAKEN = LONGEST_COMMAND + 64
@@ -73,6 +73,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         grants=process.memory_file("dxlrun-grants"),
         stderr=process.memory_file("dxlrun-stderr"),
         kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
+        span=process.memory_file("dxlrun-span"),
         sensors=tuple(slot.create(f"sensor-{one.name}", len(one.states)) for one in plan.loop.sensors),
         shafts=slot.create("shafts", 3 * len(sensed.bodies.joints)) if sensed is not None else -1,
     )
@@ -137,18 +138,22 @@ def start_sensor(
     return _executed(program, job, inherited, memory, Decoder(SensorMessage))
 
 
-def start_recorder(
-    log: Path, header: LogHeader, memory: RunMemory, recording: RecordingPlan
-) -> Child[RecorderMessage]:
-    """Start the recorder and wait until the log is open."""
-    job = RecorderJob(str(log), header, memory.recorded, recording)
+def start_recorder(log: Path, header: LogHeader, memory: RunMemory, plan: Plan) -> Child[RecorderMessage]:
+    """Start the recorder and wait until the log is open.
+
+    With a loop in real time it gets a larger share of the processor, so that other programs do not keep it
+    from the rings. With an ordinary loop it does not: it would be ahead of that, too.
+    """
+    job = RecorderJob(str(log), header, memory.recorded, plan.recording, memory.span)
     child: Child[RecorderMessage] = _executed(
         Program("recorder", "dxlrun.log.recorder"),
         job,
-        memory.recorded.values(),
+        (*memory.recorded.values(), memory.span),
         memory,
         Decoder(RecorderMessage),
     )
+    if plan.loop.scheduler.policy != "other":
+        raise_share(child.process.pid, RECORDER_NICE)
     try:
         child.ready()
     except BaseException:

@@ -41,7 +41,7 @@ from dxlrun.control.realtime import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
-from dxlrun.log.schemas import FAILURES_NAME, LogClosed
+from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import sensor_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
@@ -200,7 +200,7 @@ class _Run:
             self.sensors.append(_SensorProcess(self.plan, index, self.memory, sensor))
         if self.log:
             header = log_header(self.plan, self.offset_ns, virtual=False, kept=self.kept)
-            self.recorder = start_recorder(self.log, header, self.memory, self.plan.recording)
+            self.recorder = start_recorder(self.log, header, self.memory, self.plan)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
         for each in self.sensors:
@@ -419,9 +419,8 @@ class _Run:
             self.sentences.append(f"{fault} and was killed")
             recorder.kill()
         if not closed:
-            self.sentences.append(
-                f"the recorder ended before the run did; {self.log} is readable up to its last second"
-            )
+            last = CycleSpan.load(self.memory.span).last_cycle_text
+            self.sentences.append(f"the recorder ended before the run did; {self.log} can be read: {last}")
 
 
 def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:

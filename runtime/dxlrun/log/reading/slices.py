@@ -50,7 +50,7 @@ _OWN = frozenset(
 )
 """What this module reads by itself."""
 _MOST_HELD = 4096
-"""Cycles that wait for their packets, or the other way round: the recorder takes 2000 of a ring in turn."""
+"""Cycles that wait for their packets, or the other way round: recorders took up to 2000 of a ring in turn."""
 _MOST_PACKETS_HELD = 1 << 18
 _NO_PACKETS = PacketColumns.of(())
 
