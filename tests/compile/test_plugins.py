@@ -1,13 +1,16 @@
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
 from pydantic import Field
 from tests.kit.robots import PAIR, compile_text, problems_in
+from tests.kit.stories import plugin_folder
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import robot
+from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
 
 
@@ -76,6 +79,47 @@ def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
     assert controller.topics == ("/mine/main",)
     (problem,) = problems_in(text.replace("mine:", "bus:"))
     assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "call bus otherwise")
+
+
+HOOKED = """\
+import dxlrun
+from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
+@dxlrun.hookimpl
+def dxlrun_contract():
+    return dxlrun.CONTRACT_VERSION
+@dxlrun.hookimpl
+def dxlrun_controllers():
+    return {{"{name}": JointStateBroadcaster}}
+"""
+LATE = """\
+@dxlrun.hookimpl
+def dxlrun_overrun():
+    return None
+"""
+
+
+def test_only_packages_that_run_in_the_robot_are_in_its_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugin_folder(tmp_path, "used_plug_in", HOOKED.format(name="used"), "used-robots")
+    plugin_folder(tmp_path, "idle_plug_in", HOOKED.format(name="idle"), "idle-robots")
+    plugin_folder(tmp_path, "late_plug_in", HOOKED.format(name="late") + LATE, "late-robots")
+    monkeypatch.syspath_prepend(tmp_path)
+    text = PAIR.partition("controllers:")[0]
+    late = {"late_plug_in": "late-robots"}
+    assert compile_text(text).plan.packages == late
+    used = compile_text(f"{text}controllers: {{a: {{type: used}}}}\n").plan
+    standard = {"dxlrun_controllers": "dxlrun"}  # the class is in this package
+    assert used.packages == {**late, **standard, "used_plug_in": "used-robots"}
+
+
+@pytest.mark.needs("physics")
+def test_the_package_of_physics_runs_where_servos_are_simulated() -> None:
+    robot = Path(__file__).parents[2] / "robots" / "held_arm.yaml"
+    simulated = compile_files(robot, {}, []).plan.packages
+    assert simulated["dxlrun_mujoco"] == "dxlrun"
+    real = compile_files(robot, {"port": "/dev/ttyUSB0"}, []).plan.packages
+    assert set(simulated) - set(real) == {"dxlrun_mujoco"}
 
 
 MOTION = """\

@@ -6,13 +6,12 @@ import platform
 import subprocess
 import sys
 from hashlib import sha256
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 from dxlrun.log import identity
-from dxlrun.log.identity import IDENTITY_NAME, code_hashes, git_state, module_files
+from dxlrun.log.identity import IDENTITY_NAME, code_hashes, git_state, module_files, package_of
 from dxlrun.log.reader import read_log
 from dxlrun.testing import simulated_robot
 
@@ -51,6 +50,9 @@ def test_a_log_has_the_hash_of_each_file_of_its_run(tmp_path: Path) -> None:
     assert record["urdf"] == sha256((ROBOTS / "urdf/bioloid_torso.urdf").read_bytes()).hexdigest()
     group = Path(sys.modules["dxlrun_controllers.group"].__file__ or "")
     assert record["plugin dxlrun dxlrun_controllers/group.py"] == sha256(group.read_bytes()).hexdigest()
+    assert {package_of(key) for key in record if key.startswith("plugin ")} == {
+        ("dxlrun_controllers", "dxlrun")
+    }
     assert len(record["runtime"]) == 64
     assert record["host"] == platform.node()
     assert platform.release() in record["kernel"]
@@ -123,15 +125,15 @@ def test_another_byte_in_a_plug_in_is_another_hash(tmp_path: Path, monkeypatch: 
     (package / "wave.py").write_text("amplitude = 1\n")
     (package / "__pycache__/wave.cpython-311.pyc").write_bytes(b"not a source")
     monkeypatch.syspath_prepend(tmp_path)
-    point = EntryPoint("waves", "waves.wave", "dxlrun")
-    monkeypatch.setattr(identity, "entry_points", lambda group: [point])
-
-    before = code_hashes()
+    before = code_hashes([("waves", "wave-robots")])
     (package / "wave.py").write_text("amplitude = 2\n")
-    after = code_hashes()
+    after = code_hashes([("waves", "wave-robots")])
 
-    assert [key for key in after if before[key] != after[key]] == ["plugin unknown waves/wave.py"]
-    assert set(before) == {"plugin unknown waves/wave.py", "plugin unknown waves/__init__.py", "runtime"}
+    key = "plugin wave-robots waves/wave.py"
+    assert [name for name in after if before[name] != after[name]] == [key]
+    assert set(before) == {key, "plugin wave-robots waves/__init__.py", "runtime"}
+    assert package_of(key) == ("waves", "wave-robots")
+    assert package_of("plugin wave-robots wave.py") == ("wave", "wave-robots")
 
 
 def test_a_package_without_a_place_has_no_files(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
-from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.plugins import PlugIns, distribution_name
 from dxlrun.errors import LogError
-from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key
+from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key, package_of
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import LoopPlan
@@ -153,13 +153,12 @@ def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
     then = inputs.log.metadata.get(IDENTITY_NAME, {})
     if not then:
         return ()
-    now = code_hashes()
+    used = {distribution_name(plan.distribution) for plan in inputs.plan.loop.controllers}
+    packages = {package_of(key) for key in then if key.startswith(file_key(PLUGIN, ""))}
+    now = code_hashes(one for one in packages if one[1] in used)
     sentences = []
     if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
         sentences.append("dxlrun itself has changed since the run")
-    used = {
-        plan.distribution.rpartition(" ")[0] or plan.distribution for plan in inputs.plan.loop.controllers
-    }
     for name in sorted(used):
         prefix = file_key(f"{PLUGIN} {name}", "")
         own = sorted(key for key in {*then, *now} if key.startswith(prefix))

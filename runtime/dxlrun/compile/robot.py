@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -43,7 +44,7 @@ from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
-from dxlrun.plan.robot_plan import MotionPart, Plan
+from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import Row
@@ -244,9 +245,24 @@ def compile_robot(
         simulation=simulation,
         groups=description.groups,
         gateway=robot.processes.gateway.enabled,
+        packages=plugins.packages_of(loop.controllers, sensors, _models(buses)) | _physics(simulation, buses),
         mechanics=compile_mechanics(joints),
     )
     return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
+
+
+def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
+    """Return the models of all servos and devices."""
+    servos = {servo.model for bus in buses for servo in bus.servos}
+    return frozenset(servos | {device.model for bus in buses for device in bus.devices})
+
+
+def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:
+    """Return the package that moves the bodies of simulated servos, with its distribution; {} without."""
+    if not any(bus.port == SIMULATED for bus in buses):
+        return {}
+    points = entry_points(group="dxlrun.physics", name=simulation.physics)
+    return {one.module.partition(".")[0]: one.dist.name for one in points if one.dist is not None}
 
 
 def _check_scheduler(file: RobotFile) -> None:

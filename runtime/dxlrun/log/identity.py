@@ -12,11 +12,8 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
-
-from dxlrun.contract.hookspecs import GROUP
 
 IDENTITY_NAME = "identity"
 """The metadata record; docs/how-to/logs.md has its keys."""
@@ -27,17 +24,23 @@ HOST, KERNEL, REVISION, CHANGED = "host", "kernel", "git revision", "git changed
 _GIT_TIMEOUT_S = 2.0
 """For all questions to git together: a folder of a network may answer late, and the run waits for it."""
 _MOST_FILES = 2_000
-"""Of one plug-in: a bound on the time before a run, not on packages."""
+"""Of one package: a bound on the time before a run, not on packages."""
 _BUILT = (".pyc", ".so")
 """Suffixes of what each machine makes of sources by itself."""
 
 
-def identity(source_file: str, files: Mapping[str, str]) -> dict[str, str]:
-    """Return the record of a run: `files` are texts by their keys, as `file_key` makes them."""
+def identity(source_file: str, files: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, str]:
+    """Return the record of a run.
+
+    Args:
+        source_file: Path of the robot file.
+        files: Texts by their keys, as `file_key` makes them.
+        packages: The packages of plug-ins that run, with their distributions (`Plan.packages`).
+    """
     folder = Path(source_file).parent
     return {
         **{key: sha256(text.encode()).hexdigest() for key, text in files.items()},
-        **_imported(frozenset(_plugin_modules())),
+        **_imported(frozenset(packages.items())),
         **git_state(folder, Path(source_file).name),
         HOST: platform.node(),
         KERNEL: " ".join((platform.system(), platform.release(), platform.version(), platform.machine())),
@@ -49,18 +52,17 @@ def file_key(what: str, name: str) -> str:
     return f"{what} {name}"
 
 
-def code_hashes() -> dict[str, str]:
-    """Return the hash of each file of the plug-ins that are installed, and one of dxlrun's own code.
+def code_hashes(packages: Iterable[tuple[str, str]] = ()) -> dict[str, str]:
+    """Return the hash of each file of some packages, and one of dxlrun's own code.
 
-    `plugin DISTRIBUTION PACKAGE/FILE.py` -> SHA-256; a package counts from its top. Of a plug-in with more
+    `plugin DISTRIBUTION PACKAGE/FILE.py` -> SHA-256; a package counts from its top. Of a package with more
     than 2000 files only the first, by name.
+
+    Args:
+        packages: Top packages or modules with their distributions.
     """
-    return _code_hashes(frozenset(_plugin_modules()))
-
-
-def _code_hashes(modules: frozenset[tuple[str, str]]) -> dict[str, str]:
     hashes: dict[str, str] = {}
-    for distribution, module in sorted(modules):
+    for module, distribution in sorted(packages):
         for number, (name, path) in enumerate(module_files(module)):
             if number == _MOST_FILES:
                 break
@@ -72,13 +74,13 @@ def _code_hashes(modules: frozenset[tuple[str, str]]) -> dict[str, str]:
     return {**hashes, RUNTIME: whole.hexdigest()}
 
 
-def _plugin_modules() -> Iterator[tuple[str, str]]:
-    """Yield distribution and top package of each plug-in."""
-    for point in entry_points(group=GROUP):
-        yield (point.dist.name if point.dist else "unknown"), point.module.partition(".")[0]
+def package_of(key: str) -> tuple[str, str]:
+    """Return package and distribution of a key of a plug-in's file."""
+    distribution, _, name = key.removeprefix(file_key(PLUGIN, "")).rpartition(" ")
+    return name.partition("/")[0].removesuffix(".py"), distribution
 
 
-_imported = cache(_code_hashes)
+_imported = cache(code_hashes)
 """The code of this process, which imports it once."""
 
 

@@ -50,6 +50,9 @@ class Plan(msgspec.Struct, frozen=True):
     simulation: SimulationPlan = SimulationPlan()
     groups: dict[str, tuple[str, ...]] = {}  # Names that stand for some joints
     gateway: bool = True  # Others may steer the run, over a Unix socket
+    packages: dict[str, str] = {}
+    """Packages of plug-ins that run in this robot, with their distributions: those of its controllers,
+    sensors, servo models, physics and hooks of the loop."""
     mechanics: MechanicsPlan = MechanicsPlan()
     """Which servos move which joints; empty: each joint has one servo."""
 

@@ -52,7 +52,7 @@ def log_header(
                 "simulated": " ".join(bus.name for bus in plan.buses if virtual or is_simulated(bus.port)),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },
-            IDENTITY_NAME: identity(plan.source_file, _files(plan)),
+            IDENTITY_NAME: identity(plan.source_file, _files(plan), plan.packages),
             "versions": {"python": sys.version.split()[0], "contract": str(CONTRACT_VERSION)}
             | {name: version(name) for name in _LIBRARIES},
             "plugins": {controller.type: controller.distribution for controller in plan.loop.controllers},

@@ -7,7 +7,7 @@ the types of what is declared; the rest is the author's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -144,6 +144,8 @@ class LoadedPlugIn(msgspec.Struct, frozen=True):
     """Of its entry point."""
     distribution: str
     """Its publisher: `name version`."""
+    package: str
+    """Top package of its entry point."""
     contract: int
     """The one that it was written for."""
     controllers: Mapping[str, Make[Offer]]
@@ -184,6 +186,39 @@ class PlugIns(msgspec.Struct, frozen=True):
             for one in self.loaded
             if one.overrun is not None
         )
+
+    def packages_of(
+        self,
+        controllers: Sequence[ControllerPlan],
+        sensors: Sequence[SensorPlan],
+        models: Container[str],
+    ) -> dict[str, str]:
+        """Return the packages that run in a robot with their distributions, by package.
+
+        Those that offer its controllers, sensors or servo models, those of the classes, where these are in
+        others, and those that decide about late cycles.
+        """
+        types = {one.type for one in controllers}, {one.type for one in sensors}
+        found = {
+            one.package: one.distribution
+            for one in self.loaded
+            if types[0] & one.controllers.keys()
+            or types[1] & one.sensors.keys()
+            or one.overrun is not None
+            or any(model in models for model in one.servo_models)
+        }
+        known = {one.package: one.distribution for one in self.loaded}
+        classes = [
+            # the text of a single file has a hash of its own
+            *((self.controllers[kind].controller, kind) for kind in types[0] if file_of(kind) is None),
+            *((self.sensors[kind].sensor, kind) for kind in types[1]),
+        ]
+        publishers = {one.type: one.distribution for one in controllers}
+        publishers |= {one.type: one.distribution for one in sensors}
+        for made, kind in classes:
+            package = _top(made.__module__)
+            found.setdefault(package, known.get(package, publishers[kind]))
+        return {package: distribution_name(publisher) for package, publisher in sorted(found.items())}
 
     def import_all(self) -> None:
         """Import every controller now: an import in a running loop takes longer than its cycle."""
@@ -286,6 +321,15 @@ def _together(
     return {name: make for name, make in made.items() if name not in twice}
 
 
+def _top(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def distribution_name(publisher: str) -> str:
+    """Return the distribution of a publisher, `name version`, without the version."""
+    return publisher.rpartition(" ")[0] or publisher
+
+
 def _publisher(entry_point: EntryPoint) -> str:
     if entry_point.dist is None:
         return "an unknown distribution"
@@ -328,6 +372,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> LoadedPlugIn:
     return LoadedPlugIn(
         entry_point.name,
         publisher,
+        _top(entry_point.module),
         contract,
         dict(_makes(controllers, "dxlrun_controllers", refuse, partial(_offer, publisher, refuse))),
         tuple(name for models in servo_models for name in _add_servo_models(models, refuse)),
