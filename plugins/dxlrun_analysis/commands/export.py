@@ -40,8 +40,8 @@ def export(
         A new file for csv, a new directory for the other formats.
     file_format
         csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
-        commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set in the
-        layout of LeRobotDataset v3.0.
+        commands and each topic; topics without a file are listed with the reason. ros2bag: a directory that
+        `ros2 bag` opens. lerobot: a data set in the layout of LeRobotDataset v3.0.
     topic
         Topic for csv: /events, /commands, /bus/NAME or one of a controller, instead of /cycle.
     """
@@ -55,12 +55,28 @@ def export(
     from dxlrun.output.target import new_target
 
     with err().status(f"exporting {log}"), new_target(output) as beside:
-        count = _write(open_log(log), beside, file_format, topic)
+        reader = open_log(log)
+        count = _write(reader, beside, file_format, topic)
+        without = _without_table(reader, beside, file_format)
     if as_json:
-        show_json({"output": str(output), "format": file_format, f"{_OF[file_format]}s": count})
-    else:
-        show(f"{output}: {counted(count, _OF[file_format], f'{_OF[file_format]}s')}")
+        result = {"output": str(output), "format": file_format, f"{_OF[file_format]}s": count}
+        show_json({**result, **({} if without is None else {"without_file": without})})
+        return 0
+    show(f"{output}: {counted(count, _OF[file_format], f'{_OF[file_format]}s')}")
+    for name, reason in (without or {}).items():
+        show(f"no {'file' if file_format == 'parquet' else 'table'} for {name}: {reason}")
     return 0
+
+
+def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str] | None:
+    """Return the topics that the format cannot have, with reasons; None of a format that is no table."""
+    if to not in ("csv", "parquet"):
+        return None
+    from dxlrun_analysis.export.parquet import has_file
+    from dxlrun_analysis.export.tables import topics_without_table
+
+    # with --topic, CSV has each topic that has messages
+    return topics_without_table(reader, lambda name: to == "csv" or has_file(target, name))
 
 
 def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> int:

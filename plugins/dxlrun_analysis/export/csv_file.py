@@ -11,7 +11,7 @@ from pyarrow import csv
 from dxlrun.errors import LogError, suggestion
 from dxlrun.log.reader import LogReader
 from dxlrun.log.schemas import bus_topic
-from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, tables_of
+from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABLE, tables_of
 
 
 def write_csv(reader: LogReader, target: Path, topic: str) -> int:
@@ -31,6 +31,8 @@ def write_csv(reader: LogReader, target: Path, topic: str) -> int:
         if writer is not None:
             writer.close()
     if writer is None:
+        if topic in WITHOUT_TABLE:
+            raise LogError(f"{reader.path}: {topic} has no table: {WITHOUT_TABLE[topic]}")
         about = reader.about
         others = {*about.topics, *map(bus_topic, about.buses), CYCLES, EVENTS, COMMANDS} - {topic}
         raise LogError(f"{reader.path}: it has no records of {topic}; {suggestion(topic, sorted(others))}")

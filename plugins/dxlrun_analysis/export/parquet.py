@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dxlrun.log.reader import LogReader
-from dxlrun_analysis.export.tables import tables_of
+from dxlrun.log.schemas import BUS_PREFIX
+from dxlrun_analysis.export.tables import PACKETS, tables_of
 
 _NAMES = {"/cycle": "cycles"}
 _ODD = re.compile(r"[^\w.-]|^\.")
@@ -48,6 +49,12 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
         for name in tuple(waiting):
             flush(name)
     return count
+
+
+def has_file(directory: Path, topic: str) -> bool:
+    """Return whether a directory of tables has that of a topic; the packets of all buses are in one."""
+    table = PACKETS if topic.startswith(BUS_PREFIX) else topic
+    return (directory / file_name(table)).exists()
 
 
 def file_name(topic: str) -> str:

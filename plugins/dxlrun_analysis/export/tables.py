@@ -7,7 +7,7 @@ the tables carry as metadata.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
-from dxlrun.log.reader import Log
+from dxlrun.log.reader import Log, LogReader
 from dxlrun.log.reading.arrow import struct_of
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
@@ -28,6 +28,17 @@ from dxlrun.messages.definition import parse, short_name
 
 CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one
+WITHOUT_TABLE: Mapping[str, str] = {
+    schemas.JOINT_STATES_TOPIC: "the states are in /cycle",
+    schemas.JOINT_COMMANDS_TOPIC: "the goals are in /cycle",
+    schemas.DIAGNOSTICS_TOPIC: "temperatures, voltages, hardware errors and modes are in /cycle",
+    schemas.FRAMES_TOPIC: "the URDF and the positions in /cycle give the frames",
+    schemas.STILL_FRAMES_TOPIC: "the URDF has these frames",
+    schemas.ROBOT_DESCRIPTION_TOPIC: "it is one text, the URDF",
+    schemas.ROSOUT_TOPIC: "the same events are in /events",
+    schemas.ACTIVATION_TOPIC: "it is one message, the states and goals before the first cycle",
+}
+"""Topics of a log that no table has, and the reason."""
 _ROWS = 4096
 """Cycles that become one table: a slice of a log may have a few, and a table costs some time a column."""
 
@@ -63,6 +74,20 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
 
     name: str  # The topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, that of a controller
     table: pa.Table
+
+
+def topics_without_table(reader: LogReader, has_table: Callable[[str], bool]) -> dict[str, str]:
+    """Return the topics of a log that have no table, and the reason for each.
+
+    Args:
+        reader: The log.
+        has_table: Whether the table of a topic was written, for topics that can have one.
+    """
+    return {
+        name: WITHOUT_TABLE.get(name, "the log has no message of it")
+        for name in sorted(reader.topics)
+        if name in WITHOUT_TABLE or not has_table(name)
+    }
 
 
 def tables_of(slices: Iterable[Log], only: Container[str] | None = None) -> Iterator[Rows]:

@@ -14,9 +14,10 @@ import pytest
 from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.reader import open_log, read_log
 from dxlrun.output.target import new_target
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.export.tables import WITHOUT_TABLE
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")
@@ -67,6 +68,33 @@ def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: 
     assert goals["header.stamp.sec"].to_pylist() == stamps
     assert set(stamps) == {0, 1}
     assert tables["events"]["text"].to_pylist() == [event.text for event in log.events]
+
+
+def test_parquet_names_topics_without_a_file_and_the_reason(
+    run: Path, tmp_path: Path, export: Export
+) -> None:
+    _, said, _ = export(run, tmp_path / "out", "--format", "parquet", "--json")
+    missing = json.loads(said)["without_file"]
+    topics = open_log(run).topics
+    files = {path.stem for path in (tmp_path / "out").iterdir()}
+    assert missing.keys() == {
+        name
+        for name in topics
+        if not name.startswith("/bus/") and name.strip("/").replace("cycle", "cycles") not in files
+    }
+    assert missing["/joint_states"] == "the states are in /cycle"
+    reasons = {WITHOUT_TABLE.get(name, "the log has no message of it") for name in missing}
+    assert set(missing.values()) == reasons
+    code, said, _ = export(run, tmp_path / "again", "--format", "parquet")
+    assert (code, said.count("no file for ")) == (0, len(missing))
+    assert "no file for /rosout: the same events are in /events" in said
+
+
+def test_csv_names_topics_that_it_cannot_have(run: Path, tmp_path: Path, export: Export) -> None:
+    _, said, _ = export(run, tmp_path / "out.csv", "--format", "csv", "--json")
+    assert json.loads(said)["without_file"].keys() == WITHOUT_TABLE.keys() & open_log(run).topics.keys()
+    code, _, errors = export(run, tmp_path / "other.csv", "--format", "csv", "--topic", "/joint_states")
+    assert (code, "/joint_states has no table: the states are in /cycle" in errors[0]) == (2, True)
 
 
 @pytest.mark.parametrize(
