@@ -52,6 +52,7 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.devices import device_blocks
 from dxlrun.dynamixel.plan.line import Line as LineTimes
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.port.ports import OwnProcessors
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
@@ -105,7 +106,7 @@ class Tally:
     """Lines that were lost and came back."""
 
 
-class Line:
+class Line(OwnProcessors):
     """Answers the reads of a cycle in their order with prepared pieces of (ns after it, bytes), and nothing
     else. `replies`: pairs of a read's packet and its pieces, None where the line is lost at that read.
     """

@@ -35,6 +35,7 @@ from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.port.ports import OwnProcessors
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlrun.simulation.bus.ledger import Ledger
@@ -220,7 +221,7 @@ class Rig:
         return [servo.torque_on for servo in self.buses[index].servos]
 
 
-class ScriptedLine:
+class ScriptedLine(OwnProcessors):
     """Port and Ports in one: after the n-th write it says what the script has, at times since that write."""
 
     polling = None

@@ -29,11 +29,12 @@ from dxlrun.control.loop import StopFlag
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.port.ports import StallCounter
 from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.process_table import read_stat
 from dxlrun.run import supervisor, watch
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
-from dxlrun.run.loop_process import AskedToStop, Pulse
+from dxlrun.run.loop_process import AskedToStop, Pulse, StallReport
 from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.watch import (
@@ -238,13 +239,17 @@ class Unwatched(LoopWatch):
         return Duty.NONE
 
 
+def no_stalls() -> StallReport:
+    return StallReport(StallCounter(), no_events())
+
+
 def no_events() -> EventRing:
     return EventRing(Handover(lambda kind, payload: None), VirtualClock())
 
 
 def test_only_a_set_up_is_given_up_and_only_once(page):
     stop = StopFlag(requested=True)
-    beat = Pulse(page, stop, Unwatched(), no_events(), lambda: 0)
+    beat = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0)
     for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
         page.enter(phase)
         beat()
@@ -274,7 +279,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     os.close(descriptor)
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     stop = StopFlag()
-    pulse = Pulse(page, stop, Unwatched(), no_events(), lambda: 0)
+    pulse = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0)
     count = 0
 
     def beat() -> None:
@@ -575,7 +580,7 @@ def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):
     with Stopped() as supervisor, Stopped() as guardian:
         loop_watch = LoopWatch(page, supervisor, guardian, 20 * MS, 0)
         clock = VirtualClock(0)
-        beat = Pulse(page, stop, loop_watch, events, clock.now_ns)
+        beat = Pulse(page, stop, loop_watch, events, no_stalls(), clock.now_ns)
         page.enter(Phase.RUNNING)
         while not stop.requested:
             clock.wait_until(clock.now_ns() + 20 * MS)

@@ -33,6 +33,8 @@ class EventCode(IntEnum):
     OVERRUN = 3
     SCHEDULER = 4
     """A request about scheduler, memory or collector, and whether it was granted."""
+    SIMULATION_STALLED = 5
+    """The process of simulated servos did not run, and the loop waited for it; the data are Waited."""
     SETUP = 10
     TORQUE_ON = 11
     TORQUE_OFF = 12
@@ -118,6 +120,13 @@ class LostRecords(msgspec.Struct, frozen=True):
     ring: str
     lost: int
     """Records."""
+
+
+class Waited(msgspec.Struct, frozen=True):
+    """Data of SIMULATION_STALLED, since the event of this kind before."""
+
+    waited_ns: int
+    times: int
 
 
 class Granted(msgspec.Struct, frozen=True):

@@ -1,5 +1,8 @@
 """Heartbeats: shared memory by which loop, guardian and supervisor see that the others respond.
 
+`SimulationProgress` is the same for the process of simulated servos: how far it has served each line.
+
+
 Each field has one writer: the supervisor for `supervisor_looks` and `steering`, the guardian for `looks`,
 and the loop's process for the others. Each field is one aligned 64-bit store through a cast memoryview,
 which 64-bit processors make whole. (`struct.pack_into` would not do: it clears its target first, and a
@@ -181,6 +184,100 @@ class Heartbeat:
     def skipped(self) -> int:
         """Number of periods that were skipped."""
         return self._words[_SKIPPED]
+
+
+_STALLS, _FIRST_STALL = 0, 1
+_KEPT_STALLS = 16
+_LINES = _FIRST_STALL + 2 * _KEPT_STALLS
+_TAKEN, _SERVED, _GIVEN, _DUE = range(4)
+_LINE_WORDS = 4
+ENDLESS_NS = 1 << 62
+
+
+def create_progress(lines: int) -> int:
+    """Return the descriptor of fresh memory for the progress of a simulation of so many lines."""
+    return shared_memory.create("simulation", 8 * (_LINES + _LINE_WORDS * lines))
+
+
+class SimulationProgress:
+    """Time up to which the process of simulated servos has served its lines; it is the one writer.
+
+    By this a reply that is late because that process had no core is distinguished from a servo that stays
+    silent on purpose. All times are CLOCK_MONOTONIC, ns.
+    """
+
+    __slots__ = ("_words",)
+
+    def __init__(self, descriptor: int) -> None:
+        self._words = shared_memory.mapped(descriptor).cast("Q")
+
+    def note_stall(self, begin_ns: int, end_ns: int) -> None:
+        """Publish a time in which the process did not run although it had to."""
+        count = self._words[_STALLS]
+        place = _FIRST_STALL + 2 * (count % _KEPT_STALLS)
+        self._words[place], self._words[place + 1] = begin_ns, end_ns
+        store(self._words, _STALLS, count + 1)
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long the process did not run between two times; of the last 16 stalls."""
+        load(self._words, _STALLS)
+        ends = self._words[_FIRST_STALL:_LINES]
+        return sum(
+            max(0, min(end_ns, until_ns) - max(begin_ns, since_ns))
+            for begin_ns, end_ns in zip(ends[::2], ends[1::2], strict=True)
+        )
+
+    def line(self, index: int) -> LineProgress:
+        """Return the progress on one line."""
+        at = _LINES + index * _LINE_WORDS
+        return LineProgress(self, self._words[at : at + _LINE_WORDS])
+
+
+class LineProgress:
+    """Progress of the simulation on one line."""
+
+    __slots__ = ("_words", "process")
+
+    def __init__(self, process: SimulationProgress, words: memoryview) -> None:
+        self.process = process
+        self._words = words
+
+    # The simulation's side
+
+    def serve(self, until_ns: int) -> None:
+        """Publish that all bytes that reach the host before `until_ns` were handed over."""
+        store(self._words, _SERVED, until_ns)
+
+    def take(self, off_wire_ns: int) -> None:
+        """Publish when the last byte is off the wire that was taken from the host, and executed."""
+        store(self._words, _TAKEN, off_wire_ns)
+
+    def give(self, due_ns: int, now_ns: int) -> None:
+        """Publish when the newest bytes for the host were due, and that they are handed over now."""
+        self._words[_DUE] = due_ns
+        store(self._words, _GIVEN, now_ns)
+
+    # The host's side
+
+    @property
+    def taken_ns(self) -> int:
+        """When the last byte of the host is off the wire that the simulation has taken; to be read first."""
+        return load(self._words, _TAKEN)
+
+    @property
+    def served_ns(self) -> int:
+        """Time before which nothing is due to the host that it was not given."""
+        return load(self._words, _SERVED)
+
+    @property
+    def given_ns(self) -> int:
+        """When the newest bytes were handed over to the host; 0: none were."""
+        return load(self._words, _GIVEN)
+
+    @property
+    def due_ns(self) -> int:
+        """When these bytes were due."""
+        return self._words[_DUE]
 
 
 class Standstill:

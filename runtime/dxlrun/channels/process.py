@@ -130,12 +130,16 @@ class RunMemory:
     """Slots of the sensors, in the order of the plan."""
     shafts: int = -1
     """Slot of the shafts of simulated servos, for sensors that sense the simulated body; -1: none does."""
+    simulation: int = -1
+    """Progress of the simulation; -1: no bus is simulated."""
 
     @property
     def of_loop(self) -> tuple[int, ...]:
         """Those that the loop's process inherits."""
         rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
-        return (self.plan, self.heartbeat, *rings, self.result, self.grants, self.kept, *self.sensors)
+        simulated = (self.simulation,) if self.simulation >= 0 else ()
+        own = (self.result, self.grants, self.kept, *self.sensors, *simulated)
+        return (self.plan, self.heartbeat, *rings, *own)
 
     @property
     def recorded(self) -> dict[str, int]:

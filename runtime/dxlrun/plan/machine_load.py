@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import msgspec
 
+from dxlrun.errors import counted
+
 SAMPLE_PERIOD_NS = 1_000_000_000
 """Time between two samples."""
 _SILENT_NS = 2 * SAMPLE_PERIOD_NS
@@ -79,6 +81,33 @@ class MachineLoad(msgspec.Struct, frozen=True):
         return ", ".join(f"{text} {_seconds(value)} {of}" for value, text in observed if value >= 0.05)
 
 
+class SimulationWait(msgspec.Struct, frozen=True):
+    """Time for which the loop awaited replies beyond their deadlines, as the simulation did not run."""
+
+    waited_ns: int = 0
+    times: int = 0
+
+    @property
+    def text(self) -> str:
+        """Observation without a full stop, for a sentence; empty when there was no wait."""
+        if not self.times:
+            return ""
+        times = counted(self.times, "time", "times")
+        return (
+            f"the loop waited {times}, {self.waited_ns / 1e9:.3g} s in all, for the process of the simulated "
+            "servos, which did not run"
+        )
+
+
+NO_WAIT = SimulationWait()
+
+
+def describe_busy_machine(load: MachineLoad, wait: SimulationWait = NO_WAIT) -> str:
+    """Return the sentence about a machine that was too busy; empty when it was not."""
+    observed = ", ".join(filter(None, (load.text if load.too_busy else "", wait.text)))
+    return f"The machine was too busy: {observed}." if observed else ""
+
+
 class LoadMeter:
     """Accumulates the samples of one interval, in constant memory.
 
@@ -113,8 +142,8 @@ class LoadMeter:
             "silent": length_ns > _SILENT_NS and not sample.most_idle >= _SPARE_SHARE,
         }
         found |= {"sampled": True, "busy": any(found.values())}
-        for name, counted in found.items():
-            self._ns[name] += counted * (end_ns - begin_ns)
+        for name, is_true in found.items():
+            self._ns[name] += is_true * (end_ns - begin_ns)
 
     def load(self) -> MachineLoad:
         """Return the load of the interval.

@@ -83,6 +83,7 @@ class Reply(msgspec.Struct):
     echoed: bool  # True when the instruction itself came back: the adapter echoes
     sent_ns: int = 0  # Start of the write of the instruction
     asked_ns: int = 0  # The same of its oldest repetition whose late reply this may be
+    stalled_ns: int = 0  # By how much it is late because simulated servos had no processor
 
     @property
     def answered(self) -> bool:

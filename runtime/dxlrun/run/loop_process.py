@@ -22,8 +22,8 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity
-from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity, Waited
+from dxlrun.channels.heartbeat import Heartbeat, Phase, SimulationProgress
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.messages import MessageRing
@@ -37,11 +37,20 @@ from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.realtime import Pacing
+from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.hardware import TAKEN_BACK
-from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
+from dxlrun.dynamixel.port.ports import (
+    MOST_SHARE,
+    ReplyPolling,
+    SerialPort,
+    SerialPorts,
+    SimulatedPort,
+    StallCounter,
+)
 from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, counted
 from dxlrun.plan.loop_plan import SchedulerPlan
+from dxlrun.plan.machine_load import SimulationWait
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
@@ -64,6 +73,7 @@ class LoopOutcome(msgspec.Struct, frozen=True):
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
     events: EventTotals = EventTotals()
+    simulation_wait: SimulationWait = SimulationWait()
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:
@@ -106,6 +116,8 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     return check
 
 
+_WAIT_OVER_NS = 20_000_000  # The simulation answers again: no reply was late for so long
+_WAITS_EVENT_NS = 1_000_000_000  # Between two events, where most replies are late
 UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit; start it again"
 
 
@@ -113,21 +125,61 @@ class AskedToStop(Exception):
     """A stop was requested before the robot ran: no torque may be switched on any more."""
 
 
+class StallReport:
+    """Reports to the log for how long the loop waited for simulated servos, at most once a second."""
+
+    def __init__(self, stalls: StallCounter, events: EventSink) -> None:
+        self._stalls = stalls
+        self._events = events
+        self._reported_ns = self._reported_times = 0
+        self._seen_ns = 0  # What was waited when that was looked at last
+        self._grew_ns = 0  # When that had grown
+        self._emitted_ns = 0
+
+    @property
+    def total(self) -> SimulationWait:
+        """All waits since the start."""
+        return SimulationWait(self._stalls.waited_ns, self._stalls.times)
+
+    def look(self, now_ns: int) -> None:
+        """Emit the event of waits that are over, or that last for more than a second."""
+        if self._stalls.times == self._reported_times and self._stalls.waited_ns == self._reported_ns:
+            return
+        if self._stalls.waited_ns != self._seen_ns:
+            self._seen_ns, self._grew_ns = self._stalls.waited_ns, now_ns
+        if now_ns - self._grew_ns >= _WAIT_OVER_NS and now_ns - self._emitted_ns >= _WAITS_EVENT_NS:
+            self._emitted_ns = now_ns
+            self.emit()
+
+    def emit(self) -> None:
+        """Emit what was not reported yet."""
+        total = self.total
+        since = SimulationWait(total.waited_ns - self._reported_ns, total.times - self._reported_times)
+        if since.waited_ns or since.times:
+            self._reported_ns, self._reported_times = total.waited_ns, total.times
+            data = msgspec.json.encode(Waited(since.waited_ns, since.times))
+            text = f"{since.text}: the machine is too busy"
+            self._events.emit(EventCode.SIMULATION_STALLED, Severity.WARNING, "machine", text, data)
+
+
 @dataclass(slots=True)
 class Pulse:
-    """Called while replies are awaited, and once a cycle: beats, looks at supervisor and guardian, and gives
-    a set-up up that is to stop."""
+    """Called while replies are awaited, and once a cycle: beats, looks at supervisor and guardian, reports
+    waits for simulated servos, and gives a set-up up that is to stop."""
 
     heartbeat: Heartbeat
     stop: StopFlag
     watch: LoopWatch
     events: EventSink
+    stalls: StallReport
     now_ns: Callable[[], int]
 
     def __call__(self) -> None:
         """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
         self.heartbeat.beat()
-        if not self.stop.requested and self.watch.duty(self.now_ns()) is Duty.END:
+        now_ns = self.now_ns()
+        self.stalls.look(now_ns)
+        if not self.stop.requested and self.watch.duty(now_ns) is Duty.END:
             self.stop.request()
             self.events.emit(EventCode.GUARDIAN, Severity.ERROR, "loop", UNWATCHED)
         if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
@@ -151,15 +203,30 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
     return structs.replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
 
 
-def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOutcome:
+def _make_ports(plan: Plan, job: LoopJob, stalls: StallCounter) -> list[SerialPort]:
+    """Return the ports of all buses; those of simulated servos wait for a process that has no core."""
+    ports: list[SerialPort] = []
+    simulated = 0
+    for descriptor, bus in zip(job.ports, plan.buses, strict=True):
+        if bus.port == SIMULATED:
+            line = SimulationProgress(job.memory.simulation).line(simulated)
+            ports.append(SimulatedPort(descriptor, bus.port, line, stalls))
+            simulated += 1
+        else:
+            ports.append(SerialPort(descriptor, bus.port))
+    return ports
+
+
+def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: StallCounter) -> LoopOutcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
-        [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)],
+        _make_ports(plan, job, stalls),
         LinesAgain(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
         _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )
+    report = StallReport(stalls, sinks.events)
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
     watch = LoopWatch(heartbeat, job.supervisor, job.guardian, plan.loop.period_ns, clock.now_ns())
@@ -171,7 +238,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         ports=ports,
         clock=clock,
         sinks=sinks,
-        beat=Pulse(heartbeat, stop, watch, sinks.events, clock.now_ns),
+        beat=Pulse(heartbeat, stop, watch, sinks.events, report, clock.now_ns),
         stop=stop,
         take_over=job.take_over,
         inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),
@@ -187,7 +254,10 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     if ports.polling:
         ports.polling.margin_ns = pacing.measured_ns
     try:
-        result = robot.run(heartbeat.enter)
+        try:
+            result = robot.run(heartbeat.enter)
+        finally:
+            report.emit()
     except AskedToStop as asked:
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])
@@ -234,12 +304,13 @@ def main() -> None:
         MessageRing(RingWriter(job.memory.messages)),
         job.epoch_offset_ns,
     )
+    stalls = StallCounter()
     try:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
         plan = from_json(process.whole(job.memory.plan))
         events.goals.planned = plan.loop.origins
-        outcome = _run(plan, job, heartbeat, sinks)
+        outcome = _run(plan, job, heartbeat, sinks, stalls)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
         outcome = LoopOutcome("start-up", sentences=error.sentences)
@@ -249,6 +320,7 @@ def main() -> None:
         outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)
         events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
+    outcome = structs.replace(outcome, simulation_wait=SimulationWait(stalls.waited_ns, stalls.times))
     sinks.packets.commit()
     os.pwrite(job.memory.result, msgspec.json.encode(outcome), 0)
     if not outcome.traceback:

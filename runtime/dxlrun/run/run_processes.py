@@ -21,6 +21,7 @@ from dxlrun.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.realtime import Grant, guardian_priority, raise_share
+from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
@@ -51,6 +52,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     """
     shared_memory.library()
     servos = sum(len(bus.servos) for bus in plan.buses)
+    simulated = sum(bus.port == SIMULATED for bus in plan.buses)
     sensed = sensed_bodies(plan)
     period, cycle = plan.loop.period_ns, plan.loop.layout.size
     events = event_capacity(period, servos + len(plan.loop.sources)) + command_capacity(
@@ -76,6 +78,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         span=process.memory_file("dxlrun-span"),
         sensors=tuple(slot.create(f"sensor-{one.name}", len(one.states)) for one in plan.loop.sensors),
         shafts=slot.create("shafts", 3 * len(sensed.bodies.joints)) if sensed is not None else -1,
+        simulation=heartbeat.create_progress(simulated) if simulated else -1,
     )
 
 
@@ -117,7 +120,9 @@ def start_simulated_buses(
         if scheduler.policy != "other"
         else (0, -1)
     )
-    job = SimulationJob(simulation_of(plan), str(ledger) if ledger else None, *real_time, memory.shafts)
+    job = SimulationJob(
+        simulation_of(plan), str(ledger) if ledger else None, *real_time, memory.shafts, memory.simulation
+    )
     child = start_simulation(job, memory.stderr)
     try:
         return child, first_message(child).ports or {}

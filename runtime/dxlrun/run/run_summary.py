@@ -15,6 +15,7 @@ from dxlrun.channels.events import EventCode, EventGroup, EventTotals
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
+from dxlrun.plan.machine_load import MachineLoad, SimulationWait, describe_busy_machine
 from dxlrun.plan.played_goals import find_unreached_goals
 
 if TYPE_CHECKING:
@@ -82,6 +83,18 @@ class RunSummary(msgspec.Struct, frozen=True):
     events: EventTotals = EventTotals()
     virtual: bool = False
     """It was on virtual time."""
+    start_up_load: MachineLoad = MachineLoad()
+    """Of the machine before the first cycle, as far as the recorder has sampled it."""
+    run_load: MachineLoad = MachineLoad()
+    """Of the machine from the first cycle on."""
+    simulation_wait: SimulationWait = SimulationWait()
+    """Time for which the loop waited for simulated servos that had no processor."""
+
+    @property
+    def machine(self) -> str:
+        """Sentence about a machine that was too busy for this run; empty when it was not."""
+        load = self.run_load if self.cycles else self.start_up_load
+        return describe_busy_machine(load, self.simulation_wait)
 
 
 @contextmanager
@@ -150,6 +163,8 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append("The states of all joints were valid in every cycle.")
     unreached = list(find_unreached_goals(loop, events.goals, ran_ns))
     sentences += [f"{'; '.join(filter(None, (one.sentence, one.remedy)))}." for one in unreached[:_MOST]]
+    if run.machine and (errors or often or run.skipped):
+        sentences.insert(0, run.machine)
     failed = errors or often or not kept or any(one.failed for one in unreached)
     exit_code = 1 if failed or (unreached and not run.exit_code) else run.exit_code
     return RunVerdict(exit_code, f"{'; '.join(happened)}.", tuple(sentences))

@@ -39,7 +39,7 @@ def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage
     """Start the process of simulated buses; `errors` takes what it prints."""
     descriptor = process.memory_file("dxlrun-simulation", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
-    inherited = [descriptor, *([job.shafts] if job.shafts >= 0 else [])]
+    inherited = [descriptor, *(one for one in (job.shafts, job.progress) if one >= 0)]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
         return Child("simulated bus", "dxlrun.simulation", arguments, inherited, errors, messages)

@@ -42,6 +42,7 @@ from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed
+from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import sensor_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
@@ -163,6 +164,8 @@ class _Run:
     ended: Ended | None = None
     """The guardian's last message."""
     messages: int = 0
+    closed: LogClosed | None = None
+    """The recorder's last message; None: there was no recorder, or it ended early."""
     guardian_grants: tuple[Grant, ...] = ()
     grants: tuple[Grant, ...] = ()
     """What the operating system granted, once the loop runs."""
@@ -408,6 +411,7 @@ class _Run:
                     self.sentences.append(incomplete_log(message.sentence))
                 elif isinstance(message, LogClosed):
                     closed = True
+                    self.closed = message
                     self.messages = message.summary.messages
                     if gaps := message.summary.gaps:
                         self.sentences.append(
@@ -486,6 +490,9 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         messages=run.messages,
         invalid=outcome.invalid,
         events=outcome.events,
+        start_up_load=run.closed.start_up_load if run.closed else MachineLoad(),
+        run_load=run.closed.run_load if run.closed else MachineLoad(),
+        simulation_wait=outcome.simulation_wait,
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from msgspec.json import Decoder
 
 from dxlrun.channels import process
+from dxlrun.channels.heartbeat import SimulationProgress
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.dynamixel.control_table import add_control_table
@@ -34,7 +35,8 @@ def main() -> int:
     with Ledger(Path(job.ledger) if job.ledger else None, keep=False) as ledger:
         try:
             shafts = None if job.shafts < 0 else SlotWriter(mapped(job.shafts))
-            server = Server(job.config, ledger, starter, shafts)
+            progress = None if job.progress < 0 else SimulationProgress(job.progress)
+            server = Server(job.config, ledger, starter, shafts, progress)
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             starter.send(SimulationMessage(error=str(error)))
             return 2

@@ -15,6 +15,7 @@ class SimulationJob(msgspec.Struct, frozen=True):
     priority: int = 0  # Real-time priority that it asks for, 1 to 99; 0: none
     core: int = -1  # Core that it stays on; -1: any
     shafts: int = -1  # Descriptor of the slot into which it writes how its shafts move; -1: none
+    progress: int = -1  # Descriptor of the memory into which it writes how far it has come; -1: none
 
 
 class Request(msgspec.Struct):

@@ -7,6 +7,7 @@ import os
 import struct
 import time
 import tty
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -84,11 +85,14 @@ class PseudoTerminal:
         self._taken += data
         self.may_have_more = len(data) == _CHUNK
 
-    def receive(self, now_ns: int) -> None:
-        """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier."""
+    def receive(self, now_ns: int) -> int:
+        """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier.
+
+        Return the number of bytes.
+        """
         data, self._taken = self._taken, b""
         if not data:
-            return
+            return 0
         settings = _settings(self._master)
         if settings != self._settings:  # the host's rate can only be another one then
             self._settings = settings
@@ -96,12 +100,19 @@ class PseudoTerminal:
             if rate not in (0, self.bus.baud_rate):
                 self.bus.change_rate(rate)
         self.bus.receive(data, now_ns)
+        return len(data)
 
-    def deliver(self, now_ns: int) -> None:
-        """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost."""
-        data = self.bus.take(now_ns, handed_ns=time.monotonic_ns())
+    def deliver(self, now_ns: int, announce: Callable[[int], None] | None = None) -> None:
+        """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost.
+
+        `announce` is called before, with the time, where there are any bytes.
+        """
+        handed_ns = time.monotonic_ns()
+        data = self.bus.take(now_ns, handed_ns=handed_ns)
         if not data:
             return
+        if announce is not None:
+            announce(handed_ns)
         try:
             written = os.write(self._master, data)
         except BlockingIOError:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from dxlrun.channels.heartbeat import ENDLESS_NS, LineProgress, SimulationProgress
 from dxlrun.channels.process import MessageChannel
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import InputError
@@ -39,7 +40,14 @@ hand-over costs the processor, and the host's, more than a reply."""
 _WRITTEN = select.EPOLLIN | select.EPOLLET
 """Reports once what a host has written; without a host a terminal is at its end all the time."""
 
+LONGEST_SLEEP_NS = 10_000_000
+"""Where the host watches the progress: no sleep is longer, so that a longer pause is known for a stall."""
+STALL_NS = 20_000_000
+"""A longer pause between two looks at the clock counts as a stall, in which the process had no core."""
+
 IDLE_NS = 300_000  # So long the mechanics of a few steps may take
+
+_BITS_PER_BYTE = 10  # 8N1
 
 _GOAL_MODES = (3, 4, 5)
 """Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
@@ -58,8 +66,12 @@ class Server:
         ledger: Ledger,
         starter: MessageChannel[Request],
         shafts: SlotWriter | None = None,
+        progress: SimulationProgress | None = None,
     ) -> None:
-        """`shafts` takes how the shafts move, for sensors in other processes."""
+        """`shafts` takes how the shafts move, for sensors in other processes.
+
+        `progress` takes up to which time each line was served, for a host that waits for this process.
+        """
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._starter = starter
@@ -75,6 +87,13 @@ class Server:
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
         self._terminals = tuple(PseudoTerminal(bus, links.get(bus.name)) for bus in self._buses)
         self._shafts = None if shafts is None else ShaftsShown(self._mechanics, shafts)
+        self._progress = progress
+        self._lines = {
+            terminal: _ServedLine(progress.line(index), terminal.bus)
+            for index, terminal in enumerate(self._terminals)
+            if progress is not None
+        }
+        self._looked_ns = self.start_ns
         self._polling = PollBudget(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
@@ -97,20 +116,29 @@ class Server:
         for terminal in self._terminals:
             terminal.close()
 
-    def _serve_once(self, wake: int) -> None:
+    def _look_at_clock(self) -> int:
+        """Return the time, ns; publish a stall before it, which no servo counts as silence of the host."""
         now_ns = time.monotonic_ns()
-        soonest_ns = None
-        for bus in self._buses:
-            due_ns = bus.next_delivery_ns(GATHER_NS)
-            if due_ns is not None and (soonest_ns is None or due_ns < soonest_ns):
-                soonest_ns = due_ns
+        if self._progress is not None:
+            since_ns, self._looked_ns = self._looked_ns, now_ns
+            if now_ns - since_ns > STALL_NS:
+                self._progress.note_stall(since_ns, now_ns)
+                for bus in self._buses:
+                    bus.excuse(now_ns - since_ns)
+        return now_ns
+
+    def _serve_once(self, wake: int) -> None:
+        now_ns = self._look_at_clock()
+        soonest_ns = self._find_next_delivery()
         easy_ns = None
         if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
             easy_ns = self._work_in_idle_time(now_ns)
-            now_ns = time.monotonic_ns()
+            now_ns = self._look_at_clock()
+        if self._lines:
+            easy_ns = min(easy_ns or ENDLESS_NS, now_ns + LONGEST_SLEEP_NS)
         ready = self._wait(soonest_ns, easy_ns, now_ns)
         # What was due before the host wrote goes out first: the host could have read it.
-        now_ns = time.monotonic_ns()
+        now_ns = self._look_at_clock()
         self._polling.woke(now_ns)
         if soonest_ns is not None and soonest_ns <= now_ns:
             for terminal in self._terminals:
@@ -122,12 +150,25 @@ class Server:
             for number, _ in ready:
                 if number in self._by_descriptor:
                     self._by_descriptor[number].read()
-            now_ns = time.monotonic_ns()  # no host gets a reply before it wrote, though other lines take long
+            now_ns = (
+                self._look_at_clock()
+            )  # no host gets a reply before it wrote, though other lines take long
             for number, _ in ready:
                 self._read_ready(number, wake, now_ns)
             rounds -= 1
             ready = self._waiting.poll(0) if rounds else []  # what is reported is reported once
         self._ledger.flush_if_due(now_ns)
+
+    def _find_next_delivery(self) -> int | None:
+        """Return when bytes are due to a host next; publish it for each line."""
+        soonest_ns = None
+        for terminal in self._terminals:
+            due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
+            if self._lines:
+                self._lines[terminal].serve(due_ns)
+            if due_ns is not None and (soonest_ns is None or due_ns < soonest_ns):
+                soonest_ns = due_ns
+        return soonest_ns
 
     def _work_in_idle_time(self, now_ns: int) -> int | None:
         """Do what is not urgent; return when there is more of it."""
@@ -157,7 +198,7 @@ class Server:
         return ready
 
     def _deliver(self, terminal: PseudoTerminal, now_ns: int) -> None:
-        terminal.deliver(now_ns)
+        terminal.deliver(now_ns, self._lines[terminal].give if self._lines else None)
         if terminal.follow_adapter():
             self._plug()
             self._tell(SimulationMessage(self._ports()))
@@ -178,7 +219,10 @@ class Server:
             self._deliver(terminal, now_ns)
         if not terminal.plugged or terminal.fileno() != number:
             return
-        terminal.receive(now_ns)
+        count = terminal.receive(now_ns)
+        if count and self._lines:
+            self._lines[terminal].serve(bus.next_delivery_ns(GATHER_NS))
+            self._lines[terminal].take(count, now_ns)
         if bus.host_free_ns - MOST_BACKLOG_NS > now_ns:
             self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
             self._waiting.unregister(number)
@@ -224,6 +268,38 @@ class Server:
         except InputError as error:
             return SimulationMessage(error=str(error))
         return SimulationMessage(fault=str(fault))
+
+
+class _ServedLine:
+    """Publishes the progress on one line."""
+
+    __slots__ = ("_bus", "_progress", "_served_ns", "_taken_ns")
+
+    def __init__(self, progress: LineProgress, bus: SimulatedBus) -> None:
+        self._progress = progress
+        self._bus = bus
+        self._taken_ns = 0
+        self._served_ns = -1
+
+    def serve(self, due_ns: int | None) -> None:
+        """Publish when something is due to the host next; None: nothing is."""
+        until_ns = ENDLESS_NS if due_ns is None else due_ns
+        if until_ns != self._served_ns:
+            self._progress.serve(until_ns)
+            self._served_ns = until_ns
+
+    def take(self, count: int, now_ns: int) -> None:
+        """Publish that bytes of the host were taken, though a fault may keep them from the servos.
+
+        To be called after `serve`: a host that sees the bytes as taken relies on when the reply is due.
+        """
+        duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
+        self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
+        self._progress.take(self._taken_ns)
+
+    def give(self, now_ns: int) -> None:
+        """Publish that bytes are handed over to the host now."""
+        self._progress.give(now_ns - self._bus.lateness_ns[-1], now_ns)
 
 
 def _wake_on_sigterm() -> socket.socket:

@@ -36,6 +36,18 @@ class VirtualPort:
         """Return why a write failed: the adapter was unplugged, there is no other reason."""
         return PortError(f"the adapter of bus {self._bus.name} is gone")
 
+    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
+        """Return `deadline_ns`: virtual time waits for the servos."""
+        return deadline_ns
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return 0, for the same reason."""
+        return 0
+
+    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
+        """Return 0, for the same reason."""
+        return 0
+
     def collect(self) -> bool:
         """Take what has passed the wire by now; return whether something waits, or the adapter is gone."""
         self._arrived += self._bus.take(self._clock.now_ns())

@@ -108,6 +108,7 @@ class Bus:
         self._reply = Reply(_SENT, 0, b"", 0, 0, False)
         self._state = _READY
         self._sent_ns = self._earliest_ns = self._deadline_ns = self._drain_end_ns = 0
+        self._planned_deadline_ns = 0  # Of a reply that is awaited for longer; 0: none is
         self._last_byte_ns = -NEVER
         self._open = 0  # a bit for each status that is still awaited
         self._refused = False
@@ -233,6 +234,8 @@ class Bus:
         reply, done = self._reply, self._awaited
         if done is not None and reply.outcome is _OK:
             self._note_lateness(reply.last_ns - self._sent_ns - done.due_ns - self._latency_ns)
+            if not self._cyclic_job:
+                reply.stalled_ns = self._port.late_ns(self.words[FREE_NS], reply.last_ns)
         self._before = done
         self._awaited = None
         transaction = job.advance(None if done is None else reply)
@@ -333,6 +336,7 @@ class Bus:
             self._deadline_ns = started_ns + transaction.timeout_ns
             self._open = (1 << len(transaction.awaited)) - 1
             self._refused = False
+            self._planned_deadline_ns = 0
         else:
             reply.outcome = _SENT
             self._state = _RESTING
@@ -343,7 +347,8 @@ class Bus:
         # bytes may have come while this process was not running: look before giving up
         self._receive()
         if self._state == _AWAITING:
-            self._give_up(now_ns)
+            if not self._extend_deadline(now_ns):
+                self._give_up(now_ns)
         elif self._state == _DRAINING and self._quiet_at() > now_ns:
             self._deadline_ns = self._quiet_at()
         elif self._state in (_RESTING, _DRAINING):
@@ -352,6 +357,18 @@ class Bus:
         elif self._state == _HOLDING:
             self.receiver.flush()
             self._release_held(now_ns)
+
+    def _extend_deadline(self, now_ns: int) -> bool:
+        """Await a late reply for longer if the port has a reason to; return whether it has."""
+        self._planned_deadline_ns = self._planned_deadline_ns or self._deadline_ns
+        self._deadline_ns = self._port.extend_deadline(
+            self._planned_deadline_ns, self.words[FREE_NS], self._last_byte_ns, now_ns
+        )
+        return self._deadline_ns > now_ns
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long what is behind the line had no processor between two times, ns."""
+        return self._port.stalled_ns(since_ns, until_ns)
 
     def _give_up(self, now_ns: int) -> None:
         """End a transaction of which not every reply came in time."""
@@ -425,6 +442,7 @@ class Bus:
 
     def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
         """Await what is open for a moment only: the servos have answered by `last_ns`. As in kernel.c."""
+        self._planned_deadline_ns = 0
         brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
         self._deadline_ns = min(self._deadline_ns, brief_ns)
 

@@ -17,11 +17,11 @@ LONGEST_RETURN_DELAY_NS = 508_000
 TIMEOUT_MARGIN_NS = 10_000_000
 """How long a servo that answered last time is awaited beyond the latest moment of its reply by the wire.
 
-A real servo is never late by more than microseconds, but a simulated one is a process of the same machine: it
-may have to wait for its processor for a slice or two of the scheduler (3 ms each on a stock Linux). Ten
-milliseconds keep that from being taken for a broken cable; only the first silence of a cycle costs them
-(the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
-would count as hanging.
+A real servo is never late by more than microseconds, but the host may have to wait for its processor for a
+slice or two of the scheduler (3 ms each on a stock Linux), and so may a simulated servo that another program
+serves. Ten milliseconds keep that from being taken for a broken cable; only the first silence of a cycle
+costs them (the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
+would count as hanging. Servos that the run itself simulates are awaited for longer: `SimulatedPort`.
 """
 SHORT_TIMEOUT_MARGIN_NS = 1_000_000
 """The same for a servo that is silent already: it must not take the time of the others."""

@@ -66,7 +66,7 @@ def extend_timeouts(
 
     A servo that answers late costs what it takes; a bus without any servo is reported within about two
     seconds. `extra_ns` collects how much later than due by the wire each reply came that can answer
-    one request only.
+    one request only, without the time in which simulated servos had no processor.
     """
     left_ns = MOST_SILENCE_NS
     try:
@@ -78,7 +78,7 @@ def extend_timeouts(
             )
             certain = reply.answered and reply.asked_ns == reply.sent_ns
             if extra_ns is not None and request.awaited and certain:
-                extra_ns.append(reply.last_ns - reply.sent_ns - request.due_ns)
+                extra_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns
             request = program.send(reply)

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import msgspec
 
+from dxlrun.channels.heartbeat import LineProgress
 from dxlrun.errors import PortError
 
 # found at once, some dozen times a cycle
@@ -19,6 +20,12 @@ _write, _now_ns = os.write, time.monotonic_ns
 
 _WRITE_TIMEOUT_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
+
+LONGEST_STALL_NS = 500_000_000
+"""A simulated servo that has not answered by then is lost, whatever its process does: the shutdown of a run
+has two seconds, and a person notices a robot that stands still for half a second."""
+_STALL_STEP_NS = 1_000_000  # Between two looks at the progress of a process that has no core
+_SAME_STALL_NS = 10_000_000  # Waits that are no further apart count as one
 
 Reopened = Callable[[int], int | None]
 """Asks the process that opens lines for one again; returns its descriptor once there is one; never waits."""
@@ -59,6 +66,31 @@ class Port(Protocol):
         """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
         ...
 
+    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
+        """Return until when a reply is awaited of which not all has come by its deadline.
+
+        Later than `now_ns` only where the device behind the line itself had no processor to answer with, as
+        the process of simulated servos may have none; of real servos it is always `deadline_ns`.
+
+        Args:
+            deadline_ns: Deadline by the plan.
+            off_wire_ns: When the last byte of the request is off the wire.
+            heard_ns: When the newest byte was received on the line.
+            now_ns: Time now.
+        """
+        ...
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long the device behind the line had no processor between two times; 0: a servo."""
+        ...
+
+    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
+        """Return by how much the newest reply is late because the device behind the line had no processor.
+
+        `off_wire_ns`: when its request was off the wire; `heard_ns`: when it was received.
+        """
+        ...
+
 
 class Ports(Protocol):
     """All lines of a robot, waited for together."""
@@ -95,7 +127,23 @@ class Ports(Protocol):
         ...
 
 
-class SerialPort:
+class OwnProcessors:
+    """Part of the port of a line whose devices have processors of their own: the host does not delay them."""
+
+    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
+        """Return `deadline_ns`."""
+        return deadline_ns
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return 0."""
+        return 0
+
+    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
+        """Return 0."""
+        return 0
+
+
+class SerialPort(OwnProcessors):
     """A serial line by its descriptor, made non-blocking; opened, locked and set up by another process."""
 
     def __init__(self, descriptor: int, name: str) -> None:
@@ -144,6 +192,10 @@ class SerialPort:
         self.announced = False
         return count or 0  # None where a read would have waited
 
+    def renewed(self) -> SerialPort:
+        """Return the port of the same line after it was opened again under the same descriptor."""
+        return SerialPort(self.descriptor, self.name)
+
     def failure(self, code: int) -> PortError:
         """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
         if code < 0:
@@ -153,6 +205,73 @@ class SerialPort:
     def _gone(self, error: OSError | None) -> PortError:
         why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
         return PortError(f"{self.name} is gone{why}: was the adapter unplugged?")
+
+
+class StallCounter:
+    """Time for which replies of simulated servos were awaited beyond their deadlines, of all lines."""
+
+    __slots__ = ("_until_ns", "times", "waited_ns")
+
+    def __init__(self) -> None:
+        self.waited_ns = 0
+        self.times = 0
+        self._until_ns = 0
+
+    def count(self, begin_ns: int, end_ns: int) -> None:
+        """Count a wait, as far as it was not counted for another line; it may continue the one before."""
+        if begin_ns - self._until_ns > _SAME_STALL_NS:
+            self.times += 1
+            self._until_ns = begin_ns
+        self.waited_ns += max(0, end_ns - self._until_ns)
+        self._until_ns = max(self._until_ns, end_ns)
+
+
+class SimulatedPort(SerialPort):
+    """Pseudo-terminal of simulated servos, whose process may have to wait for a core.
+
+    A reply is awaited beyond its deadline as long as `progress` shows that this process has not taken the
+    request, has not served the line up to the deadline, or has handed over bytes that the kernel still has;
+    at most LONGEST_STALL_NS after the request. The deadline counts from when the request was taken.
+    """
+
+    def __init__(self, descriptor: int, name: str, progress: LineProgress, stalls: StallCounter) -> None:
+        super().__init__(descriptor, name)
+        self._progress = progress
+        self._stalls = stalls
+        self._given_up: tuple[int, int] | None = None  # Progress of a process that was waited for in vain
+
+    def renewed(self) -> SimulatedPort:
+        """Return the port of the same line after it was opened again under the same descriptor."""
+        return SimulatedPort(self.descriptor, self.name, self._progress, self._stalls)
+
+    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
+        """Return how long a reply is awaited whose deadline has passed."""
+        progress = self._progress
+        taken_ns, served_ns, given_ns = progress.taken_ns, progress.served_ns, progress.given_ns
+        if (taken_ns, served_ns) == self._given_up:
+            return deadline_ns
+        until_ns = now_ns + _STALL_STEP_NS
+        if taken_ns >= off_wire_ns:
+            deadline_ns += taken_ns - off_wire_ns
+            on_the_way = given_ns > max(heard_ns, off_wire_ns)
+            if served_ns >= deadline_ns and not on_the_way:
+                return now_ns  # whatever comes is later than that on purpose
+            until_ns = max(until_ns, min(deadline_ns, served_ns))
+        latest_ns = off_wire_ns + LONGEST_STALL_NS
+        if now_ns >= latest_ns:
+            self._given_up = taken_ns, served_ns
+            return now_ns
+        self._stalls.count(now_ns, now_ns + _STALL_STEP_NS)
+        return min(until_ns, latest_ns)
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long the process of the simulated servos did not run between two times."""
+        return self._progress.process.stalled_ns(since_ns, until_ns)
+
+    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
+        """Return by how much the newest reply is late by its process, which took or gave bytes late."""
+        taken_late_ns = max(0, self._progress.taken_ns - off_wire_ns)
+        return taken_late_ns + max(0, heard_ns - self._progress.due_ns)
 
 
 class SerialPorts:
@@ -218,7 +337,7 @@ class SerialPorts:
         if descriptor is None:
             return False
         put_in_place(descriptor, gone.descriptor)
-        self._ports[index] = SerialPort(gone.descriptor, gone.name)
+        self._ports[index] = gone.renewed()
         self._waited.append(gone.descriptor)
         self._poll.register(gone.descriptor, select.POLLIN)
         return True

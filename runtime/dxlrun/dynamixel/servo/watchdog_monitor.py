@@ -53,8 +53,11 @@ class WatchdogMonitor:
         words = self._words
         if not (words[SILENCE_NS] and words[ASKED_NS]):
             return
-        if now_ns - words[ASKED_NS] > words[SILENCE_NS]:
-            self._revive_all((now_ns - words[ASKED_NS]) // 1_000_000)
+        silent_ns = now_ns - words[ASKED_NS]
+        if silent_ns > words[SILENCE_NS]:
+            silent_ns -= self._life.idle.bus.stalled_ns(words[ASKED_NS], now_ns)
+        if silent_ns > words[SILENCE_NS]:
+            self._revive_all(silent_ns // 1_000_000)
         words[ASKED_NS] = now_ns
 
     def _revive_all(self, silent_ms: int) -> None:

@@ -223,6 +223,11 @@ class SimulatedBus:
         for node in self.nodes:
             node.advance(now_ns)
 
+    def excuse(self, duration_ns: int) -> None:
+        """Leave out of the servos' Bus Watchdogs for how long this process did not run, ns."""
+        for servo in self.servos:
+            servo.excuse(duration_ns)
+
     def at(self, t_ns: int, action: Action) -> None:
         """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
         heapq.heappush(self._planned, (t_ns, next(self._order), action))

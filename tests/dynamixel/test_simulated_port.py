@@ -1,0 +1,153 @@
+"""Deadlines of simulated servos: extended only as far as their process proves that it did not run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from dxlrun.channels.heartbeat import (
+    ENDLESS_NS,
+    LineProgress,
+    SimulationProgress,
+    create_progress,
+)
+from dxlrun.dynamixel.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
+
+MS = 1_000_000
+SENT = 1_000 * MS  # when the request is off the wire
+DEADLINE = SENT + 12 * MS
+
+
+@pytest.fixture
+def memory() -> Iterator[int]:
+    descriptor = create_progress(2)
+    yield descriptor
+    os.close(descriptor)
+
+
+@pytest.fixture
+def simulation(memory: int) -> LineProgress:
+    """The simulation's side of a line."""
+    return SimulationProgress(memory).line(1)
+
+
+@pytest.fixture
+def stalls() -> StallCounter:
+    return StallCounter()
+
+
+@pytest.fixture
+def port(memory: int, stalls: StallCounter) -> Iterator[SimulatedPort]:
+    ours, theirs = os.pipe()
+    yield SimulatedPort(ours, "sim", SimulationProgress(memory).line(1), stalls)
+    os.close(ours)
+    os.close(theirs)
+
+
+def extended(port: SerialPort, now: int, heard: int = 0) -> int:
+    return port.extend_deadline(DEADLINE, SENT, heard, now)
+
+
+def test_request_that_was_not_taken_is_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
+    simulation.take(SENT - 1)
+    simulation.serve(ENDLESS_NS)
+    assert extended(port, DEADLINE) == DEADLINE + MS
+
+
+def test_deadline_counts_from_when_the_request_was_taken(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    simulation.serve(SENT + 100 * MS)
+    simulation.take(SENT + 100 * MS)
+    assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
+    simulation.serve(ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
+    assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
+
+
+def test_silent_servo_of_a_running_process_is_given_up_at_once(
+    port: SimulatedPort, simulation: LineProgress, stalls: StallCounter
+) -> None:
+    simulation.serve(ENDLESS_NS)
+    simulation.take(SENT + MS // 10)
+    assert extended(port, DEADLINE) <= DEADLINE
+    assert (stalls.times, stalls.waited_ns) == (0, 0)
+
+
+def test_reply_that_is_late_on_purpose_is_given_up_at_once(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
+    simulation.serve(SENT + 16 * MS)
+    simulation.take(SENT)
+    assert extended(port, DEADLINE) <= DEADLINE
+
+
+def test_reply_that_was_due_and_was_not_handed_over_is_awaited(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    simulation.serve(SENT + MS)  # when the reply is due; the process has not run since
+    simulation.take(SENT)
+    assert extended(port, DEADLINE) > DEADLINE
+
+
+def test_bytes_that_the_kernel_still_has_are_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
+    simulation.take(SENT)
+    simulation.give(SENT + MS, SENT + 11 * MS)
+    simulation.serve(ENDLESS_NS)
+    assert extended(port, DEADLINE, heard=SENT - MS) > DEADLINE
+    assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
+
+
+def test_wait_is_bounded_and_not_repeated_for_the_same_stall(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    assert extended(port, SENT + LONGEST_STALL_NS - MS // 2) == SENT + LONGEST_STALL_NS
+    late = SENT + LONGEST_STALL_NS
+    assert extended(port, late) <= late
+    later, sent = late + 100 * MS, late + 80 * MS
+    assert port.extend_deadline(sent + 12 * MS, sent, 0, later) <= later
+    simulation.take(late)  # the process runs again
+    assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
+
+
+def test_waits_of_several_lines_count_once() -> None:
+    stalls = StallCounter()
+    for begin in (100, 101, 102):
+        for _line in range(3):
+            stalls.count(begin * MS, (begin + 1) * MS)
+    stalls.count(200 * MS, 201 * MS)
+    assert (stalls.times, stalls.waited_ns) == (2, 4 * MS)
+    stalls.count(203 * MS, 204 * MS)  # the same wait goes on, after a wake-up that was late
+    assert (stalls.times, stalls.waited_ns) == (2, 7 * MS)
+
+
+def test_real_port_never_extends_a_deadline(port: SimulatedPort) -> None:
+    real = SerialPort(port.descriptor, "/dev/ttyUSB0")
+    assert extended(real, DEADLINE) == DEADLINE
+    assert (real.late_ns(0, 9), real.stalled_ns(0, 9)) == (0, 0)
+
+
+def test_late_reply_is_split_into_what_its_process_was_late(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    simulation.take(SENT + 5 * MS)
+    simulation.give(SENT + 6 * MS, SENT + 9 * MS)
+    assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
+
+
+def test_stalls_count_as_far_as_they_overlap(memory: int, port: SimulatedPort) -> None:
+    progress = SimulationProgress(memory)
+    for second in range(20):  # more than are kept
+        progress.note_stall(second * 1_000 * MS, (second * 1_000 + 100) * MS)
+    assert port.stalled_ns(18_050 * MS, 19_050 * MS) == (50 + 50) * MS
+    assert port.stalled_ns(18_200 * MS, 18_900 * MS) == 0
+    assert port.stalled_ns(0, 2_000 * MS) == 0  # forgotten
+
+
+def test_port_of_a_line_that_is_back_keeps_its_progress(
+    port: SimulatedPort, simulation: LineProgress
+) -> None:
+    simulation.take(SENT - 1)
+    assert extended(port.renewed(), DEADLINE) > DEADLINE

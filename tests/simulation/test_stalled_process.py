@@ -1,0 +1,119 @@
+"""A process of simulated servos that is stopped for a while, or answers late on purpose, and its host."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import pytest
+from tests.kit.rigs import make_plan
+
+from dxlrun.channels import process
+from dxlrun.channels.heartbeat import SimulationProgress, create_progress
+from dxlrun.channels.packets import PacketSink
+from dxlrun.clock import MonotonicClock
+from dxlrun.dynamixel.exchange.bus import Lines
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.retry import extend_timeouts
+from dxlrun.dynamixel.port.ports import SerialPorts, SimulatedPort, StallCounter
+from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
+from dxlrun.plan.transaction import Outcome, Program, Reply
+from dxlrun.run.simulation_front import first_message, start_simulation
+from dxlrun.simulation.messages import SimulationJob
+
+IDS = (1, 2)
+PLAN = make_plan(IDS)
+
+
+@dataclass
+class Host:
+    lines: Lines
+    stalls: StallCounter
+    child: subprocess.Popen[bytes]
+
+    def ask(self, servo_id: int) -> Reply:
+        def ping() -> Program[Reply]:
+            return (yield plan_line(PLAN).ping(servo_id))
+
+        (reply,) = self.lines.run([ping()])
+        assert reply is not None
+        return reply
+
+    @contextmanager
+    def stopped(self, seconds: float) -> Iterator[None]:
+        """Stop the process of the servos; a thread lets it continue, or the end of the context."""
+        os.kill(self.child.pid, signal.SIGSTOP)
+        timer = threading.Timer(seconds, os.kill, (self.child.pid, signal.SIGCONT))
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            timer.join()
+            os.kill(self.child.pid, signal.SIGCONT)
+
+
+@contextmanager
+def simulated(*faults: str, latency_timer_ns: int = 0) -> Iterator[Host]:
+    progress, errors = create_progress(1), process.memory_file("errors")
+    bus = BusConfig("main", PLAN.baud_rate, tuple(ServoConfig(each, "AX-12A", 2.0) for each in IDS))
+    job = SimulationJob(SimulationConfig((bus,), faults=faults), progress=progress)
+    child = start_simulation(job, errors)
+    try:
+        path = (first_message(child).ports or {})["main"]
+        with open_serial(path, PLAN.baud_rate) as line:
+            stalls = StallCounter()
+            port = SimulatedPort(line.fileno(), "sim", SimulationProgress(progress).line(0), stalls)
+            lines = Lines([PLAN], SerialPorts([port]), MonotonicClock(), PacketSink())
+            yield Host(lines, stalls, child.process)
+    finally:
+        child.kill()
+        os.close(progress)
+        os.close(errors)
+
+
+def test_reply_is_awaited_while_the_process_is_stopped() -> None:
+    with simulated() as host:
+        assert host.ask(1).outcome is Outcome.OK
+        with host.stopped(0.2):
+            reply = host.ask(1)
+        assert reply.outcome is Outcome.OK
+        assert host.stalls.waited_ns > 100_000_000
+        assert reply.stalled_ns > 100_000_000
+
+
+def test_process_that_stays_stopped_is_given_up_once() -> None:
+    with simulated() as host, host.stopped(20.0):
+        assert [host.ask(1).outcome for _ in range(3)] == [Outcome.TIMEOUT] * 3
+        # three times the bound would be 1.5 s
+        assert 0 < host.stalls.waited_ns < 1_400_000_000
+
+
+@pytest.mark.parametrize(
+    "fault", ["silence servo=1 for=60s", "wedge for=60s", "timer by=200ms", "slow servo=1 by=200ms"]
+)
+def test_servo_that_is_silent_or_late_on_purpose_is_lost(fault: str) -> None:
+    with simulated(fault) as host:
+        # what an adapter's timer held back of the first reply brings a later one in time
+        assert host.ask(1).outcome is Outcome.TIMEOUT
+        assert Outcome.TIMEOUT in [host.ask(1).outcome for _ in range(4)]
+        assert host.stalls.waited_ns < 500_000_000  # on a busy machine; it would be 2.5 s
+
+
+def test_lateness_of_the_process_is_told_apart_from_that_of_the_servo() -> None:
+    with simulated("slow servo=1 by=30ms") as host:
+        late_ns: list[int] = []
+
+        def ping() -> Program[Reply]:
+            return (yield plan_line(PLAN).ping(1))
+
+        with host.stopped(0.1):
+            host.lines.run([extend_timeouts(ping(), extra_ns=late_ns)])
+        (late,) = late_ns
+        assert 29_000_000 < late < 60_000_000  # of more than 100 ms
