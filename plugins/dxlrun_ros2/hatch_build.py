@@ -1,4 +1,4 @@
-"""Build hook: generates and compiles the ROS 2 message packages that have no wheels, from interfaces/."""
+"""Build hooks: the version of the tree, and the ROS 2 message packages without wheels, from interfaces/."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import re
 import shutil
 import subprocess
 import sysconfig
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 USED = re.compile(r"__rosidl_(generator|typesupport_\w*c\b)|librosidl|librcutils|librcpputils|fastcdr")
 """Libraries of other packages."""
@@ -47,6 +49,23 @@ class Interfaces(BuildHookInterface[Any]):
         build_data["shared_data"][str(made / "share")] = "share"
         for path in (made / "lib").iterdir():  # one by one: of a folder what .gitignore names is left out
             build_data["shared_data"][str(path)] = f"lib/{path.name}"
+
+
+class TreeVersion(MetadataHookInterface):
+    """Gives the package the version of the tree that it is built from, and pins dxlrun to it.
+
+    The version has one home, the pyproject.toml of dxlrun. An sdist has both in its PKG-INFO.
+    """
+
+    PLUGIN_NAME = "custom"
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set version and dependencies of a build from the tree."""
+        if "version" in metadata:
+            return
+        core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
+        metadata["version"] = core["project"]["version"]
+        metadata["dependencies"] = [f"dxlrun=={metadata['version']}", *self.config.get("dependencies", ())]
 
 
 def make(source: Path, place: Path, library: Path, libraries: Path) -> None:

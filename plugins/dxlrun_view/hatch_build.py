@@ -1,4 +1,4 @@
-"""Build hook: makes the page's one script from the libraries that page/package-lock.json names."""
+"""Build hooks: the version of the tree, and the page's one script, of the libraries in package-lock.json."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import os
 import shutil
 import subprocess
 import tempfile
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 BUNDLE = "src/dxlrun_view/page/build"
 ESBUILD = "node_modules/esbuild/bin/esbuild"
@@ -31,6 +33,23 @@ class Bundle(BuildHookInterface[Any]):
             return
         with tempfile.TemporaryDirectory() as place:
             bundle(root / "page", Path(place), root / BUNDLE)
+
+
+class TreeVersion(MetadataHookInterface):
+    """Gives the package the version of the tree that it is built from, and pins dxlrun to it.
+
+    The version has one home, the pyproject.toml of dxlrun. An sdist has both in its PKG-INFO.
+    """
+
+    PLUGIN_NAME = "custom"
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set version and dependencies of a build from the tree."""
+        if "version" in metadata:
+            return
+        core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
+        metadata["version"] = core["project"]["version"]
+        metadata["dependencies"] = [f"dxlrun=={metadata['version']}", *self.config.get("dependencies", ())]
 
 
 def bundle(source: Path, place: Path, target: Path) -> None:

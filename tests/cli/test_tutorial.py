@@ -12,6 +12,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def reader(
     # dxlrun_view as if installed, which would fetch what its page is made of
     info = tmp_path / "installed/dxlrun_view-0.1.0.dist-info"
     info.mkdir(parents=True)
-    (info / "METADATA").write_text("Name: dxlrun-view\nVersion: 0.1.0\n")
+    (info / "METADATA").write_text(f"Name: dxlrun-view\nVersion: {version('dxlrun')}\n")
     (info / "entry_points.txt").write_text("[dxlrun]\nview = dxlrun_view\n")
     packages = (str(ROOT / "plugins/dxlrun_view/src"), str(info.parent))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(packages))

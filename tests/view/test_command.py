@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[View]:
     # as if the package was installed, which would fetch what its page is made of
     installed = tmp_path / "dxlrun_view-0.1.0.dist-info"
     installed.mkdir()
-    (installed / "METADATA").write_text("Name: dxlrun-view\nVersion: 0.1.0\n")
+    (installed / "METADATA").write_text(f"Name: dxlrun-view\nVersion: {version('dxlrun')}\n")
     (installed / "entry_points.txt").write_text("[dxlrun]\nview = dxlrun_view\n")
     package = str(ROOT / "plugins/dxlrun_view/src")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join((package, str(tmp_path))))

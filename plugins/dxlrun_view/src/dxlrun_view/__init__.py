@@ -17,4 +17,4 @@ def dxlrun_contract() -> int:
 def dxlrun_commands() -> Sequence[Command]:
     """Return the verb."""
     help_line = "Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers."
-    return (Command("view", "dxlrun_view.view:view", help_line, "Robots that run"),)
+    return (Command("view", "dxlrun_view.command:view", help_line, "Robots that run"),)
