@@ -102,11 +102,13 @@ def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_j
 
     with ThreadPoolExecutor(len(work)) as threads:
         rows = list(threads.map(done, work, work.values()))
+    failures = [str(row["text"]) for row in rows if not row["done"]]
+    code = 1 if failures else 0
     if as_json:
-        show_json(rows)
+        show_json(rows, code=code, errors=failures)
     for row in () if as_json else rows:
         (show if row["done"] else print_error)(str(row["text"]))
-    return 0 if all(row["done"] for row in rows) else 1
+    return code
 
 
 def _start(fleet: Fleet, name: str) -> str:
@@ -154,8 +156,10 @@ def _view(fleet: Fleet, *, as_json: bool) -> int:
         for view in views:
             view.tried.wait(max(0.0, until - time.monotonic()))
         rows = [view.seen() for view in views]
+    failures = [f"{row.robot} is unreachable: {row.reason}" for row in rows if row.state == "unreachable"]
+    code = 1 if failures else 0
     if as_json:
-        show_json(rows)
+        show_json(rows, code=code, errors=failures)
     else:
         show(fleet_table(rows))
-    return 1 if any(row.state == "unreachable" for row in rows) else 0
+    return code

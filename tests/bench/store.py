@@ -10,7 +10,6 @@ kept. Needs `pip install 'moto[server,s3]'`.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import os
 import subprocess
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import fsspec
 from moto.server import ThreadedMotoServer
+from tests.kit.answers import result_of
 
 from dxlrun.testing import simulated_robot
 
@@ -61,7 +61,7 @@ def timed(verb: str, *words: object) -> None:
     """Run a command, and print how long it took, and of how many logs it told."""
     began = time.monotonic()
     done = subprocess.run([DXLRUN, verb, *map(str, words), "--json"], check=True, stdout=subprocess.PIPE)
-    took, found = time.monotonic() - began, json.loads(done.stdout)
+    took, found = time.monotonic() - began, result_of(done.stdout)
     sys.stdout.write(f"{verb} {words[-1] if verb == 'upload' else words[0]}: {took:.1f} s, ")
     sys.stdout.write(f"{len(found.get('uploaded') or found['rows'])} logs\n")
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import read_answer, result_of
 from tests.kit.held_logs import being_written
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 """Of one joint, because a page has a figure for each."""
 FOOTER_BYTES = 37  # mcap.dev/spec: a record of 20 bytes, and the magic at the end of the file
+NO_LOG = "this is no MCAP file, so it is no log of dxlrun"
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def test_a_report_is_written_beside_the_output(dxlrun: Callable, log: Path, tmp_
     assert "virtual: times are computed, not measured" in text
 
     said = dxlrun("analyze", log, "--json", "--report", target)
-    assert json.loads(said.out)["robot"] == "single_joint"
+    assert result_of(said.out)["robot"] == "single_joint"
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_without_an_argument_the_newest_log_of_the_directory_is_analyzed(dxlrun:
 
     assert said.code == 0
     assert said.out.splitlines()[0] == f"log: {newest.relative_to(Path.cwd())}"
-    assert json.loads(dxlrun("analyze", "--json").out)["log"] == str(newest.relative_to(Path.cwd()))
+    assert result_of(dxlrun("analyze", "--json").out)["log"] == str(newest.relative_to(Path.cwd()))
 
 
 def test_without_an_argument_a_log_that_is_being_written_is_not_analyzed(dxlrun: Callable, log: Path):
@@ -145,14 +146,10 @@ def test_several_logs_get_one_line_each(dxlrun: Callable, log: Path, tmp_path: P
     assert said.out.splitlines() == [
         f"{path}: Good: ran for 0.2 s without a motion." for path in (first, second)
     ]
-    assert said.errors == [f"dxlrun: {other}: this is no MCAP file, so it is no log of dxlrun"]
-    assert [
-        each["log"] for each in json.loads(dxlrun("analyze", first, other, second, "--json").out)["logs"]
-    ] == [
-        str(first),
-        str(other),
-        str(second),
-    ]
+    assert said.errors == [f"dxlrun: {other}: {NO_LOG}"]
+    answer = read_answer(dxlrun("analyze", first, other, second, "--json").out)
+    assert [each["log"] for each in answer.result["logs"]] == [str(first), str(second)]
+    assert [error.what for error in answer.errors] == [f"{other}: {NO_LOG}"]
 
 
 @pytest.mark.parametrize(("option", "value"), [("--report", "file.html"), ("--worst", "3")])

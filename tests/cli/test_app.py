@@ -1,4 +1,3 @@
-import json
 import os
 import re
 import subprocess
@@ -6,6 +5,7 @@ import sys
 from importlib import metadata
 
 import pytest
+from tests.kit.answers import read_answer
 
 from dxlrun.channels import compiled
 from dxlrun.cli import inputs
@@ -169,7 +169,7 @@ def test_an_interrupt_under_json_is_json(dxlrun, monkeypatch: pytest.MonkeyPatch
 
     said = dxlrun("check", "robot.yaml", "--json")
 
-    assert (said.code, json.loads(said.out)["errors"]) == (130, [{"what": "interrupted"}])
+    assert (said.code, [one.what for one in read_answer(said.out).errors]) == (130, ["interrupted"])
 
 
 def test_the_usage_shows_that_a_robot_and_a_command_are_alternatives(dxlrun):

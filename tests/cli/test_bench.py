@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunSummary
@@ -22,7 +22,7 @@ def test_a_robot_is_run_to_see_whether_a_rate_is_kept(
 ) -> None:
     monkeypatch.setattr(highest_rate, "MOST_TRIES", 1)  # each takes seconds
     said = dxlrun("bench", "rate", ROBOT, "--duration", "0.3", "--json")
-    shown = json.loads(said.out)
+    shown = result_of(said.out)
     assert said.code == (0 if shown["kept_hz"] else 1)
     assert shown["robot"] == "single_joint"
     assert shown["tries"][0]["rate_hz"] <= shown["computed_hz"]

@@ -1,7 +1,7 @@
-import json
 import re
 
 import pytest
+from tests.kit.answers import read_answer, result_of
 
 TEN_MISTAKES = """\
 name: ten mistakes
@@ -115,12 +115,10 @@ def test_errors_as_json(dxlrun, tmp_path):
 
     said = dxlrun("check", file, "--json")
 
-    result = json.loads(said.out)
+    errors = read_answer(said.out).errors
     assert (said.code, said.err) == (2, "")
-    assert result["ok"] is False
-    assert sorted((e["line"], e["column"]) for e in result["errors"]) == marked(CROSSED, CROSSED_TEN)
-    assert {type(e["what"]) for e in result["errors"]} == {str}
-    assert set(result["errors"][0]) == {"file", "line", "column", "what", "mend"}
+    assert sorted((e.line, e.column) for e in errors) == marked(CROSSED, CROSSED_TEN)
+    assert all(e.what and e.fix and e.file == str(file) for e in errors)
 
 
 def test_the_torso_as_tables(dxlrun, torso, three_parts):
@@ -142,10 +140,11 @@ def test_the_torso_as_tables(dxlrun, torso, three_parts):
 def test_the_torso_as_json(dxlrun, torso, three_parts):
     said = dxlrun("check", torso, "port:=/dev/ttyUSB0", "--play", three_parts, "--json")
 
-    result = json.loads(said.out)
+    answer = read_answer(said.out)
+    result = answer.result
     assert (said.code, said.err) == (0, "")
     assert set(result) == {
-        *("ok", "errors", "warnings", "robot", "rate"),
+        *("robot", "rate"),
         *(
             "joints",
             "devices",
@@ -159,9 +158,7 @@ def test_the_torso_as_json(dxlrun, torso, three_parts):
             "duration",
         ),
     }
-    assert result["ok"] is True
-    assert result["errors"] == []
-    assert len(result["warnings"]) == 1
+    assert len(answer.warnings) == 1
     assert len(result["joints"]) == 8
     (bus,) = result["buses"]
     # protocol.md, Time budget: 8 reads of 6 bytes and one sync write
@@ -181,7 +178,7 @@ def test_too_fast_a_loop_names_the_highest_rate(dxlrun, torso):
 
 
 def test_a_simulated_adapter_does_not_wait(dxlrun, torso):
-    (bus,) = json.loads(dxlrun("check", torso, "--json").out)["buses"]
+    (bus,) = result_of(dxlrun("check", torso, "--json").out)["buses"]
 
     assert bus["latency"] == 0
     assert bus["total"] == pytest.approx(6.08e-3)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from pathlib import Path
 
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.compile.robot import compile_files
@@ -34,7 +34,7 @@ def test_a_scan_finds_boards_beside_servos_and_drafts_them(dxlrun, simulated_lin
     path, finish = simulated_line(BOARDS)
     said = dxlrun("scan", path, *NEW, "--output", tmp_path / "found.yaml", "--json")
     assert said.code == 0, said.err
-    found = {each["servo_id"]: each for each in json.loads(said.out)["servos"]}
+    found = {each["servo_id"]: each for each in result_of(said.out)["servos"]}
     assert {key: (each["model"], each["device"]) for key, each in found.items()} == {
         1: ("XL430-W250", False),
         42: ("bitbots-core", True),
@@ -55,7 +55,7 @@ def test_items_of_a_board_are_read_and_written(dxlrun, simulated_line):
     path, finish = simulated_line(BOARDS)
     said = dxlrun("servo", path, 241, "get", "accel_z", "button_1", *NEW)
     assert "9.80665 m/s^2" in said.out, said.err
-    shown = json.loads(dxlrun("servo", path, 42, "get", "--json", *NEW).out)
+    shown = result_of(dxlrun("servo", path, 42, "get", "--json", *NEW).out)
     assert (shown["registers"]["vdxl"], shown["servo"]["model"]) == (574, "bitbots-core")
     assert "LED 0 Red (10) was 0 and is 200" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
     assert "LED 0 Red (10) is 200 already" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
@@ -105,7 +105,7 @@ def test_boards_of_protocol_1_are_found(dxlrun, simulated_line):
     )
     path, _ = simulated_line(config)
     said = dxlrun("scan", path, *OLD, "--ids", "1,200", "--json")
-    assert [(each["servo_id"], each["model"]) for each in json.loads(said.out)["servos"]] == [
+    assert [(each["servo_id"], each["model"]) for each in result_of(said.out)["servos"]] == [
         (1, "MX-28"),
         (200, "CM-730"),
     ]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import read_answer
 
 from dxlrun.channels import compiled
 from dxlrun.control.realtime import UNLIMITED
@@ -314,10 +314,11 @@ def test_trying_a_policy_leaves_none_behind() -> None:
 
 def test_the_doctor_looks_at_this_machine(dxlrun: Callable[..., Any]) -> None:
     said = dxlrun("doctor", "--json")
-    shown = json.loads(said.out)
+    answer = read_answer(said.out)
+    shown = answer.result
     states = {check["state"] for check in shown["checks"]}
     assert said.code == (1 if "missing" in states else 0)
-    assert shown["ok"] == ("missing" not in states)
+    assert answer.ok == ("missing" not in states)
     assert states <= {"good", "worse", "missing"}
     assert all(set(check) == {"what", "state", "found", "why", "mend"} for check in shown["checks"])
     assert all(check["mend"] for check in shown["checks"] if check["state"] != "good")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
 
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.cli.steering import echo as module
 from dxlrun.cli.steering.echo import fields
@@ -117,8 +117,8 @@ def test_messages_are_printed_until_there_are_no_more(dxlrun: Any, running: Call
 def test_a_count_ends_it(dxlrun: Any, running: Callable[..., Robot]) -> None:
     running([message(1), message(2), message(3)])
     lines = dxlrun("echo", "arm/state", "--count", "2", "--json").out.splitlines()
-    assert [json.loads(line)["number"] for line in lines] == [1, 2]
-    assert json.loads(lines[0]) == {
+    assert [result_of(line)["number"] for line in lines] == [1, 2]
+    assert result_of(lines[0]) == {
         "topic": "/arm/state", "number": 1, "time": 1.5, "lost": 0, "message": {"share": 1.0},
     }  # fmt: skip
 
@@ -136,4 +136,4 @@ def test_without_a_topic_all_are_listed(dxlrun: Any, running: Callable[..., Robo
         ["/arm/state", "mine/msg/State", "12", "49.96", "Hz"],
         ["/events", "dxlrun_msgs/msg/Event", "3"],
     ]
-    assert [row["name"] for row in json.loads(dxlrun("echo", "--json").out)] == ["/arm/state", "/events"]
+    assert [row["name"] for row in result_of(dxlrun("echo", "--json").out)] == ["/arm/state", "/events"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.examples import as_parameters
 
 from dxlrun.cli import inputs
@@ -20,7 +20,7 @@ NAMES = sorted(path.stem for path in ROBOTS.glob("*.yaml"))
 
 def test_every_robot_is_listed_with_its_motions(dxlrun: Callable):
     said = dxlrun("examples")
-    listed = {one["name"]: one for one in json.loads(dxlrun("examples", "--json").out)}
+    listed = {one["name"]: one for one in result_of(dxlrun("examples", "--json").out)}
 
     assert said.code == 0
     assert sorted(listed) == NAMES
@@ -68,7 +68,7 @@ def test_it_goes_into_robots_and_may_be_copied_again(
 
 
 def test_a_copy_is_reported_in_json_too(dxlrun: Callable, tmp_path: Path):
-    shown = json.loads(dxlrun("examples", "diff_drive", tmp_path, "--json").out)
+    shown = result_of(dxlrun("examples", "diff_drive", tmp_path, "--json").out)
 
     assert shown["robot"] == shown["files"][0] == f"{tmp_path}/diff_drive.yaml"
     assert all(Path(file).is_file() for file in shown["files"])

@@ -11,7 +11,7 @@ from rich.console import Console
 from dxlrun.output.graph import Graph, Node
 from dxlrun.output.html import table_element
 from dxlrun.output.table import Cell, Column, Sentence, Table
-from dxlrun.output.terminal import print_error, print_warning, show, show_json, show_json_line
+from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 SERVOS = Table.of(
     "",
@@ -117,15 +117,13 @@ def test_texts_of_plug_ins_have_no_effect_on_a_terminal(capsys: pytest.CaptureFi
     texts.append(shown(graph, width=200))  # type: ignore[arg-type]  # a part like the others
     print_error(HOSTILE)
     print_warning(HOSTILE)
-    show_json_line({HOSTILE: HOSTILE})
-    show_json([HOSTILE.removesuffix("\ud800")])
+    show_json({HOSTILE: HOSTILE}, code=1, errors=[HOSTILE])
     said = capsys.readouterr()
     for text in (*texts, said.out, said.err):
         assert all(character.isprintable() or character == "\n" for character in text), ascii(text)
     assert r"\x1b]0;owned\x07\x1b[2J \x9b31m \u202egood" in texts[2]
-    line, rest = said.out.split("\n", 1)
-    assert json.loads(line) == {HOSTILE: HOSTILE}
-    assert json.loads(rest) == [HOSTILE.removesuffix("\ud800")]
+    answer = json.loads(said.out)
+    assert (answer["result"], answer["errors"][0]["what"]) == ({HOSTILE: HOSTILE}, HOSTILE.partition("; ")[0])
     page = "".join(table_element(table).itertext())
     assert r"\x1b[2J \x9b31m \u202egood" in page
     assert "\x1b" not in page

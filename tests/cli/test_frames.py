@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
@@ -59,7 +59,7 @@ def test_the_tree_is_drawn(dxlrun: Dxlrun, pair: Path) -> None:
 
 
 def test_the_tree_as_json_has_what_the_drawing_has(dxlrun: Dxlrun, pair: Path) -> None:
-    found = json.loads(dxlrun("frames", str(pair), "--json").out)
+    found = result_of(dxlrun("frames", str(pair), "--json").out)
 
     assert (found["robot"], found["root"]) == ("pair", "base")
     rows = {row["frame"]: row for row in found["frames"]}
@@ -83,7 +83,7 @@ def test_a_pose_is_printed_and_as_json(dxlrun: Dxlrun, pair: Path) -> None:
         "jaw=5 mm",
     )
     printed = dxlrun(*words).out
-    found = json.loads(dxlrun(*words, "--json").out)
+    found = result_of(dxlrun(*words, "--json").out)
 
     assert "x y z           0.000000 0.005000 0.000000 m" in printed
     assert "roll pitch yaw  0.000 0.000 90.000 deg" in printed

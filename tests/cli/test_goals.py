@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import read_answer, result_of
 
 from dxlrun.cli.steering import goals, parameters, play, steer
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
@@ -133,7 +133,7 @@ SEND = ("send", "arm", "trajectory", "points=[]")
 
 def test_send_reports_the_number_of_the_goal(dxlrun: Dxlrun, robot: Robot) -> None:
     assert dxlrun(*SEND) == (0, "torso: arm accepted trajectory as goal 3\n", "")
-    assert json.loads(dxlrun(*SEND, "--json").out) == {"robot": "torso", "done": True, "cycle": 7, "goal": 3}
+    assert result_of(dxlrun(*SEND, "--json").out) == {"robot": "torso", "cycle": 7, "goal": 3}
 
 
 def test_send_waits_for_the_result(dxlrun: Dxlrun, robot: Robot) -> None:
@@ -147,9 +147,11 @@ def test_send_waits_for_the_result(dxlrun: Dxlrun, robot: Robot) -> None:
 def test_the_result_is_json_for_programs(dxlrun: Dxlrun, robot: Robot) -> None:
     robot.script = {3: [RUNNING, MISSED]}
     said = dxlrun(*SEND, "--wait", "--json")
-    found = json.loads(said.out)
-    assert (said.code, said.err) == (1, "")
-    assert (found["done"], found["goal"], found["status"], found["joint"]) == (False, 3, "missed", "elbow")
+    answer = read_answer(said.out)
+    assert (said.code, said.err, answer.ok) == (1, "", False)
+    assert answer.errors[0].what.startswith("goal 3 of arm missed")
+    found = answer.result
+    assert (found["goal"], found["status"], found["joint"]) == (3, "missed", "elbow")
 
 
 @pytest.mark.parametrize("status", ["aborted", "cancelled", "preempted"])
@@ -235,7 +237,7 @@ def test_cancel_takes_a_number_a_controller_or_all(dxlrun: Dxlrun, robot: Robot)
     assert dxlrun("cancel") == (0, "torso: goals 3, 4 cancelled\n", "")
     assert dxlrun("cancel", "leg") == (0, "torso: goal 4 cancelled\n", "")
     assert dxlrun("cancel", "3").out == "torso: goal 3 cancelled\n"
-    assert json.loads(dxlrun("cancel", "--json").out)["goals"] == [3, 4]
+    assert result_of(dxlrun("cancel", "--json").out)["goals"] == [3, 4]
     robot.script = {2: [REACHED]}
     assert dxlrun("cancel").out == "torso: no goal runs\n"
     robot.refusals = {2: Refused("goal 2 has ended already: reached", code="goal_ended")}
@@ -264,7 +266,7 @@ def test_parameters_are_a_table(dxlrun: Dxlrun, robot: Robot) -> None:
         ["joints", "[a,", "b]", "fixed"],
         ["careful", "false", "live"],
     ]
-    assert json.loads(dxlrun("parameters", "arm", "--json").out)["parameters"][0]["name"] == "gains.p"
+    assert result_of(dxlrun("parameters", "arm", "--json").out)["parameters"][0]["name"] == "gains.p"
 
 
 def test_parameters_are_changed_together(dxlrun: Dxlrun, robot: Robot) -> None:
@@ -302,14 +304,14 @@ def test_play_follows_all_goals(dxlrun: Dxlrun, robot: Robot, wave: Path) -> Non
 def test_play_fails_when_one_of_its_goals_does(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
     robot.script = {3: [REACHED], 4: [replace(MISSED, number=4, controller="leg")]}
     said = dxlrun("play", wave, "--json")
-    found = json.loads(said.out)
-    assert (said.code, found["done"]) == (1, False)
+    found = read_answer(said.out).result
+    assert said.code == 1
     assert [(goal["goal"], goal["status"]) for goal in found["goals"]] == [(3, "reached"), (4, "missed")]
 
 
 def test_play_without_waiting_reports_the_numbers(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
     assert dxlrun("play", wave, "--no-wait").out == f"torso: plays {wave} as goals 3, 4\n"
-    assert json.loads(dxlrun("play", wave, "--no-wait", "--json").out)["goals"] == [3, 4]
+    assert result_of(dxlrun("play", wave, "--no-wait", "--json").out)["goals"] == [3, 4]
 
 
 def test_ctrl_c_cancels_all_goals_of_a_motion(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
@@ -410,7 +412,7 @@ def test_the_list_has_what_can_be_played_with_its_length(dxlrun: Dxlrun, robot: 
     (wave.parent / "broken.yaml").write_text("name: broken\nmotions: 3\n")
     other = wave.read_text().replace("controller: arm", "controller: wing")
     (wave.parent / "flap.yaml").write_text(other)  # for another robot
-    found = json.loads(dxlrun("play", "--list", "--json").out)
+    found = result_of(dxlrun("play", "--list", "--json").out)
     assert [(each["motion"], each["joints"], each["seconds"]) for each in found] == [
         ("bow", ["hip"], 1.25),
         ("broken", [], None),

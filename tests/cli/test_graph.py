@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Callable
 from itertools import combinations
@@ -15,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from tests.kit.answers import result_of
 
 from dxlrun.cli.steering.steer import drawing
 from dxlrun.output.graph import Edge, Graph, Node, placed
@@ -71,7 +71,7 @@ def test_the_graph_is_drawn_in_the_terminal(dxlrun: Dxlrun, chain: Path) -> None
 
 
 def test_nodes_and_edges_are_in_the_json(dxlrun: Dxlrun, chain: Path) -> None:
-    graph = json.loads(dxlrun("check", chain, "--json").out)["graph"]
+    graph = result_of(dxlrun("check", chain, "--json").out)["graph"]
     assert graph["order"] == ["states", "arm", "arm_pid", "still"]
     assert {"name": "elbow", "kind": "joint"} in graph["nodes"]
     assert {"name": "arm", "kind": "controller"} in graph["nodes"]
@@ -93,7 +93,7 @@ def test_a_picture_of_each_robot_has_all_in_it_and_nothing_over_another(
     assert f"the controller graph is in {path}" in said.out
     root = ET.parse(path).getroot()  # noqa: S314  our own file
     space = "{http://www.w3.org/2000/svg}"
-    controllers = json.loads(dxlrun("check", ROBOTS / f"{name}.yaml", "--json").out)["controllers"]
+    controllers = result_of(dxlrun("check", ROBOTS / f"{name}.yaml", "--json").out)["controllers"]
     texts = [text.text or "" for text in root.iter(f"{space}text")]
     assert {one["name"] for one in controllers} <= set(texts)
     for one in controllers:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import re
 import resource
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.log.reader import read_log
@@ -48,7 +48,7 @@ def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path:
     words = ("--count", 50, "--period", "1ms", "--blocks", 2, "--stress", "--compare", "other,c")
     found = dxlrun("latency", *words, "--report", "page.html", "--json")
     assert (found.code, found.err) == (0, "")
-    result = json.loads(found.out)
+    result = result_of(found.out)
     ours, yardstick = result["conditions"]
     assert (ours["label"], yardstick["label"]) == ("other", "c (other)")
     assert (ours["wake_ups"], yardstick["wake_ups"]) == (50, 50)
@@ -60,7 +60,7 @@ def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path:
     assert (tmp_path / "page.html").read_text().count("<figure") == 3
     analyzed = dxlrun("analyze", result["log"], "--json", "--report", "again.html")
     assert analyzed.code == 0
-    assert json.loads(analyzed.out)["conditions"] == result["conditions"]
+    assert result_of(analyzed.out)["conditions"] == result["conditions"]
     assert (tmp_path / "again.html").is_file()
     assert dxlrun("analyze").out.startswith(f"log: {result['log']}\n\nWake-up latency, period 1 ms, 2 blocks")
     one, two = dxlrun("analyze", result["log"], result["log"]).out.splitlines()
@@ -188,7 +188,7 @@ def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
         else:
             os.kill(running.pid, signal.SIGTERM)  # as Ctrl-C
         shown, errors = running.communicate(timeout=60)
-    result = json.loads(shown)
+    result = result_of(shown)
     (one,) = result["conditions"]
     assert one["wake_ups"] > 10
     assert (running.returncode, result["interrupted"]) == ((1, False) if kill else (130, True))

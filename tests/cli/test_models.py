@@ -1,10 +1,10 @@
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 import dxlrun as dxlrun_package
@@ -85,7 +85,7 @@ def test_the_motor_that_is_simulated_is_reported_with_its_source(dxlrun):
         "1.78 Nm/A",
         "  source    [i] scaled from the MX-64: Rhoban BAM, bam/params/mx64/m3.json",
     ]
-    (shown,) = json.loads(dxlrun("models", "XL330-M077", "--json").out)
+    (shown,) = result_of(dxlrun("models", "XL330-M077", "--json").out)
     motor = shown["simulated_motor"]
     assert (motor["time_constant"], motor["p_gain_duty"]) == pytest.approx((0.0448, 0.0028774), rel=1e-2)
     assert motor["source"].startswith("[i] scaled from the XL330-M288: ")
@@ -113,7 +113,7 @@ def test_items_that_repeat_themselves_share_a_line(dxlrun):
 
 
 def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
-    (shown,) = json.loads(dxlrun("models", "XM430-W350", "--json").out)
+    (shown,) = result_of(dxlrun("models", "XM430-W350", "--json").out)
 
     table = control_table("XM430-W350")
     assert shown["rad_per_tick"] == table.rad_per_tick
@@ -136,7 +136,7 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
 
 
 def test_json_of_all_models_has_no_items(dxlrun):
-    shown = json.loads(dxlrun("models", "--json").out)
+    shown = result_of(dxlrun("models", "--json").out)
 
     assert [(each["model"], each["protocol"]) for each in shown if each["kind"] == "servo"] == [
         (table.model, table.protocol) for table in all_tables()
@@ -157,7 +157,7 @@ def test_a_device_is_printed_with_its_states(dxlrun):
     ]  # fmt: skip
     assert "button.user" in said.out
     assert "angular_velocity.x" in dxlrun("models").out
-    (shown,) = json.loads(dxlrun("models", "BitFoot", "--json").out)
+    (shown,) = result_of(dxlrun("models", "BitFoot", "--json").out)
     assert (shown["kind"], shown["model_number"], len(shown["items"])) == ("device", None, 8)
     said = dxlrun("models", "OpenCR", "--protocol", "1.0")
     assert (said.code, said.errors) == (2, [said.errors[0]])

@@ -9,13 +9,13 @@ or 1 below the line that says so. No robot runs, and `robots` lies in the workin
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import read_answer
 
 ROOT = Path(__file__).parents[2]
 NEEDED = {"identify": "identify", "sweep": "sweep"}
@@ -71,8 +71,9 @@ def test_a_wrong_command_line_is_refused(
 
     if not words.startswith(WITHOUT_JSON):
         for_programs = dxlrun(*shlex.split(words), "--json")
-        refusal = json.loads(for_programs.out)
-        assert (for_programs.code, for_programs.err, refusal["ok"]) == (code, "", False)
-        assert len(refusal["errors"]) == len(said)
-        assert all(one["what"] in line for one, line in zip(refusal["errors"], plain.errors, strict=True))
+        refusal = read_answer(for_programs.out)
+        assert (for_programs.code, for_programs.err, refusal.ok, refusal.result) == (code, "", False, None)
+        assert len(refusal.errors) == len(said)
+        for one, line in zip(refusal.errors, plain.errors, strict=True):
+            assert line.endswith("; ".join(filter(None, (one.what, one.fix))))
     assert [*tmp_path.iterdir()] == [tmp_path / "robots"], "nothing is written"

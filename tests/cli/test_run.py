@@ -1,5 +1,4 @@
 import io
-import json
 import re
 import resource
 import signal
@@ -13,6 +12,7 @@ import msgspec
 import pytest
 from msgspec import structs
 from rich.console import Console
+from tests.kit.answers import result_of
 from tests.kit.commands import Said
 
 from dxlrun.channels.events import (
@@ -120,7 +120,7 @@ def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyz
     assert sentences[0].startswith("  left_shoulder_swing_joint: ")
     path = log.split()[1]
     printed = dxlrun("analyze", path, "--json")
-    verdict = json.loads(printed.out)["verdict"]
+    verdict = result_of(printed.out)["verdict"]
     assert (printed.code, verdict["good"]) == (1, False)
     shown = dxlrun("analyze", path, "--report", "run.html")
     assert shown.code == 1

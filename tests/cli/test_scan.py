@@ -1,10 +1,10 @@
 """`dxlrun scan`: its words, and a pseudo-terminal with simulated servos, judged by the ledger."""
 
-import json
 import subprocess
 import sys
 
 import yaml
+from tests.kit.answers import result_of
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
@@ -39,7 +39,7 @@ def test_both_protocols_are_looked_at_and_told_as_json(dxlrun, simulated_line):
     path, finish = simulated_line(BusConfig("main", 1_000_000, servos("AX-12A")))
     said = dxlrun("scan", path, *NARROW, "--json")
     assert said.code == 0
-    result = json.loads(said.out)
+    result = result_of(said.out)
     assert result["port"] == path
     (servo,) = result["servos"]
     assert (servo["model"], servo["protocol"], servo["baud_rate"]) == ("AX-12A", 1.0, 1_000_000)

@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.tools import scanning
@@ -56,14 +57,14 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): not a terminal, cannot ask" in refused.err
     assert "add --yes" in refused.err
     done = servo(1, "set", "return_delay_time", "100 us", "--yes", "--json", *NEW)
-    result = json.loads(done.out)
+    result = result_of(done.out)
     assert result["done"] == ["Return Delay Time (9) was 250 and is 50"]
     assert result["servo"]["model"] == "XM430-W350"
     again = servo(1, "set", "return_delay_time", "100 us", *NEW)  # nothing to confirm
     assert (again.code, "is 50 already" in again.out) == (0, True)
     offset = servo(1, "set", "homing_offset", "-100", "--yes", *NEW)
     assert (offset.code, "was 0 and is -100" in offset.out) == (0, True)
-    read = json.loads(servo(1, "get", "return_delay_time", "homing_offset", "--json", *NEW).out)
+    read = result_of(servo(1, "get", "return_delay_time", "homing_offset", "--json", *NEW).out)
     assert read["registers"] == {"return_delay_time": 50, "homing_offset": -100}
     assert len(writes(finish())) == 3
 
@@ -81,8 +82,8 @@ def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
     servo(1, "set", "bus_watchdog", "1", *NEW)
     time.sleep(0.2)
     asked = servo(1, "torque", "on", "--json", *NEW)
-    assert len(json.loads(asked.out)["done"]) == 2, asked.err
-    assert "Bus Watchdog" in json.loads(asked.out)["done"][0]
+    assert len(result_of(asked.out)["done"]) == 2, asked.err
+    assert "Bus Watchdog" in result_of(asked.out)["done"][0]
     finish()
 
 
@@ -127,7 +128,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
 def test_a_servo_is_found_without_its_address(one):
     servo, _ = one("AX-12A", 1.0, 1_000_000)
     said = servo(1, "get", "model_number", "--json")
-    assert json.loads(said.out)["servo"] == {
+    assert result_of(said.out)["servo"] == {
         "id": 1,
         "model": "AX-12A",
         "firmware": 24,
@@ -172,7 +173,7 @@ def test_a_backup_goes_into_a_file_and_back_into_another_servo(one, tmp_path, mo
     assert back.code == 0, back.err
     assert "Return Delay Time" in back.out
     assert "Temperature Limit" in back.out
-    one_, two = (json.loads(servo(each, "get", "--json", *words).out)["registers"] for each in (1, 2))
+    one_, two = (result_of(servo(each, "get", "--json", *words).out)["registers"] for each in (1, 2))
     differing = {name for name in one_ if one_[name] != two[name] and not name.startswith("present_")}
     assert differing <= {"id", "realtime_tick", "goal_position", "position_trajectory", "torque_limit"}
     assert "has everything that" in servo(2, "restore", path, *words).out
@@ -202,7 +203,7 @@ def test_a_servo_keeps_a_backup_of_its_own(one):
     servo(1, "set", "return_delay_time", "0", "--yes", *NEW)
     assert "took its EEPROM back" in servo(1, "restore", "--yes", *NEW).out
     said = servo(1, "get", "return_delay_time", "--json", *NEW)
-    assert json.loads(said.out)["registers"] == {"return_delay_time": 250}
+    assert result_of(said.out)["registers"] == {"return_delay_time": 250}
 
 
 class Terminal(io.StringIO):
@@ -259,7 +260,7 @@ def test_get_shows_what_a_start_would_refuse_or_report(one):
     servo(1, "set", "pwm_limit", 400, "--yes", *NEW)
     said = servo(1, "get", "secondary_shadow_id", "pwm_limit", "velocity_limit", *NEW).out
     assert [word in said for word in ("refused: makes", "reported: limits")] == [True, True]
-    judged = json.loads(servo(1, "get", "--json", *NEW).out)["deviations"]
+    judged = result_of(servo(1, "get", "--json", *NEW).out)["deviations"]
     assert {name: found["judgement"] for name, found in judged.items()} == {
         "secondary_shadow_id": "refuse",
         "pwm_limit": "report",

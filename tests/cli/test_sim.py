@@ -19,6 +19,7 @@ from fcntl import ioctl
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import read_answer, result_of
 from tests.kit.pages import page_text
 
 from dxlrun.simulation.bus.ledger import read_ledger
@@ -146,19 +147,19 @@ def test_a_robot_runs_against_it_as_against_a_real_one(start, torso, tmp_path):
 
 def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start):
     sim = start("--servo", "XL430-W250:1-2", "--json")
-    ports = json.loads(sim.line())["ports"]
+    ports = result_of(sim.line())["ports"]
 
     assert hear(ports["main"], PING_1, 14)[:12] == PONG_1
     sim.type("silence  servo=0x1")
-    assert json.loads(sim.line()) == {"understood": "silence servo=1"}
-    assert json.loads(sim.line()) == {"fault": "silence servo=1"}
+    assert result_of(sim.line()) == {"understood": "silence servo=1"}
+    assert result_of(sim.line()) == {"fault": "silence servo=1"}
     sim.type("turn servo=2 by=30deg for=100ms")
-    assert json.loads(sim.line()) == {"understood": "turn servo=2 by=30deg for=100ms"}
-    assert json.loads(sim.line()) == {"fault": "turn servo=2 by=30deg for=100ms"}
+    assert result_of(sim.line()) == {"understood": "turn servo=2 by=30deg for=100ms"}
+    assert result_of(sim.line()) == {"fault": "turn servo=2 by=30deg for=100ms"}
     sim.type("slience servo=1")
-    assert "did you mean silence?" in json.loads(sim.line())["error"]
+    assert "did you mean silence?" in read_answer(sim.line()).errors[0].what
     sim.type("help")
-    assert any(line.startswith("lose ") for line in json.loads(sim.line())["faults"])
+    assert any(line.startswith("lose ") for line in result_of(sim.line())["faults"])
 
     sim.input.close()  # no more input: that ends nothing
     sim.process.stdin = None
@@ -174,7 +175,7 @@ def test_the_programs_of_the_page_run_against_the_servos_of_the_page(start, tmp_
     page = PAGE.replace("/tmp/robot", link)  # noqa: S108
     (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page, re.MULTILINE)
     sim = start(*words.split(), "--json")
-    assert json.loads(sim.line())["ports"] == {"main": link}
+    assert result_of(sim.line())["ports"] == {"main": link}
     said = [
         subprocess.run(
             [sys.executable, "-c", code],
@@ -189,14 +190,14 @@ def test_the_programs_of_the_page_run_against_the_servos_of_the_page(start, tmp_
 
     assert said[0] == "(1060, 0, 0)\n"
     assert len(json.loads(said[1])) == 3
-    assert json.loads(said[2]) == {"fault": "silence servo=2"}
+    assert result_of(said[2]) == {"fault": "silence servo=2"}
     assert sim.stop()[0] == 0
 
 
 def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(start, tmp_path):
     (tmp_path / "robot.yaml").write_text(TWO)
     sim = start("robot.yaml", "--link", "robot", "--json")
-    printed = json.loads(sim.line())
+    printed = result_of(sim.line())
 
     assert printed["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
     assert {name: os.readlink(port) for name, port in printed["ports"].items()} == printed["devices"]
@@ -204,8 +205,8 @@ def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(start, t
     sim.type("unplug bus=left for=200ms")
     line = "unplug bus=left for=200ms"
     for expected in ({"understood": line}, {"fault": line}, {"devices": {"left": ""}}):
-        assert json.loads(sim.line()) == expected
-    (back,) = json.loads(sim.line())["devices"].values()
+        assert result_of(sim.line()) == expected
+    (back,) = result_of(sim.line())["devices"].values()
     assert back != printed["devices"]["left"]
     assert os.readlink(printed["ports"]["left"]) == back
     assert hear(printed["ports"]["left"], PING_1, 14)[:12] == PONG_1
@@ -246,7 +247,7 @@ def test_a_simulation_whose_process_dies_fails_with_a_sentence(start, tmp_path):
 
 def test_a_ledger_that_is_not_complete_fails_at_the_end(start):
     sim = start("--servo", "AX-12A:1", "--json", "--ledger", "ledger.jsonl")
-    port = json.loads(sim.line())["ports"]["main"]
+    port = result_of(sim.line())["ports"]["main"]
     (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
     resource.prlimit(int(child), resource.RLIMIT_FSIZE, (1, 1))  # as a full disk
     assert hear(port, bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex("ff ff 01 02 00 fc")

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import read_answer, result_of
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
@@ -137,7 +138,7 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
 
 
 def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) -> None:
-    (printed,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
+    (printed,) = result_of(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
     assert (printed["name"], printed["robot"], printed["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
     assert [one["name"] for one in printed["controllers"]] == list(controllers(torso))
 
@@ -195,7 +196,7 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
 def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:
     words = ("send", "left_arm", "position", "left_elbow_joint=20deg", "--in", "200ms")
     said = dxlrun(*words, "--wait", "--json")
-    result = json.loads(said.out)
+    result = result_of(said.out)
     assert (said.code, result["status"], result["progress"]) == (0, "reached", 1.0)
     assert torso.goal_state(result["goal"]).reached
     assert torso.states().joint("left_elbow_joint")["goal_position"] == pytest.approx(0.349, abs=0.003)
@@ -256,7 +257,7 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
         "          head_yaw_joint: {position: 10 deg, velocity: 1 rad/s}\n"
     )
     said = dxlrun("play", file, "--json")
-    result = json.loads(said.out)
+    result = result_of(said.out)
     assert (said.code, result["status"], result["controller"]) == (0, "reached", "head")
     until(torso, "head_yaw_joint", 0.1745)
     torso.switch(deactivate=["head"])
@@ -293,14 +294,14 @@ def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: Rem
     torso.switch(["head"])
     assert dxlrun("torque", "on", "head").out == "bioloid_torso: head has torque\n"
     said = dxlrun("torque", "off", "left_arm", "--release", "--json")
-    assert json.loads(said.out)["deactivated"] == ["left_arm"]
+    assert result_of(said.out)["deactivated"] == ["left_arm"]
     assert torso.torque("left_arm", on=True).offered == ("left_arm",)
 
 
 def test_items_are_read_and_what_cannot_be_is_said(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("get", "head_yaw_joint", "temperature_limit")
     assert said == (0, "bioloid_torso: Temperature Limit (11) of head_yaw_joint is 70 (70 degC)\n", "")
-    found = json.loads(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
+    found = result_of(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
     assert (found["title"], found["area"], found["value"]) == (
         "Return Delay Time (5)",
         "EEPROM",
@@ -321,7 +322,7 @@ def test_a_snapshot_of_the_robot(dxlrun, torso: RemoteRobot) -> None:
     assert (said.code, said.err) == (0, "")
     assert "left_elbow_joint" in said.out
     assert "whole_body_posvel" in said.out
-    line = json.loads(dxlrun("watch", "--json", "--once").out)
+    line = result_of(dxlrun("watch", "--json", "--once").out)
     assert line["torque"][line["joints"].index("left_elbow_joint")] == "on"
 
 
@@ -329,8 +330,8 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     file = tmp_path / "wave.yaml"
     file.write_text("points:\n  - {time: 200 ms, positions: [0.1 rad, 0 deg, 10 deg]}\n")
     said = dxlrun("send", "left_arm", "trajectory", "--file", file, "--json")
-    done = json.loads(said.out)
-    assert (said.code, said.err, done["robot"], done["done"]) == (0, "", "bioloid_torso", True)
+    done = result_of(said.out)
+    assert (said.code, said.err, done["robot"]) == (0, "", "bioloid_torso")
     assert done["cycle"] > 0
     until(torso, "left_elbow_joint", 0.1745)
 
@@ -379,23 +380,17 @@ def test_a_wrong_request_is_wrong_input(dxlrun, torso: RemoteRobot, words: str, 
 
 def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("switch", "--activate", "head", "--json")
-    (error,) = json.loads(said.out)["errors"]
-    assert (said.code, error) == (
-        1,
-        {
-            "what": "head is active already",
-            "code": "active_already",
-            "fields": {"controller": ["head"]},
-        },
-    )
+    (error,) = read_answer(said.out).errors
+    assert (said.code, error.what) == (1, "head is active already")
+    assert (error.code, error.fields) == ("active_already", {"controller": ["head"]})
     said = dxlrun("send", "heat", "posvel", "--json")
-    (error,) = json.loads(said.out)["errors"]
-    assert (said.code, error["code"], error["fields"]["controller"]) == (2, "unknown_controller", ["heat"])
+    (error,) = read_answer(said.out).errors
+    assert (said.code, error.code, error.fields["controller"]) == (2, "unknown_controller", ["heat"])
     said = dxlrun(
         "send", "head", "posvel", "positions=[400 deg, 0 deg]", "velocities=[1 rpm, 1 rpm]", "--json"
     )
-    (error,) = json.loads(said.out)["errors"]
-    assert (said.code, error["code"], error["fields"]["joints"]) == (2, "beyond_limits", ["head_pitch_joint"])
+    (error,) = read_answer(said.out).errors
+    assert (said.code, error.code, error.fields["joints"]) == (2, "beyond_limits", ["head_pitch_joint"])
 
 
 @pytest.mark.parametrize(
@@ -449,8 +444,8 @@ def test_a_halted_robot_holds_until_a_controller_is_activated(dxlrun, torso: Rem
     )
     active = [name for name, one in controllers(torso).items() if one["active"]]
     assert active == ["joint_state_broadcaster"]
-    printed = json.loads(dxlrun("halt", "--json").out)
-    assert set(printed) == {"robot", "done", "cycle", "seconds", "joint", "velocity"}
+    printed = result_of(dxlrun("halt", "--json").out)
+    assert set(printed) == {"robot", "cycle", "seconds", "joint", "velocity"}
     assert torso.switch(["head"]).cycle > printed["cycle"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from rich.console import Console
+from tests.kit.answers import result_of
 
 from dxlrun import DxlrunError
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
@@ -171,7 +171,7 @@ def test_a_pipe_gets_one_snapshot(shown: Any) -> None:
 
 def test_json_is_one_object_a_line_until_the_run_ends(shown: Any) -> None:
     code, said = shown(Robot(6, looks=4), as_json=True)
-    lines = [json.loads(line) for line in said.splitlines()]
+    lines = [result_of(line) for line in said.splitlines()]
     assert (code, len(lines)) == (0, 4)
     assert [line["cycle"] for line in lines] == [50, 100, 150, 200]
     assert [len(line["events"]) for line in lines] == [1] * 4

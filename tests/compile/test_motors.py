@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import result_of
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
@@ -242,5 +242,5 @@ def test_check_shows_which_joints_have_a_motor_file(capsys: pytest.CaptureFixtur
     rows = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines() if line}
     assert (rows["joint"], rows["shoulder"], rows["elbow"]) == ("file", "shoulder.yaml", "none")
     assert run_tokens(["check", "robot.yaml", "--json"]) == 0
-    joints = json.loads(capsys.readouterr().out)["joints"]
+    joints = result_of(capsys.readouterr().out)["joints"]
     assert [joint["motor"] for joint in joints] == ["shoulder.yaml", None]

@@ -1,8 +1,7 @@
 """`dxlrun check ROBOT --online` on pseudo-terminals, judged by the simulated bus' ledger."""
 
-import json
-
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
@@ -81,7 +80,7 @@ def test_a_servo_that_is_missing_is_not_counted(check):
 
 def test_a_servo_that_is_missing_is_named_and_the_table_is_there_all_the_same(check):
     code, out, _, sent = check("position_p_gain: 800", "--json", ids=(2,))
-    online = json.loads(out)["online"]
+    online = result_of(out)["online"]
     assert code == 1
     assert [(row["joint"], row["found"], row["action"]) for row in online["registers"]] == [
         ("elbow", None, ""),
@@ -145,5 +144,5 @@ def test_settings_that_another_program_left_are_a_table_with_what_they_do(check)
     assert "1 difference\n" in out
     assert (code, err) == (0, "")
     _, out, _, _ = check("position_p_gain: 800", "wrist_led:=0", "--json", before=before)
-    (found,) = json.loads(out[out.index("{") :])["online"]["deviations"]
+    (found,) = result_of(out[out.index("{") :])["online"]["deviations"]
     assert (found["item"], found["found"], found["factory"]) == ("pwm_limit", 400, 885)

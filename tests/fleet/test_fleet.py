@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import pty
 import re
@@ -22,6 +21,7 @@ from typing import TypeVar
 import msgspec
 import pytest
 from rich.console import Console
+from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.commands import Dxlrun
 from tests.kit.fuzzed_http import FRAMES, Said, children, process_of, stands
@@ -133,7 +133,7 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     assert dxlrun("fleet", lab, "--start", "joint").code == 0
     until(lambda: views["joint"].seen().state == "running", "it runs again")
     said = dxlrun("fleet", lab, "--stop", "joint", "--json")
-    assert json.loads(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
+    assert result_of(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
 
 
 def test_a_long_error_takes_no_room_from_the_names() -> None:
@@ -150,7 +150,7 @@ def looked(dxlrun: Dxlrun, lab: Path) -> list[dict[str, str]]:
     """Return the rows of one look; one is unreachable."""
     said = dxlrun("fleet", lab, "--json")
     assert said.code == 1
-    found: list[dict[str, str]] = json.loads(said.out)
+    found: list[dict[str, str]] = result_of(said.out)
     return found
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from rich.prompt import Confirm
+from tests.kit.answers import result_of
 from tests.kit.held_logs import being_written
 
 from dxlrun.cli import main
@@ -104,7 +104,7 @@ def test_pruning_shows_asks_and_deletes_only_after_a_yes(
     logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["logs", "logs", "--prune", "--keep", "0.1kB", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["oldest"]) == 3
+    assert len(result_of(capsys.readouterr().out)["oldest"]) == 3
     assert main(["logs", "logs", "--prune", "--keep", "0.1kB"]) == 2
     assert "nothing was deleted" in capsys.readouterr().err
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import read_answer
 
 from dxlrun.cli import main
 
@@ -168,6 +168,6 @@ def test_the_same_for_programs_from_a_process_of_its_own(told: Told, tmp_path: P
         text=True,
         check=False,
     )
-    (error,) = json.loads(check.stdout)["errors"]
+    (error,) = read_answer(check.stdout).errors
     assert check.returncode == 2
-    assert (error["file"], error["line"], error["column"]) == ("example.yaml", 12, 16)
+    assert (error.file, error.line, error.column) == ("example.yaml", 12, 16)

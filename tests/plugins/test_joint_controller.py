@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
+from tests.kit.answers import result_of
 from tests.kit.awaited import until
 from tests.kit.stages import Stage
 
@@ -165,7 +166,7 @@ def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Wri
 
 def test_check_shows_it_and_an_editor_takes_it(written: Written, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(written()), "--json"]) == 0
-    (shown,) = json.loads(capsys.readouterr().out)["controllers"]
+    (shown,) = result_of(capsys.readouterr().out)["controllers"]
     entry = json.loads((SHORT.parents[2] / "robots/robot.schema.json").read_text())["$defs"][
         "ControllerEntry"
     ]

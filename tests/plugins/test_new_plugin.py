@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.cli import main
 from dxlrun.cli.plugins import _NOT_COPIED
@@ -90,7 +90,7 @@ def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: P
 
 def test_each_file_of_the_template_is_made_but_the_licence(said: Said, tmp_path: Path) -> None:
     code, out, _ = said("new-plugin", "arm_waves", "here/there", "--json")
-    assert (code, json.loads(out)["directory"], len(json.loads(out)["files"])) == (0, "here/there", 9)
+    assert (code, result_of(out)["directory"], len(result_of(out)["files"])) == (0, "here/there", 9)
     made = [path for path in (tmp_path / "here/there").rglob("*") if path.is_file()]
     ours = [path for path in TEMPLATE.rglob("*") if path.is_file() and not set(path.parts) & set(_NOT_COPIED)]
     assert len(made) == len(ours) - 1 == 9
@@ -160,7 +160,7 @@ def test_the_list_for_programs(said: Said, install: Callable[[str, str], None]) 
     install("first_one", PLUGIN.replace("CONTRACT", "2"))
     install("broken_one", "import no_such_thing")
     code, out, _ = said("plugins", "--json")
-    found = {one["name"]: one for one in json.loads(out)}
+    found = {one["name"]: one for one in result_of(out)}
     assert code == 0
     assert found["first_one"] == {
         "name": "first_one",

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.fuzzed_http import FRAMES, Said, process_of, stands
 from tests.kit.pages import page_text
@@ -276,7 +277,7 @@ def test_keys_write_over_nothing_that_is_anothers(computers):
     assert main(["keys", "renew", "bert", "--output", "bert"]) == 0
     assert main(["keys", "revoke", "bert"]) == 0
     assert len((keys / "revoked").read_text().split()) == 2
-    rows = computers.capsys.readouterr() and json.loads(computers.typed("dxlrun keys --json"))
+    rows = computers.capsys.readouterr() and result_of(computers.typed("dxlrun keys --json"))
     assert [(one["name"], one["role"], one["state"]) for one in rows] == [
         ("anna", "admin", "valid"),
         ("bert", "observe", "revoked"),

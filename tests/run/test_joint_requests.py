@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.totals import totals_of
 
@@ -195,7 +195,7 @@ def test_check_shows_it(tmp_path, capsys):
     file = tmp_path / "arm.yaml"
     file.write_text(LIMP)
     assert main(["check", str(file), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = result_of(capsys.readouterr().out)
     assert [row["mode"] for row in found["joints"]] == ["position", "position, limp", "position"]
 
 

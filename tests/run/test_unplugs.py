@@ -14,7 +14,6 @@ CI pulls 2 times from a fixed seed. The full campaign before a release:
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketKind
@@ -117,7 +117,7 @@ def servos(tmp_path):
         command, cwd=tmp_path, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert process.stdout is not None
-    assert json.loads(process.stdout.readline())
+    assert result_of(process.stdout.readline())
     yield Servos(process, ledger, {name: Path(f"{link}.{name}") for name in NAMES})
     process.kill()
     process.communicate()

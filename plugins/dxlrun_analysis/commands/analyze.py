@@ -56,7 +56,7 @@ def analyze(
         Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
         expected it.
     as_json
-        Print the result as JSON; with several logs {"logs": [...]}.
+        Print the result as JSON; of several logs a list, `logs`.
     """
     _check(logs, report=report, worst=worst)
     if report is not None:
@@ -96,13 +96,14 @@ def analyze(
 
             result, text = analyzed_page(reader, reading)
             write_report(report, text)
+    code = 0 if result.verdict.good else 1
     if as_json:
-        show_json(result)
-        return 0 if result.verdict.good else 1
+        show_json(result, code=code, errors=result.verdict.sentences[:code])
+        return code
     show(*analysis.parts(result), *worst_tables(result.causes.worst[:worst]))
     if report is not None:
         show(f"\nreport: {report}")
-    return 0 if result.verdict.good else 1
+    return code
 
 
 def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
@@ -173,6 +174,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
 
     code = 0
     results: list[object] = []
+    failures: list[str] = []
     for log in logs:
         try:
             reader = open_log(log)
@@ -185,15 +187,17 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
                 results.append(report)
                 words = report.verdict.sentences[0]
                 words = f"being written; so far: {words}" if report.being_written else words
-                code = code if report.verdict.good else max(code, 1)
+                if not report.verdict.good:
+                    code = max(code, 1)
+                    failures.append(f"{log}: {words}")
         except LogError as error:
             code = error.exit_code
-            results.append({"log": str(log), "ok": False, "errors": [{"what": str(error)}]})
+            failures.append(str(error))
             if not as_json:
                 print_error(f"dxlrun: {error}")
             continue
         if not as_json:
             show(f"{log}: {words}")
     if as_json:
-        show_json({"logs": results})
+        show_json({"logs": results}, code=code, errors=failures)
     return code

@@ -115,16 +115,20 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     folder = runs.find_logs(directory)
     with progress_bar(hidden=as_json) as draw:
         result = stores.upload(folder, store, draw)
+    others = [
+        f"{store} has another run named {name}; give each robot a prefix of its own" for name in result.others
+    ]
+    written = [f"{name} was left out: a run is writing it" for name in result.written]
     if as_json:
-        show_json(result._asdict())
-        return 1 if result.others else 0
-    for name in result.others:
-        print_error(f"{store} has another run named {name}; give each robot a prefix of its own")
-    for name in result.written:
-        print_warning(f"{name} was left out: a run is writing it")
+        show_json(result._asdict(), code=1 if others else 0, errors=others, warnings=written)
+        return 1 if others else 0
+    for other in others:
+        print_error(other)
+    for name in written:
+        print_warning(name)
     uploaded = counted(len(result.uploaded), "log was", "logs were")
     show(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there")
-    return 1 if result.others else 0
+    return 1 if others else 0
 
 
 def _prune(directory: Path, keep: str, *, as_json: bool) -> int:

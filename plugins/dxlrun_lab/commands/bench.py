@@ -51,11 +51,12 @@ def bench_rate(
             run,
             lambda rate: None if as_json else show(f"running at {rate:g} Hz"),
         )
+    code = 0 if result.kept_hz else 1
     if as_json:
-        show_json(result)
+        show_json(result, code=code, errors=[_highest(result)] * code)
     else:
         show(_rates(result), _highest(result))
-    return 0 if result.kept_hz else 1
+    return code
 
 
 def _rates(result: HighestRate) -> Table:

@@ -51,13 +51,15 @@ def characterize(
         check_report(options.report)
     ran = run_on_robot(Characterize(measure or MEASUREMENTS, allowed), words, options)
     if ran.result is None:
+        if options.as_json:
+            show_json(None, code=ran.exit_code, errors=ran.failures)
         return ran.exit_code
     if options.report is not None:
         from dxlrun_lab.characterize.page import page
 
         write_report(options.report, page(ran.result))
     if options.as_json:
-        show_json(results(ran.result))
+        show_json(results(ran.result), code=ran.exit_code, errors=ran.failures)
     else:
         show(*parts(ran.result))
         if ran.log is not None:

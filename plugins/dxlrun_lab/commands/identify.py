@@ -75,13 +75,15 @@ def identify(
     chosen = Options(duration, load=KnownLoad(load_inertia, load_gravity), voltage=voltage)
     if recorded is not None:
         results, robot, code, log = _of_log(recorded, words, chosen, options), recorded.name, 0, None
+        failures: tuple[str, ...] = ()
     else:
         ran = run_on_robot(Identification(chosen), words, options)
         results, robot, code, log = ran.result or (), ran.robot, ran.exit_code, ran.log
+        failures = ran.failures
     found = [each for each in results if each.identified is not None]
-    for each in results:
-        if each.identified is None:
-            print_error(f"dxlrun: {each.refusal}")
+    refusals = [each.refusal for each in results if each.identified is None]
+    for refusal in () if options.as_json else refusals:
+        print_error(f"dxlrun: {refusal}")
     if output is not None:
         for each in results:  # of one joint: _check_output
             if each.identified is not None:
@@ -90,10 +92,12 @@ def identify(
         from dxlrun_lab.identify.page import page
 
         write_report(options.report, page(robot, found))
-    _show(found, options, log, output)
-    if recorded is not None and results and not found:
-        return 2
-    return code or (1 if len(found) < len(results) else 0)
+    code = 2 if recorded is not None and results and not found else code or bool(refusals)
+    if options.as_json:
+        show_json([each.identified for each in found], code=code, errors=[*failures, *refusals])
+    else:
+        _show(found, options, log, output)
+    return code
 
 
 def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot) -> tuple[JointResult, ...]:
@@ -141,12 +145,9 @@ def _write(target: Path, joint: str, found: Identified) -> None:
 def _show(found: list[JointResult], options: OnRobot, log: Path | None, output: Path | None) -> None:
     from dxlrun_lab.identify.tables import parts
 
-    results = [each.identified for each in found if each.identified is not None]
-    if options.as_json:
-        show_json(results)
-        return
-    for result in results:
-        show(*parts(result))
+    for each in found:
+        if each.identified is not None:
+            show(*parts(each.identified))
     if log is not None:
         show(f"\nlog: {log}")
     if options.report is not None and found:

@@ -152,6 +152,8 @@ def _show(
     from dxlrun_analysis.latency.tables import parts
 
     code = _INTERRUPTED if measured.interrupted else 1 if measured.failure else 0
+    why = (measured.failure, "interrupted" if measured.interrupted else "")
+    failures = [f"{one}; the table has what was measured before" for one in why if one]
     result = figures(settings, measured.blocks, load, measured.remarks)
     if not result.conditions:
         _discard(target)
@@ -165,23 +167,22 @@ def _show(
             summary = write(target, settings, measured.blocks, load, measured.remarks)
             if summary.error:
                 code = code or 1
-                print_error(f"dxlrun: the log {target} is incomplete: {summary.error}")
+                failures.append(f"the log {target} is incomplete: {summary.error}")
         if report is not None:
             from dxlrun_analysis.latency.page import page
 
             write_report(report, page(result, measured.blocks, machine()))
     if as_json:
         more = {"log": None if target is None else str(target), "failure": measured.failure}
-        show_json(msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted})
+        content = msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted}
+        show_json(content, code=code, errors=failures)
         return code
     if target is not None:
         show(f"\nlog: {target}")
     if report is not None:
         show(f"report: {report}")
-    if measured.failure:
-        print_error(f"dxlrun: {measured.failure}; the table has what was measured before")
-    if measured.interrupted:
-        print_error("interrupted; the table has what was measured before")
+    for failure in failures:
+        print_error(failure if failure.startswith("interrupted") else f"dxlrun: {failure}")
     return code
 
 

@@ -113,6 +113,11 @@ class Ran(msgspec.Struct, Generic[R], frozen=True):
     interrupted: bool
 
     @property
+    def failures(self) -> tuple[str, ...]:
+        """Return why it ended early, and the problems; empty on success."""
+        return (*filter(None, (self.why,)), *self.problems)
+
+    @property
     def exit_code(self) -> int:
         """0 good, 1 ended early or not restored, 130 aborted."""
         return INTERRUPTED if self.interrupted else int(bool(self.why or self.problems))

@@ -145,7 +145,7 @@ def play_recorded(
     course = Course("the motion", ranges=None, back=False, expected=playback.expected)
     ran = perform_on(playback, chosen, plan, options, course)
     if as_json:
-        show_json(_content(ran))
+        show_json(_content(ran), code=ran.exit_code, errors=ran.failures)
     elif ran.result is not None:
         show(*_parts(ran, ran.result, log))
     return ran.exit_code

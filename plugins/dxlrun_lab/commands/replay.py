@@ -69,21 +69,21 @@ def replay(
     from dxlrun_analysis.replay import Setting, replay_log
 
     report = replay_log(log, [Setting.parse(text) for text in settings], arguments, code)
-    for remark in report.remarks:
-        print_warning(f"{report.robot}: {remark}")
-    if report.stopped:
-        print_warning(f"{report.robot}: {report.stopped}")
+    warnings = [f"{report.robot}: {remark}" for remark in (*report.remarks, report.stopped) if remark]
     if report.unprepared:
         them = counted(report.unprepared, "command", "commands")
-        print_warning(
+        warnings.append(
             f"{report.robot}: the log has no request of {them}, to prepare what was handed on again"
         )
+    exit_code = 0 if report.same else 1
     if as_json:
-        content = msgspec.to_builtins(report)
-        show_json(content | {"same": report.same, "sentence": report.sentence})
-    else:
-        show(*_replayed(report))
-    return 0 if report.same else 1
+        content = msgspec.to_builtins(report) | {"same": report.same, "sentence": report.sentence}
+        show_json(content, code=exit_code, errors=[report.sentence] * exit_code, warnings=warnings)
+        return exit_code
+    for warning in warnings:
+        print_warning(warning)
+    show(*_replayed(report))
+    return exit_code
 
 
 def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:

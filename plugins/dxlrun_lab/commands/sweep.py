@@ -107,16 +107,18 @@ def sweep(
             found.run(lambda: processes(workers or len(os.sched_getaffinity(0))), draw)
     except KeyboardInterrupt:
         interrupted = True
+    scored = any(row.measured.scores is not None for row in found.rows)
+    code = _INTERRUPTED if interrupted else 0 if scored else 1
     if as_json:
-        show_json(_result(found, sort, "interrupted" if interrupted else ""))
+        why = ["interrupted"] if interrupted else ["no run was scored"] * code
+        show_json(_result(found, sort, "interrupted" if interrupted else ""), code=code, errors=why)
     else:
         _show(found, sort)
     if picture is not None and found.rows:
         _draw(picture, found, sort)
-    if interrupted:
+    if interrupted and not as_json:
         print_error("interrupted")
-        return _INTERRUPTED
-    return 0 if any(row.measured.scores is not None for row in found.rows) else 1
+    return code
 
 
 def _checked_grid(

@@ -102,11 +102,12 @@ def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
     if report is not None and result.measured:
         write_report(report, results.page(result))
     if as_json:
-        show_json(results.result(result))
-    else:
-        show(*results.parts(result))
-        if report is not None and result.measured:
-            show(f"report: {report}")
+        interrupted = ["interrupted"] * result.interrupted
+        show_json(results.result(result), code=result.exit_code, errors=[*result.failures, *interrupted])
+        return
+    show(*results.parts(result))
+    if report is not None and result.measured:
+        show(f"report: {report}")
     for sentence in result.failures:
         print_error(f"dxlrun: {sentence}")
     if result.interrupted:

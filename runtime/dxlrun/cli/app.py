@@ -8,6 +8,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
@@ -26,7 +27,7 @@ from dxlrun.cli import verbs
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused, near
 from dxlrun.output.table import Table
-from dxlrun.output.terminal import out, print_error, print_refusal, print_warning, show
+from dxlrun.output.terminal import out, print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpEntry, HelpPanel
@@ -160,7 +161,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
             _refuse(tokens, (), error.problems)
             return error.exit_code
         sentences, code = _explained(error, tokens)
-        reason = {"code": error.code, "fields": error.fields} if isinstance(error, Refused) else {}
+        reason = {"code": error.code, "fields": dict(error.fields)} if isinstance(error, Refused) else {}
         _refuse(tokens, sentences, reason=reason)
         return code
     return code if isinstance(code, int) else 0
@@ -174,7 +175,10 @@ def _refuse(
 ) -> None:
     """Report why a command was refused: in lines for a person, or with --json in JSON."""
     if "--json" in tokens:
-        print_refusal(problems, sentences, reason)
+        errors = [one for one in problems if one.severity == "error"]
+        warnings = [one for one in problems if one.severity == "warning"]
+        with suppress(OSError):  # the reader is gone; the exit code is left
+            show_json(None, code=1, errors=[*errors, *sentences], warnings=warnings, reason=reason)
         return
     for problem in problems:
         (print_error if problem.severity == "error" else print_warning)(str(problem))

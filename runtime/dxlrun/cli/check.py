@@ -22,7 +22,6 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
-from dxlrun.output.json import problems_json
 from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
@@ -74,8 +73,11 @@ def check(
     for file in graph or ():
         _write(result, file)
     if as_json:
-        show_json(_as_json(result, found))
-        return 0 if found is None or found.as_declared else 1
+        code = 0 if found is None or found.as_declared else 1
+        problems = [] if found is None else found.problems or [_compared(found)] * code
+        remarks = () if found is None else found.remarks
+        show_json(_as_json(result, found), code=code, errors=problems, warnings=[*result.warnings, *remarks])
+        return code
     if graph is None:
         show(_verdict(result), *_tables(result))
     else:
@@ -131,8 +133,7 @@ def _look(result: Compiled, packets: BusesLog) -> Found:
 def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
     from msgspec import to_builtins
 
-    report = {"ok": True, "errors": [], "warnings": problems_json(result.warnings)}
-    report |= to_builtins(result.report)
+    report: dict[str, object] = to_builtins(result.report)
     if found is not None:
         report["online"] = {"as_declared": found.as_declared, **to_builtins(found)}
     return report

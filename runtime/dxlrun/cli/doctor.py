@@ -27,7 +27,8 @@ def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     findings = diagnose(Machine.this())
     missing = sum(finding.state == "missing" for finding in findings)
     if as_json:
-        show_json({"ok": not missing, "checks": findings})
+        wrong = [f"{one.what}: {one.why}; {one.mend}" for one in findings if one.state == "missing"]
+        show_json({"checks": findings}, code=1 if missing else 0, errors=wrong)
     else:
         show(*_findings(findings, missing))
     return 1 if missing else 0

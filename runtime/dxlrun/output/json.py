@@ -1,41 +1,78 @@
-"""JSON: results of commands as programs read them."""
+"""JSON: answers of commands as programs read them, see docs/reference/commands.md."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+import json
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.output.escaping import escaped_json
 
 if TYPE_CHECKING:
     from dxlrun.errors import Problem
 
-
-def json_text(value: object) -> str:
-    """Return a result as JSON, indented: dataclasses by their fields, bytes in hexadecimal, NaN as null."""
-    import msgspec  # not above: a refusal needs none of it
-
-    plain = _hexadecimal(msgspec.to_builtins(value, builtin_types=(bytes,)))
-    return escaped_json(msgspec.json.format(msgspec.json.encode(plain), indent=2).decode())
+Report: TypeAlias = "Sequence[Problem | str]"
+"""Problems with places in files, and sentences `problem; fix` without one."""
+NO_REASON: Mapping[str, object] = MappingProxyType({})
 
 
-def _hexadecimal(value: object) -> object:
+def answer_text(
+    result: object,
+    errors: Report,
+    warnings: Report,
+    reason: Mapping[str, object] = NO_REASON,
+    *,
+    ok: bool,
+    indent: int | None = None,
+) -> str:
+    """Return the envelope of every answer: `ok`, `result`, `errors` and `warnings`.
+
+    `reason`: code and fields of a running robot's refusal.
+    """
+    answer = {
+        "ok": ok,
+        "result": result,
+        "errors": [{**_problem(one), **reason} for one in errors],
+        "warnings": [_problem(one) for one in warnings],
+    }
+    return json_text(answer, indent)
+
+
+def json_text(value: object, indent: int | None = 2) -> str:
+    """Return a value as JSON: dataclasses by their fields, bytes in hexadecimal, NaN and infinity as null."""
+    import msgspec  # not above: most commands print no JSON
+
+    plain = _plain(msgspec.to_builtins(value, builtin_types=(bytes,)))
+    return escaped_json(json.dumps(plain, ensure_ascii=False, indent=indent))
+
+
+def _plain(value: object) -> object:
     if isinstance(value, bytes):
         return value.hex()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _hexadecimal(item) for key, item in value.items()}
-    return [_hexadecimal(item) for item in value] if isinstance(value, list | tuple) else value
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def problems_json(problems: Iterable[Problem]) -> list[dict[str, object]]:
-    """Return problems as commands print them under --json."""
-    return [
-        {
-            "file": problem.mark.file,
-            "line": problem.mark.line,
-            "column": problem.mark.column,
-            "what": problem.what,
-            "mend": problem.fix,
-        }
-        for problem in problems
-    ]
+def _problem(problem: Problem | str) -> dict[str, object]:
+    """Return a problem with all keys of the envelope; a sentence has no place."""
+    if isinstance(problem, str):
+        what, _, fix = problem.partition("; ")
+        place: tuple[object, ...] = None, None, None
+    else:
+        what, fix, mark = problem.what, problem.fix, problem.mark
+        place = mark.file, mark.line, mark.column
+    file, line, column = place
+    return {
+        "what": what,
+        "fix": fix,
+        "file": file,
+        "line": line,
+        "column": column,
+        "code": None,
+        "fields": {},
+    }

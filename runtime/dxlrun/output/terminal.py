@@ -5,7 +5,6 @@ What is shown is laid out here, line by line; rich colours lines on a terminal, 
 
 from __future__ import annotations
 
-import json
 import sys
 import textwrap
 import time
@@ -14,14 +13,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import IO, TYPE_CHECKING, TypeAlias, cast
 
-from dxlrun.output.escaping import escaped, escaped_json
-from dxlrun.output.json import json_text, problems_json
+from dxlrun.output.escaping import escaped
+from dxlrun.output.json import NO_REASON, Report, answer_text
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from dxlrun.errors import Problem
 
 Line: TypeAlias = Sequence[tuple[str, str]]
 """The pieces of a line, each with its style."""
@@ -100,14 +97,26 @@ def ascii_only(console: Console) -> bool:
     return not (getattr(console.file, "encoding", None) or "utf-8").lower().startswith("utf")
 
 
-def show_json(value: object) -> None:
-    """Print a result as JSON: dataclasses by their fields."""
-    sys.stdout.write(json_text(value) + "\n")
+def show_json(
+    result: object,
+    *,
+    code: int = 0,
+    errors: Report = (),
+    warnings: Report = (),
+    reason: Mapping[str, object] = NO_REASON,
+) -> None:
+    """Print the answer of a command with --json: one line in a pipe, indented on a terminal.
 
-
-def show_json_line(value: object) -> None:
-    """Print one object of a stream of JSON, at once."""
-    sys.stdout.write(escaped_json(json.dumps(value, ensure_ascii=False)) + "\n")
+    Args:
+        result: What the command has to say; None: nothing.
+        code: Its exit code; the answer is `ok` where it is 0.
+        errors: What went wrong, problems with places or sentences `problem; fix`.
+        warnings: The same of what does not change the exit code.
+        reason: `code` and `fields` of the refusal of a running robot.
+    """
+    indent = 2 if sys.stdout.isatty() else None
+    text = answer_text(result, errors, warnings, reason, ok=code == 0, indent=indent)
+    sys.stdout.write(f"{text}\n")
     sys.stdout.flush()  # a reader behind a pipe waits for it
 
 
@@ -119,24 +128,6 @@ def print_error(line: str) -> None:
 def print_warning(line: str) -> None:
     """Print one warning to stderr, unbroken."""
     _print_to_stderr(line, "yellow")
-
-
-def print_refusal(
-    problems: Sequence[Problem], sentences: Sequence[str], reason: Mapping[str, object]
-) -> None:
-    """Print on stdout, as one line of JSON, why a command with --json was refused.
-
-    `problems` have places in files; `sentences` are errors without one; `reason` is a running robot's: a code
-    with its fields.
-    """
-    errors = [problem for problem in problems if problem.severity == "error"]
-    refusal = {
-        "ok": False,
-        "errors": [*problems_json(errors), *({"what": sentence, **reason} for sentence in sentences)],
-        "warnings": problems_json([problem for problem in problems if problem.severity == "warning"]),
-    }
-    with suppress(OSError):  # the reader is gone; the exit code is left
-        show_json_line(refusal)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import yaml
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
+from tests.kit.answers import result_of
 
 from dxlrun.log import schemas
 from dxlrun.log.reader import read_log
@@ -59,7 +60,7 @@ def test_the_files_of_a_split_log_are_one_bag(split: Path, tmp_path: Path, expor
     code, said, _ = export(split, tmp_path / "bag", "--format", "ros2bag", "--json")
     parts = sorted(split.iterdir())
     assert (code, len(parts)) == (0, 2)
-    count = json.loads(said)["messages"]
+    count = result_of(said)["messages"]
     metadata = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert [file["path"] for file in metadata["files"]] == [part.name for part in parts]
     with Reader(tmp_path / "bag") as reader:
@@ -71,7 +72,7 @@ def test_a_split_log_is_exported_as_a_whole_one(
     split: Path, run: Path, tmp_path: Path, export: Export, to: str
 ) -> None:
     said = [
-        json.loads(export(log, tmp_path / name, "--format", to, "--json")[1])
+        result_of(export(log, tmp_path / name, "--format", to, "--json")[1])
         for log, name in ((split, "split"), (run, "run"))
     ]
     counts = [one.get("rows") or one["frames"] for one in said]

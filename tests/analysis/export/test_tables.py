@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
@@ -38,7 +38,7 @@ def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: 
     log = read_log(run)
     tables = {path.stem: pq.read_table(path) for path in (tmp_path / "out").iterdir()}
     counts = {name: len(table) for name, table in tables.items()}
-    assert (code, json.loads(said)["rows"]) == (0, sum(counts.values()))
+    assert (code, result_of(said)["rows"]) == (0, sum(counts.values()))
     assert counts == {
         "cycles": len(log.cycles),
         "packets": len(log.packets),

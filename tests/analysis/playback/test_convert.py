@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.answers import result_of
 
 from dxlrun.description.motion import read_motion as read_motion_file
 from dxlrun.log.reader import Log, read_log
@@ -33,7 +33,7 @@ def test_what_it_plays_is_within_the_tolerance(
     swing: Path, place: Path, dxlrun: Dxlrun, degrees: float, most_points: int
 ) -> None:
     words = ["--tolerance", f"{degrees}deg", "--json"]
-    result = json.loads(dxlrun("convert", swing, "again.yaml", *words).out)
+    result = result_of(dxlrun("convert", swing, "again.yaml", *words).out)
     assert result["points"].keys() == {"both"}
     assert 5 < result["points"]["both"] <= most_points
     assert dxlrun("pair.yaml", "--virtual", "--play", "again.yaml").code == 0
@@ -86,7 +86,7 @@ def test_controllers_of_single_positions_get_them_every_20_ms(
     words = ["--play", "both.yaml", "--play", "one.yaml"]
     assert dxlrun("groups.yaml", "--virtual", *words).code == 0
     (log,) = place.glob("logs/*.mcap")
-    result = json.loads(dxlrun("convert", log, "second.yaml", "--json").out)
+    result = result_of(dxlrun("convert", log, "second.yaml", "--json").out)
     # a position with a speed beside it is a destination: where the joint was is what is played
     assert "goals of tilt; states of pan" in (place / "second.yaml").read_text().splitlines()[0]
     assert set(result["points"]) == {"both", "one"}

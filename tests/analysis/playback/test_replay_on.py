@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.anew import put, written_anew
+from tests.kit.answers import result_of
 
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
@@ -43,7 +43,7 @@ def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxl
     """Behind the first 0.3 s, in which the motion becomes as fast as it was recorded."""
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json")
     assert done.code == 0, done
-    result = json.loads(done.out)
+    result = result_of(done.out)
     assert result["whole"]
     assert [one["name"] for one in result["joints"]] == ["pan", "tilt"]
     assert "first pose: pan (ID 1 on bus main) has the longest way, 0.0 deg, at up to" in done.err
@@ -61,7 +61,7 @@ def test_half_the_speed_a_stretch_and_other_joints(swing: Path, place: Path, dxl
     words = "--from 1 --to 2 --speed 0.5 --map pan=tilt --map tilt= --json --virtual"
     done = dxlrun("replay", swing, "--on", "pair.yaml", *words.split())
     assert done.code == 0, done
-    result = json.loads(done.out)
+    result = result_of(done.out)
     assert result["seconds"] == pytest.approx(2.0 + 0.3 + 0.5, abs=0.05)  # the ramps, and the pose at the end
     time_s, sent = goals(read_log(swing), "pan")
     _, again = goals(played(result), "tilt")
@@ -186,7 +186,7 @@ def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: P
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", time_s[widest])
     assert done.code == 0, done
     assert "first pose: tilt (ID 2 on bus main) has the longest way, 34.3 deg, at up to 29 deg/s" in done.err
-    _, again = goals(played(json.loads(done.out)), "tilt")
+    _, again = goals(played(result_of(done.out)), "tilt")
     there = int(np.argmax(np.abs(again - sent[widest]) < np.radians(0.15)))
     speed = np.abs(again[10 : there + 1] - again[: there - 9]) / 0.1  # a row of that way lasts two cycles
     assert there > 80
@@ -211,7 +211,7 @@ def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", "2")
     assert done.code == 1
     assert "the motion ended early: the servo of joint tilt (ID 2 on bus main) was lost" in done.err
-    result = json.loads(done.out)
+    result = result_of(done.out)
     assert not result["whole"]
     sent = np.stack([goals(played(result), joint)[1] for joint in ("pan", "tilt")])
     assert np.ptp(sent[:, cycle - 10 : cycle], axis=1).max() > np.radians(0.5)

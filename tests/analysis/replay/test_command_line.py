@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from tests.kit.anew import no_commands, put, versions
+from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.cli import main
@@ -38,10 +38,10 @@ def test_the_document_shows_the_output(
 
 def test_json_is_for_programs(pair_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(pair_log), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = result_of(capsys.readouterr().out)
     assert (report["same"], report["compared"], report["first"]) == (True, 50, None)
     code = main(["replay", str(pair_log), "--json", "--set", "all_inputs.gain=0.5"])
-    report = json.loads(capsys.readouterr().out)
+    report = result_of(capsys.readouterr().out)
     assert (code, report["same"]) == (1, False)
     assert (report["first"]["cycle"], report["first"]["joint"]) == (0, "tilt")
     assert len(report["joints"]) == 2

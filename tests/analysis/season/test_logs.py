@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun, Said
 from tests.kit.pages import page_text
 
@@ -39,7 +39,7 @@ Here = list[str]  # Names of the logs that were read
 def rows(said: Said) -> dict[str, dict[str, Any]]:
     """Return the rows that a command printed as JSON, by the names of their logs."""
     assert said.code == 0, said.err
-    return {row["log"]: row for row in json.loads(said.out)["rows"]}
+    return {row["log"]: row for row in result_of(said.out)["rows"]}
 
 
 @pytest.fixture(scope="session")
@@ -186,13 +186,13 @@ def test_conditions_choose_logs(
 
 def test_a_whole_statement_groups_and_gives_every_column_its_name(known: Path, dxlrun: Dxlrun) -> None:
     statement = "SELECT robot, count(*) AS runs FROM logs WHERE cycles > 0 GROUP BY robot ORDER BY robot"
-    assert json.loads(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"] == [
+    assert result_of(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"] == [
         {"robot": "bioloid_torso", "runs": 3},
         {"robot": "single_joint", "runs": 1},
     ]
     assert "bioloid_torso" in dxlrun("logs", known, "--sql", statement).out
     statement = "SELECT lost, asked AS lost, 1.5 AS half FROM logs WHERE log = 'may/third.mcap'"
-    (row,) = json.loads(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"]
+    (row,) = result_of(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"]
     assert (list(row), row["half"]) == (["lost", "lost_2", "half"], 1.5)
 
 
@@ -205,7 +205,7 @@ def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here
         assert sorted(set(found) - set(NAMES)) == ["\\udcff.mcap", "gone.mcap"]
         assert found["\\udcff.mcap"]["robot"] == "bioloid_torso"
         assert "No such file" in found["gone.mcap"]["unreadable"]
-    assert "pipe.mcap" in json.loads(dxlrun("logs", season, "--json").out)["other_files"]
+    assert "pipe.mcap" in result_of(dxlrun("logs", season, "--json").out)["other_files"]
 
 
 def test_logs_md_its_questions_are_answered(known: Path, dxlrun: Dxlrun) -> None:
@@ -308,7 +308,7 @@ def test_a_log_in_parts_is_one_log(known: Path, dxlrun: Dxlrun) -> None:
     row = rows(said)["torso_1"]
     assert row["cycles"] == analyze_log(path).periods.records == 100
     assert row["bytes"] == sum(part.stat().st_size for part in path.glob("*.mcap"))
-    assert json.loads(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
+    assert result_of(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
     assert list(rows(said)) == [*NAMES, "torso_1"]
     assert list(rows(dxlrun("logs", path, "--json"))) == ["torso_1"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import socket
@@ -12,6 +11,7 @@ from pathlib import Path
 import fsspec
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun
 from tests.kit.held_logs import being_written
 
@@ -61,20 +61,20 @@ def told(dxlrun: Dxlrun, logs: Path, url: str, code: int = 0) -> dict[str, list[
     """Upload; return what became of each log, without what is empty."""
     said = dxlrun("upload", logs, url, "--json")
     assert said.code == code, said
-    return {key: names for key, names in json.loads(said.out).items() if names}
+    return {key: names for key, names in result_of(said.out).items() if names}
 
 
 def rows(dxlrun: Dxlrun, place: object) -> tuple[list[dict[str, object]], int]:
     """Return the table of a place, and how many rows were read for it."""
     said = dxlrun("logs", place, "--json")
     assert said.code == 0, said
-    found = json.loads(said.out)
+    found = result_of(said.out)
     return found["rows"], found["converted"]
 
 
 def report(dxlrun: Dxlrun, log: object) -> dict[str, object]:
     """Return the analysis of a log, without its place."""
-    return json.loads(dxlrun("analyze", log, "--json").out) | {"log": ""}
+    return result_of(dxlrun("analyze", log, "--json").out) | {"log": ""}
 
 
 def test_a_store_has_the_table_of_its_directory_without_a_byte_of_a_log(

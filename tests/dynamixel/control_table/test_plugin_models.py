@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 
 import dxlrun.dynamixel.control_table.devices
 import dxlrun.dynamixel.control_table.models
@@ -139,7 +139,7 @@ def test_a_robot_of_foreign_servos_runs_in_simulation_and_its_model_is_listed(
     (tmp_path / "robot.yaml").write_text(ROBOT)
     dxlrun_here("robot.yaml", "--duration", "0.2", "--no-record", "--no-gateway", *words)
     if words:
-        (told,) = json.loads(dxlrun_here("models", "Mine-1", "--json"))
+        (told,) = result_of(dxlrun_here("models", "Mine-1", "--json"))
         assert told["model_number"] == 60001
 
 

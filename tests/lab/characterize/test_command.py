@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.experiments import commands_of
 from tests.kit.pages import page_text
 
@@ -37,7 +37,7 @@ def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
     assert '<figure id="joint-band">' in page
     words = [word.replace("/dev/ttyUSB0", "sim") for word in real]
     done = dxlrun(*words, "--virtual", "--measure", "dead_band", "--json")
-    (joint,) = json.loads(done.out)["joints"]
+    (joint,) = result_of(done.out)["joints"]
     assert joint["range"] == pytest.approx([-1.0472, 1.0472], abs=1e-4)
     assert "no robot arm runs" in dxlrun(*running).err
 
@@ -46,7 +46,7 @@ def test_a_run_of_its_own_gives_the_same_table(dxlrun, tmp_path, monkeypatch):
     """In real time, so the figures depend on the machine: only what is there, and that it is consistent."""
     monkeypatch.setattr(procedure, "_RATE_S", 0.2)
     done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--measure", "rate", "--json")
-    result = json.loads(done.out)
+    result = result_of(done.out)
     assert (result["robot"], [joint["joint"] for joint in result["joints"]]) == ("slow", ["joint"])
     (figure,) = result["joints"][0]["figures"]
     assert (figure["name"], figure["unit"]) == ("highest rate", "Hz")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from pathlib import Path
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.experiments import ROBOTS, commands_of
 
 from dxlrun.description.joints.motor_file import read_motor
@@ -51,7 +51,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
 def test_a_log_as_json(xl330, dxlrun):
     said = dxlrun("identify", "--recorded", xl330.log.path, "--load-inertia", 0.005, "--json")
     assert said.code == 0, said.err
-    (found,) = json.loads(said.out)
+    (found,) = result_of(said.out)
     assert (found["joint"], found["scale"]) == ("elbow", "current")
     assert found["motor"]["resistance"] == pytest.approx(3.3801, rel=0.03)
 

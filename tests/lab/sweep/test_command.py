@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.answers import result_of
 from tests.kit.experiments import commands_of
 
 from dxlrun.plan.robot_plan import from_json
@@ -110,7 +111,7 @@ def test_the_best_runs_come_first(sweep, no_workers):
     assert ["2", "crashed", "its", "process", "ended", "2", "times"] in lines
     again = sweep(*words)
     assert "8 of 8 runs, 6 of them before" in again.out  # the crashed ones were tried again
-    by_energy = json.loads(sweep(*words, "--sort", "energy", "--json").out)
+    by_energy = result_of(sweep(*words, "--sort", "energy", "--json").out)
     assert [row["values"]["controllers.arm_pid.gains.p"] for row in by_energy["rows"]][:3] == [4.0, 4.0, 7.0]
     assert by_energy["rows"][-1]["status"] == "crashed"
     assert by_energy["rows"][-1]["scores"] is None

@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.answers import result_of
 from tests.kit.experiments import ROBOTS, commands_of
 
 from dxlrun.control import realtime
@@ -45,7 +46,7 @@ def test_two_setups_are_run_measured_and_shown(dxlrun, motion_file):
     )  # fmt: skip
     assert said.code == 0
     assert "1 of 2: sequential sender, normal scheduler" in said.err
-    shown = json.loads(said.out)
+    shown = result_of(said.out)
     assert (shown["joint"], shown["motion_ns"], shown["load"]) == ("joint", 300_000_000, "")
     sequential, loop = shown["setups"]
     assert (sequential["setup"], loop["setup"]) == tuple(NORMAL.split(","))

@@ -16,7 +16,7 @@ import msgspec
 
 from dxlrun.errors import counted
 from dxlrun.output.table import Column, Sentence, Table, Tone, numbers
-from dxlrun.output.terminal import fitted, out, print_error, show, show_json_line
+from dxlrun.output.terminal import fitted, out, print_error, show, show_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -160,7 +160,7 @@ class TableView(PlainView):
 
 
 class JsonView:
-    """One JSON object a line on stdout: the ports, then each fault as it happens."""
+    """One JSON answer a line on stdout: the ports, then each fault as it happens."""
 
     look_every_s: float | None = None
 
@@ -170,7 +170,7 @@ class JsonView:
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Write where the buses are."""
         named = {bus: self._shown.port(bus, ports) for bus in ports}
-        show_json_line({"ports": named, "devices": dict(ports), "real_time": real_time})
+        show_json({"ports": named, "devices": dict(ports), "real_time": real_time})
 
     def take(self, message: SimulationMessage) -> None:
         """Write where buses are now, a fault that happened, or how a typed line was understood."""
@@ -178,13 +178,14 @@ class JsonView:
             "devices": message.ports,
             "fault": message.happened,
             "understood": message.fault,
-            "error": message.error,
         }
-        show_json_line({name: value for name, value in given.items() if value is not None})
+        wrong = [] if message.error is None else [message.error]
+        found = {name: value for name, value in given.items() if value is not None}
+        show_json(found, code=len(wrong), errors=wrong)
 
     def help(self) -> None:
         """Write the faults there are."""
-        show_json_line({"faults": list(fault_lines())})
+        show_json({"faults": list(fault_lines())})
 
     def look(self, look: SimulationMessage, typed: str) -> None:
         """Write nothing."""

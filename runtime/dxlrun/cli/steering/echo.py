@@ -10,7 +10,7 @@ from dxlrun.cli.inputs import Hertz
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Columns, Table
-from dxlrun.output.terminal import show, show_json, show_json_line
+from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.remote.live.listening import TopicMessage
@@ -81,7 +81,7 @@ def print_message(message: TopicMessage, *, as_json: bool) -> None:
     time = message.time_ns * 1e-9
     plain = msgspec.json.decode(msgspec.json.encode(message.message, enc_hook=lambda array: array.tolist()))
     if as_json:
-        show_json_line(
+        show_json(
             {
                 "topic": message.topic,
                 "number": message.number,

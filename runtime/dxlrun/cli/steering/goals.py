@@ -14,7 +14,7 @@ from msgspec import to_builtins
 from dxlrun.cli.inputs import WaitFlag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
 from dxlrun.errors import DxlrunError, InputError, Refused
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
@@ -129,7 +129,7 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
             for number in cancelled:
                 robot.wait(number, REST_S)
         if chosen.as_json:
-            show_json_line({"robot": robot.name, "done": True, "goals": cancelled})
+            show_json({"robot": robot.name, "goals": cancelled})
         elif not cancelled:
             show(f"{robot.name}: no goal runs")
         else:
@@ -180,9 +180,11 @@ def follow(
     reached = all(state.reached for state in states)
     if chosen.as_json:
         goals = [_shown(state) for state in states]
-        result: dict[str, object] = {"robot": robot.name, "done": reached, "cycle": done.cycle}
+        result: dict[str, object] = {"robot": robot.name, "cycle": done.cycle}
         result |= {"motion": motion} if motion else {}
-        show_json_line(result | (goals[0] if len(goals) == 1 else {"goals": goals}))
+        result |= goals[0] if len(goals) == 1 else {"goals": goals}
+        missed = [sentence(state) for state in states if not state.reached]
+        show_json(result, code=0 if reached else 1, errors=missed)
         return 0 if reached else 1
     joints = _joints(robot) if motion else {}
     for state in states:

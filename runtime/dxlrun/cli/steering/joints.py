@@ -13,7 +13,7 @@ from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Table
-from dxlrun.output.terminal import show, show_json_line
+from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed
@@ -96,7 +96,7 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     with robot_of(chosen, "get") as robot:
         found = robot.get(joint, item)
         if chosen.as_json:
-            show_json_line({"robot": robot.name, **found})
+            show_json({"robot": robot.name, **found})
         elif item:
             meaning = f" ({found['is']})" if found["is"] else ""
             show(f"{robot.name}: {found['title']} of {joint} is {found['value']}{meaning}")

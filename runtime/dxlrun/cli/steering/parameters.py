@@ -9,7 +9,7 @@ from msgspec import to_builtins
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
-from dxlrun.output.terminal import show, show_json_line
+from dxlrun.output.terminal import show, show_json
 from dxlrun.remote.requests.replies import Parameter
 
 _DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
@@ -34,9 +34,7 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
         if not values:
             rows = robot.parameter_table(controller)
             if chosen.as_json:
-                show_json_line(
-                    {"robot": robot.name, "controller": controller, "parameters": to_builtins(rows)}
-                )
+                show_json({"robot": robot.name, "controller": controller, "parameters": to_builtins(rows)})
             elif rows:
                 show(_table(rows))
             else:
@@ -45,7 +43,7 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
         changed = robot.set_parameters(controller, values)
         if chosen.as_json:
             shown = [{"name": name, "old": old, "new": new} for name, (old, new) in changed.items()]
-            show_json_line({"robot": robot.name, "controller": controller, "done": True, "changed": shown})
+            show_json({"robot": robot.name, "controller": controller, "changed": shown})
         else:
             for name, (old, new) in changed.items():
                 show(f"{robot.name}: {controller} {name}: {written(old)} -> {written(new)}")

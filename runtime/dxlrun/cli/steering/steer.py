@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.table import Column, Columns, Table
-from dxlrun.output.terminal import print_error, show, show_json, show_json_line
+from dxlrun.output.terminal import print_error, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
@@ -75,30 +75,27 @@ def list_robots(
     if graph:
         _check_graph(graph, [*here] if robot is None else [robot])
     found, code = [], 0
+    failures: list[str] = []
     for name in names if robot is None else (robot,):
         if name in unsteered:
-            print_error(f"dxlrun: {describe(unsteered[name])}")
+            failures.append(describe(unsteered[name]))
             code |= robot is not None
             continue
         try:
             with connect(name, "dxlrun list") as one:
                 found.append({**one.info(), "name": name})
         except DxlrunError as error:  # it may have ended meanwhile; the others are listed
-            print_error(f"dxlrun: {error}")
+            failures.append(str(error))
             code |= robot is not None or name in here
-    for file in graph or ():
-        for info in found:
-            _write_graph(info, file)
-    if as_json:
-        show_json(found)
-        return code
     for info in found:
-        if graph is None:
-            show(headline(info), controllers(info), sources(info), groups(info))
-        elif graph:
-            show(headline(info), *(f"the controller graph is in {file}" for file in graph))
-        else:
-            show(headline(info), drawing(info))
+        _write_graphs(info, graph or ())
+    if as_json:
+        show_json(found, code=code, errors=failures if code else (), warnings=() if code else failures)
+        return code
+    for failure in failures:
+        print_error(f"dxlrun: {failure}")
+    for info in found:
+        _show_robot(info, graph)
     if not found and not code and not unsteered:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
@@ -113,10 +110,20 @@ def _check_graph(files: Sequence[Path], names: Sequence[str]) -> None:
     _require_one(names)
 
 
-def _write_graph(info: Row, file: Path) -> None:
+def _write_graphs(info: Row, files: Sequence[Path]) -> None:
     from dxlrun.output.graph_picture import write_picture  # as above
 
-    write_picture(drawing(info), file)
+    for file in files:
+        write_picture(drawing(info), file)
+
+
+def _show_robot(info: Row, graph: Sequence[Path] | None) -> None:
+    if graph is None:
+        show(headline(info), controllers(info), sources(info), groups(info))
+    elif graph:
+        show(headline(info), *(f"the controller graph is in {file}" for file in graph))
+    else:
+        show(headline(info), drawing(info))
 
 
 def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
@@ -308,7 +315,7 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
                 cycle |= {name: list(names)}
         numbers = [] if done is None else [goal.number for goal in done.goals]
         goals = {"goals": numbers} if len(numbers) > 1 else dict(zip(("goal",), numbers, strict=False))
-        show_json_line({"robot": robot.name, "done": True} | cycle | goals)
+        show_json({"robot": robot.name} | cycle | goals)
     else:
         show(sentence)
     return 0

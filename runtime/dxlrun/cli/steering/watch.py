@@ -17,7 +17,7 @@ from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, robot_of, state
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
 from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
-from dxlrun.output.terminal import STYLES, out, show, show_json_line
+from dxlrun.output.terminal import STYLES, out, show, show_json
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
@@ -133,11 +133,11 @@ def _first_look(watched: Watched) -> None:
 
 
 def _print_lines(watched: Watched, *, once: bool) -> None:
-    show_json_line(watched.json())
+    show_json(watched.json())
     while not once:
         time.sleep(REFRESH_S)
         watched.look()
-        show_json_line(watched.json())
+        show_json(watched.json())
 
 
 def _show_live(watched: Watched) -> None:

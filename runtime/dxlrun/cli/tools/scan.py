@@ -83,8 +83,6 @@ def scan(
     ):
         scanned = scanning.scan(ToolLine(line, packets), search, progress)
         latency_ns = line.latency_ns
-    for rate in scanned.left_out:
-        print_warning(f"{port} cannot run at {rate} bit/s, so this rate was left out")
     narrowed = protocol is not None or bool(baud) or ids is not None
     _show(port, scanned, narrowed=narrowed, as_json=as_json)
     if output is not None and scanned.servos:
@@ -138,21 +136,29 @@ def load_models() -> None:
 
 
 def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None:
+    nothing = (
+        f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
+        "`dxlrun doctor` lists the adapters"
+        + "; without --protocol, --baud and --ids everything is tried"
+        * narrowed
+    )
+    errors = [] if scanned.servos else [nothing]
+    warnings = [f"{port} cannot run at {rate} bit/s, so this rate was left out" for rate in scanned.left_out]
+    warnings += [
+        f"ID {servo.servo_id} at {servo.baud_rate} bit/s: {remark}"
+        for servo in scanned.servos
+        for remark in servo.remarks
+    ]
     if as_json:
-        show_json({"port": port, "servos": scanned.servos, "left_out": scanned.left_out})
+        found = {"port": port, "servos": scanned.servos, "left_out": scanned.left_out}
+        show_json(found, code=len(errors), errors=errors, warnings=warnings)
         return
-    if not scanned.servos:
-        print_error(
-            f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
-            "`dxlrun doctor` lists the adapters"
-            + "; without --protocol, --baud and --ids everything is tried"
-            * narrowed
-        )
-        return
-    show(_table(scanned.servos))
-    for servo in scanned.servos:
-        for remark in servo.remarks:
-            print_warning(f"ID {servo.servo_id} at {servo.baud_rate} bit/s: {remark}")
+    if scanned.servos:
+        show(_table(scanned.servos))
+    for warning in warnings:
+        print_warning(warning)
+    for error in errors:
+        print_error(error)
 
 
 def _table(servos: Sequence[FoundServo]) -> Table:

@@ -41,6 +41,7 @@ _ELSEWHERE: Mapping[str, str] = MappingProxyType(
     }
 )
 """What `set` does not do, as more than a write belongs to it."""
+NOTHING_CHANGED = "nothing was changed"
 
 
 def servo(
@@ -160,13 +161,15 @@ def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) 
             each.item.name: {"factory": each.factory, "judgement": each.judgement, "effect": each.effect}
             for each in asked.deviations
         }
-        show_json(result | {"registers": asked.registers, "deviations": deviations})
+        declined = [NOTHING_CHANGED] if asked.declined else []
+        result |= {"registers": asked.registers, "deviations": deviations}
+        show_json(result, code=len(declined), errors=declined)
         return
     if verb == "get":
         show(_registers(asked.registers, one.table, asked.deviations))
     show(*(f"{one.called}: {sentence}" for sentence in asked.done))
     if asked.declined:
-        show("nothing was changed")
+        show(NOTHING_CHANGED)
 
 
 def _registers(
