@@ -112,7 +112,7 @@ def test_a_log_that_is_being_written_is_called_so(dxlrun: Callable, log: Path):
     os.truncate(log, log.stat().st_size - FOOTER_BYTES)
     with being_written(log):
         said = dxlrun("analyze", log)
-        report = json.loads(dxlrun("analyze", log, "--json").out)
+        report = result_of(dxlrun("analyze", log, "--json").out)
         assert ": being written; so far: " in dxlrun("analyze", log, log).out
     assert (said.code, report["being_written"], report["complete"]) == (1, True, False)
     assert "has no end yet: a run is writing it; its last cycle is at " in said.out

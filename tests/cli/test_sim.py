@@ -157,7 +157,7 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
     assert result_of(sim.line()) == {"understood": "turn servo=2 by=30deg for=100ms"}
     assert result_of(sim.line()) == {"fault": "turn servo=2 by=30deg for=100ms"}
     sim.type("slience servo=1")
-    assert "did you mean silence?" in read_answer(sim.line()).errors[0].what
+    assert "did you mean silence?" in read_answer(sim.line()).errors[0].fix
     sim.type("help")
     assert any(line.startswith("lose ") for line in result_of(sim.line())["faults"])
 

@@ -540,6 +540,40 @@ def test_another_program_reads_the_robot_by_the_page(torso: RemoteRobot) -> None
     assert json.loads(printed.stdout)["robot"] == torso.name
 
 
+def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: RemoteRobot) -> None:
+    lines = """list
+        watch --once
+        get head_yaw_joint
+        set head_yaw_joint led 1
+        parameters head
+        send head position head_yaw_joint=0deg
+        cancel
+        echo /joint_states --count 2
+        rate 50
+        play --list
+        torque off left_elbow_joint --release
+        torque on left_elbow_joint
+        switch --activate left_arm
+        halt
+        switch --activate head left_arm right_arm
+        pause
+        load spare type=joint_group_position_controller joints=[head_yaw_joint]
+        unload spare
+        resume
+        take-over
+        reboot left_elbow_joint
+        stop"""
+    known = {"list", "watch", "play", "stop", *GROUPS["Robots that run"]}
+    assert {line.split()[0] for line in lines.splitlines()} == known
+    for line in lines.splitlines():
+        said = dxlrun(*shlex.split(line), "--json")
+        for text in said.out.splitlines():
+            answer = read_answer(text)
+            assert (answer.ok, said.err) == (said.code == 0, ""), line
+        assert said.code == (1 if line.split()[0] == "reboot" else 0), (line, said)  # Protocol 1.0
+    assert running() == ()
+
+
 def test_the_commands_of_the_page_work_in_their_order(
     dxlrun, torso: RemoteRobot, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,7 +74,7 @@ def test_parquet_names_topics_without_a_file_and_the_reason(
     run: Path, tmp_path: Path, export: Export
 ) -> None:
     _, said, _ = export(run, tmp_path / "out", "--format", "parquet", "--json")
-    missing = json.loads(said)["without_file"]
+    missing = result_of(said)["without_file"]
     topics = open_log(run).topics
     files = {path.stem for path in (tmp_path / "out").iterdir()}
     assert missing.keys() == {
@@ -92,7 +92,7 @@ def test_parquet_names_topics_without_a_file_and_the_reason(
 
 def test_csv_names_topics_that_it_cannot_have(run: Path, tmp_path: Path, export: Export) -> None:
     _, said, _ = export(run, tmp_path / "out.csv", "--format", "csv", "--json")
-    assert json.loads(said)["without_file"].keys() == WITHOUT_TABLE.keys() & open_log(run).topics.keys()
+    assert result_of(said)["without_file"].keys() == WITHOUT_TABLE.keys() & open_log(run).topics.keys()
     code, _, errors = export(run, tmp_path / "other.csv", "--format", "csv", "--topic", "/joint_states")
     assert (code, "/joint_states has no table: the states are in /cycle" in errors[0]) == (2, True)
 
