@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 from tests.kit.answers import read_answer, result_of
-from tests.kit.held_logs import being_written
+from tests.kit.held_logs import being_written, cut_end
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 """Of one joint, because a page has a figure for each."""
-FOOTER_BYTES = 37  # mcap.dev/spec: a record of 20 bytes, and the magic at the end of the file
 NO_LOG = "this is no MCAP file, so it is no log of dxlrun"
 
 
@@ -109,7 +108,7 @@ def test_without_an_argument_a_log_that_is_being_written_is_not_analyzed(dxlrun:
 
 
 def test_a_log_that_is_being_written_is_called_so(dxlrun: Callable, log: Path):
-    os.truncate(log, log.stat().st_size - FOOTER_BYTES)
+    cut_end(log)
     with being_written(log):
         said = dxlrun("analyze", log)
         report = result_of(dxlrun("analyze", log, "--json").out)

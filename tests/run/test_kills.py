@@ -66,15 +66,16 @@ def test_the_log_of_a_run_that_is_killed_beside_busy_programs_lacks_its_end_only
     start: Start, wait_for: Callable[..., Any], wire_and_log: Callable[..., Any]
 ) -> None:
     """The docs say 0.5 s. The ledger may lack its own last 0.5 s; the bound here is for a busy machine."""
-    with busy_programs(4):
-        run = start("--duration", "60")
-        run.wait_until_moving()
-        wait_for(lambda: run.ledger()[-1].t_ns - run.ledger()[0].t_ns > 4_000_000_000, "4 s on the wire")
+    run = start("--duration", "60")
+    run.wait_until_moving()
+    before_ns = run.ledger()[-1].t_ns
+    with busy_programs(3):  # beside them a start takes too long
+        wait_for(lambda: run.ledger()[-1].t_ns > before_ns + 2_000_000_000, "2 s on the wire")
         for process in run.processes().values():
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
-        run.finish()
-        wait_for(run.gone, "the end of every process")
+    run.finish()
+    wait_for(run.gone, "the end of every process")
     for wire, ours in wire_and_log(run):
         both = min(len(wire), len(ours))
         assert wire[:both] == ours[:both]

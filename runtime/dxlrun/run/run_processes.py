@@ -37,7 +37,8 @@ GatewayMessage = Listening | Failed
 
 Message = TypeVar("Message")
 
-RECORDER_NICE = -10  # Nine times the share of an ordinary program (sched(7)); it needs 6 % of a core at 1 kHz
+RECORDER_NICE = -10
+"""Nine times the share of an ordinary program (sched(7)); the recorder needs a tenth of a core at 1 kHz."""
 _GUARDIAN_CAPACITY = 2 << 20
 """Bytes: it sends and receives little, and reports little."""
 _LONGEST_TAKEN = LONGEST_COMMAND + 64

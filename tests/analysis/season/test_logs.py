@@ -19,6 +19,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun, Said
+from tests.kit.held_logs import being_written, cut_end
 from tests.kit.pages import page_text
 
 from dxlrun.log.log_writer import LogWriter
@@ -125,6 +126,20 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dx
         assert row["hottest_deg_c"] == np.nanmax(cycles["temperature"])
         assert row["lowest_voltage_v"] == pytest.approx(np.nanmin(cycles["voltage"]))
     assert found["may/copy.mcap"] | {"log": ""} == found["first.mcap"] | {"log": ""}
+
+
+def test_a_log_that_is_being_written_is_called_so_and_read_again(
+    season: Path, here: Here, dxlrun: Dxlrun
+) -> None:
+    log = season / "first.mcap"
+    cut_end(log)
+    os.utime(log, (1e9, 1e9))
+    with being_written(log):
+        assert rows(dxlrun("logs", season, "--json"))["first.mcap"]["being_written"]
+        assert "being written" in dxlrun("logs", season).out
+    here.clear()
+    assert not rows(dxlrun("logs", season, "--json"))["first.mcap"]["being_written"]
+    assert here == ["first.mcap"]
 
 
 def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: Here, dxlrun: Dxlrun) -> None:
