@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 from dxlrun.description.bus import SIMULATED
+from dxlrun.dynamixel.port.reopening import lasting_name
 from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 from dxlrun.errors import InputError, PortError, suggestion
 from dxlrun_hand.dialogue import Dialogue
@@ -46,17 +47,32 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
     )
 
 
-@contextmanager
-def opened_lines(ports: Mapping[str, str], opened: Opened = TunablePort) -> Iterator[dict[str, ToolLine]]:
-    """Open the port of each bus; raises PortError, InputError for simulated ones: they have no port."""
-    for bus, port in ports.items():
-        if port == SIMULATED:
-            raise InputError(
-                f"bus {bus} is simulated, and has no port where servos could be: give one, such as "
-                "port:=/dev/ttyUSB0; `dxlrun sim ROBOT.yaml --link /tmp/line` has simulated ones at /tmp/line"
-            )
-    with ExitStack() as stack:
-        yield {bus: ToolLine(stack.enter_context(opened(port))) for bus, port in ports.items()}
+class BusLines:
+    """The lines of buses, each open only while it is used.
+
+    A board that powers its servos by USB drops out when a servo is plugged in, and its port comes back as
+    another device: it is opened again by its lasting name.
+    """
+
+    def __init__(self, ports: Mapping[str, str], opened: Opened = TunablePort) -> None:
+        """Raises PortError for a port that cannot be opened, InputError for a simulated bus: it has none."""
+        for bus, port in ports.items():
+            if port == SIMULATED:
+                raise InputError(
+                    f"bus {bus} is simulated, and has no port where servos could be: give one, such as "
+                    "port:=/dev/ttyUSB0; `dxlrun sim ROBOT.yaml --link line` has simulated ones at ./line"
+                )
+        self._opened = opened
+        self._names = {bus: lasting_name(port) or port for bus, port in ports.items()}
+        for bus in ports:
+            with self.open(bus):
+                pass
+
+    @contextmanager
+    def open(self, bus: str) -> Iterator[ToolLine]:
+        """Provide the line of a bus; raises PortError."""
+        with self._opened(self._names[bus]) as port:
+            yield ToolLine(port)
 
 
 def chosen_names(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.joints.servos import AUTO
@@ -17,14 +17,13 @@ from dxlrun.dynamixel.servo.registers import compare, merged
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
 from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.errors import ServoFault
+from dxlrun.errors import PortError, ServoFault
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program
 from dxlrun_hand.dialogue import Dialogue, yes
+from dxlrun_hand.lines import BusLines
 
 SKIP = ("s", "skip")
-Lines = Mapping[str, ToolLine]
-"""By bus."""
 
 
 class SetUp:
@@ -40,22 +39,22 @@ class SetUp:
         self.changing = ""
         """The servo that is being written to; empty: none is."""
 
-    def connect_each(self, lines: Lines, chosen: Collection[str]) -> None:
+    def connect_each(self, lines: BusLines, chosen: Collection[str]) -> None:
         """Set up the chosen servos, each connected alone."""
         for index, plan in enumerate(self.plans):
             for servo in plan.servos:
-                if servo.own_name in chosen and self._set_up(lines[plan.name], index, servo.own_name):
+                if servo.own_name in chosen and self._set_up(lines, index, servo.own_name):
                     self.done.append(servo.own_name)
 
-    def compare_all(self, lines: Lines, chosen: Collection[str]) -> bool:
+    def compare_all(self, lines: BusLines, chosen: Collection[str]) -> bool:
         """Read the chosen servos of each bus back, all connected; return whether all are as in the file."""
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
                 self.dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
-                tool = lines[plan.name]
-                tool.speak(plan.protocol, plan.baud_rate)
-                found = tool.run(extend_timeouts(_read_back(plan, servos)))
+                with lines.open(plan.name) as tool:
+                    tool.speak(plan.protocol, plan.baud_rate)
+                    found = tool.run(extend_timeouts(_read_back(plan, servos)))
                 self.dialogue.say(*(f"{joint}: {text}" for joint, text in found.describe_deviations()))
                 if not found.problems:
                     count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
@@ -66,7 +65,7 @@ class SetUp:
                     return False
         return True
 
-    def _set_up(self, tool: ToolLine, index: int, name: str) -> bool:
+    def _set_up(self, lines: BusLines, index: int, name: str) -> bool:
         """Set one servo up; False: the person skipped it."""
         while True:
             plan = self.plans[index]
@@ -79,15 +78,16 @@ class SetUp:
             if typed.lower() in SKIP:
                 return False
             try:
-                found = self._alone(tool, plan, servo)
-                if name in self._unknown:
-                    self._models[name] = found.model
-                    self.plans = compile_robot(self.description, [], models=self._models).plan.buses
-                    plan = self.plans[index]
-                self.changing = name
-                for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
-                    self.dialogue.say(f"  {name}: {sentence}")
-            except ServoFault as error:
+                with lines.open(plan.name) as tool:
+                    found = self._alone(tool, plan, servo)
+                    if name in self._unknown:
+                        self._models[name] = found.model
+                        self.plans = compile_robot(self.description, [], models=self._models).plan.buses
+                        plan = self.plans[index]
+                    self.changing = name
+                    for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
+                        self.dialogue.say(f"  {name}: {sentence}")
+            except (PortError, ServoFault) as error:
                 self.dialogue.say(*error.sentences)
                 continue
             self.changing = ""

@@ -47,6 +47,7 @@ from dxlrun.description.units import Time as Time
 from dxlrun.description.units import Tolerance as Tolerance
 from dxlrun.description.units import Voltage as Voltage
 from dxlrun.description.units import distance_text as distance_text
+from dxlrun.dynamixel.port.serial_open import open_serial as open_serial
 from dxlrun.errors import ControllerFault as ControllerFault
 from dxlrun.errors import DxlrunError as DxlrunError
 from dxlrun.errors import GoalTimeout as GoalTimeout

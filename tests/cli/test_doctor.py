@@ -13,7 +13,8 @@ from tests.kit.answers import read_answer
 
 from dxlrun.channels import compiled
 from dxlrun.control.realtime import UNLIMITED
-from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
+from dxlrun.dynamixel.port.adapters import serial_devices, warnings_for
+from dxlrun.run.doctor import RATES, Finding, Machine, diagnose, may_schedule, set_rates
 
 GOOD = {
     "proc/sys/kernel/osrelease": "6.12.1-rt5",
@@ -46,6 +47,100 @@ def look(tmp_path: Path) -> Look:
         return {one.what: one for one in diagnose(Machine(**(given | {"root": tmp_path} | other)))}
 
     return look
+
+
+USB = "sys/devices/pci0/usb1/1-2"
+ADAPTER = {f"{USB}/idVendor": "0403", f"{USB}/power/control": "on", f"{USB}/1-2:1.0/ttyUSB0/port_number": "0"}
+BRLTTY = "usr/lib/udev/rules.d/85-brltty.rules"
+RULE = 'ENV{PRODUCT}=="1a86/7523/*", ENV{BRLTTY_BRAILLE_DRIVER}="bm", GOTO="brltty_usb_run"\n'
+
+
+@pytest.fixture
+def with_adapter(tmp_path: Path) -> None:
+    """The port hangs on a USB device, as sysfs shows it."""
+    (tmp_path / USB / "1-2:1.0/ttyUSB0").mkdir(parents=True)
+    (tmp_path / "sys/class/tty/ttyUSB0").mkdir(parents=True)
+    (tmp_path / "sys/class/tty/ttyUSB0/device").symlink_to(tmp_path / USB / "1-2:1.0/ttyUSB0")
+
+
+@pytest.mark.usefixtures("with_adapter")
+@pytest.mark.parametrize(
+    ("files", "what", "fix"),
+    [
+        (
+            {"proc/812/comm": "ModemManager\n"},
+            "ModemManager",
+            "sudo systemctl disable --now ModemManager",
+        ),
+        ({"proc/900/comm": "brltty\n"}, "brltty", "sudo apt remove brltty"),
+        ({BRLTTY: f"# Braille\n{RULE}"}, "brltty", "sudo apt remove brltty"),
+        (
+            {f"{USB}/power/control": "auto\n"},
+            "autosuspend of ttyUSB0",
+            f"echo on | sudo tee /{USB}/power/control",
+        ),
+    ],
+)
+def test_what_disturbs_an_adapter_is_found(
+    look: Look, tmp_path: Path, files: dict[str, str], what: str, fix: str
+) -> None:
+    one = look(ADAPTER | files)[what]
+    assert one.state == "worse"
+    assert one.mend.startswith(fix)
+    (sentence,) = warnings_for("/dev/ttyUSB0", tmp_path)
+    assert sentence.startswith(f"{what}: ")
+    assert fix in sentence
+    assert not [*warnings_for("/dev/pts/7", tmp_path)]
+
+
+@pytest.mark.usefixtures("with_adapter")
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"proc/812/comm": "ModemManagerX"},
+        {BRLTTY: f"#{RULE}"},  # as newer systems have it
+        {"proc/812/comm": "ModemManager", "dev/ttyUSB0": None},
+        {f"{USB}/power/control": "auto", f"{USB}/idVendor": None},
+    ],
+)
+def test_what_disturbs_no_adapter_is_not_named(
+    look: Look, tmp_path: Path, files: dict[str, str | None]
+) -> None:
+    found = look(ADAPTER | files)
+    assert not {"ModemManager", "brltty", "autosuspend of ttyUSB0"} & set(found)
+    assert not [*warnings_for("/dev/ttyUSB0", tmp_path)]
+
+
+def test_ports_of_the_board_are_listed_and_never_missing(look: Look, tmp_path: Path) -> None:
+    ports = ("ttyUSB1", "ttyACM0", "ttyAMA0", "ttyTHS1", "ttySC0", "serial0")
+    files = {f"dev/{name}": "" for name in ports}
+    found = look(files, may_write=lambda path: path.name.startswith("ttyUSB"))
+    assert found["/dev/ttyACM0"].state == "missing"
+    for name in ports[2:]:
+        assert found[f"/dev/{name}"].state == "worse"
+        assert found[f"/dev/{name}"].mend
+    assert serial_devices(tmp_path) == ("/dev/ttyUSB0", *(f"/dev/{name}" for name in ports))
+
+
+def test_rates_that_a_driver_does_not_have_are_named(look: Look) -> None:
+    def sets(path: Path) -> dict[int, int]:
+        return {57_600: 57_692, 1_000_000: 1_000_000, 4_000_000: 3_000_000}
+
+    one = look(set_rates=sets)["baud rates of /dev/ttyUSB0"]
+    assert (one.state, one.found) == (
+        "worse",
+        "its driver does not have all rates: 4000000 becomes 3000000 bit/s",
+    )
+    assert one.mend == "choose a rate of: 57600, 1000000"
+    good = look(set_rates=lambda path: {1_000_000: 1_000_000})["baud rates of /dev/ttyUSB0"]
+    assert good.state == "good"
+
+
+def test_the_rates_of_a_pseudo_terminal_are_as_asked() -> None:
+    master, slave = os.openpty()
+    assert set_rates(Path(os.ttyname(slave))) == {rate: rate for rate in RATES}
+    os.close(master)
+    os.close(slave)
 
 
 def test_a_good_machine_has_nothing_to_fix(look: Look) -> None:

@@ -34,7 +34,7 @@ def timer(tmp_path, line):
 
 def shortened(line, most_ns, system):
     with open_serial(line, 1_000_000) as port:
-        return shorten(port, line, most_ns, system)
+        return shorten(port.fileno(), line, most_ns, system)
 
 
 def test_a_timer_that_is_longer_than_the_robot_file_says_is_shortened(tmp_path, line, timer):

@@ -1,7 +1,9 @@
+import errno
 import fcntl
 import os
 import pty
 import select
+import struct
 import subprocess
 import sys
 import termios
@@ -18,7 +20,9 @@ from dxlrun.clock import MonotonicClock
 from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.dynamixel.port.serial_open import let_go, open_serial
+from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
+from dxlrun.dynamixel.port.serial_open import let_go, open_serial, rate_remark
+from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
@@ -111,6 +115,88 @@ def test_a_line_that_takes_nothing_is_a_port_error(opened):
 def test_a_missing_device_is_named():
     with pytest.raises(PortError, match=r"there is no /dev/ttyNOPE; (there are: /dev|this machine has no)"):
         open_serial("/dev/ttyNOPE", 1_000_000)
+
+
+class Driver:
+    """Answers ioctl of a line as a driver with one baud rate, and maybe RS-485, would."""
+
+    def __init__(self, monkeypatch, baud_rate=0, *, rs485=True):
+        self.rs485 = []
+        real = fcntl.ioctl
+
+        def ioctl(descriptor, request, argument=0):
+            if request == 0x542F:  # TIOCSRS485
+                if not rs485:
+                    raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
+                self.rs485.append(struct.unpack("8I", argument))
+                return 0
+            answer = real(descriptor, request, argument)
+            if request == 0x802C542A and baud_rate:  # TCGETS2
+                return answer[:-8] + struct.pack("2I", baud_rate, baud_rate)
+            return answer
+
+        monkeypatch.setattr(fcntl, "ioctl", ioctl)
+        monkeypatch.setattr("dxlrun.dynamixel.port.serial_open.is_simulated", lambda path: False)
+
+
+@pytest.mark.parametrize(
+    ("real", "said"), [(1_020_000, ""), (980_000, ""), (3_000_000, "+200.0%"), (975_000, "-2.5%")]
+)
+def test_the_rate_that_the_driver_set_is_read_back(terminal, monkeypatch, real, said):
+    _, path, _ = terminal
+    Driver(monkeypatch, real)
+    with open_serial(path, 1_000_000) as line:
+        assert line.baud_rate == real
+        remark = rate_remark(line, 1_000_000)
+        assert line.set_rate(real)
+    assert bool(remark) == bool(said)
+    if said:
+        assert f"{path} was asked for 1000000 bit/s, and its driver set {real} ({said})" in remark
+    lines = KeptLines([Wanted(path, 1_000_000, 0)])
+    assert lines.remarks == ([remark] if remark else [])
+    lines.close()
+
+
+def test_a_rate_beyond_two_percent_is_left_out_by_tools(terminal, monkeypatch):
+    _, path, _ = terminal
+    Driver(monkeypatch, 3_000_000)
+    with TunablePort(path) as port:
+        assert not port.tune(4_000_000)
+        assert port.tune(3_000_000)
+        assert not port.tune(4_000_000)
+        assert port.other_rates == {4_000_000: 3_000_000}
+
+
+def test_rs485_is_switched_on_or_refused(terminal, monkeypatch):
+    _, path, _ = terminal
+    driver = Driver(monkeypatch)
+    with open_serial(path, 1_000_000):
+        assert driver.rs485 == []
+    with open_serial(path, 1_000_000, rs485=True):
+        assert driver.rs485 == [(3, 0, 0, 0, 0, 0, 0, 0)]  # SER_RS485_ENABLED | SER_RS485_RTS_ON_SEND
+    Driver(monkeypatch, rs485=False)
+    with pytest.raises(PortError, match=rf"the driver of {path} has no RS-485 mode .*: leave out"):
+        open_serial(path, 1_000_000, rs485=True)
+    with open_serial(path, 1_000_000):
+        pass  # what was refused let go of it
+
+
+def test_a_simulated_line_needs_no_rs485(terminal):
+    with open_serial(terminal[1], 1_000_000, rs485=True):
+        pass
+
+
+def test_a_board_that_resets_when_it_is_opened_gets_time_once(terminal, monkeypatch):
+    _, path, slave = terminal
+    slept = []
+    monkeypatch.setattr(time, "sleep", slept.append)
+    settings = termios.tcgetattr(slave)
+    settings[2] |= termios.HUPCL  # as a port that was plugged in
+    termios.tcsetattr(slave, termios.TCSANOW, settings)
+    for _ in range(3):
+        with open_serial(path, 1_000_000, boot_ns=2_000_000_000):
+            assert not termios.tcgetattr(slave)[2] & termios.HUPCL  # DTR stays set
+    assert slept == [2.0]
 
 
 def test_a_file_is_no_serial_line(tmp_path):

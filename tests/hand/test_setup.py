@@ -13,6 +13,7 @@ from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id
 from dxlrun.errors import InputError, PortError
 from dxlrun.plan.simulation_plan import ServoConfig
+from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
 from dxlrun_hand.servo_setup import SetUp
@@ -214,10 +215,34 @@ def test_ctrl_c_while_a_servo_is_written_to_is_said_so(
     assert "the one for elbow may have its new ID or rate already: set it up again" in capsys.readouterr().err
 
 
-def test_a_port_that_goes_away_ends_it(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(PortError, match="gone"):
-        bench.do(("for elbow", bench.line.bus.unplug))
-    assert "no servo was set up" in capsys.readouterr().err
+def test_each_servo_opens_the_port_again_as_a_board_on_usb_drops_out(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plugging in a servo resets the board that powers it: the port goes, and is there again later."""
+    line, opened = bench.line, 0
+
+    def open_again(path: str) -> object:
+        nonlocal opened
+        opened += 1
+        if not line.bus.plugged:
+            raise PortError(f"there is no {path}")
+        line.ports = VirtualPorts(line.clock, [line.bus])
+        return line
+
+    def comes_back(index: int) -> None:
+        line.bus.plug_in()
+        line.connect(index)
+
+    monkeypatch.setattr(line, "open", open_again)
+    script = bench.do(
+        ("for elbow", line.bus.unplug),
+        ("for elbow", lambda: comes_back(0)),
+        ("for wrist", lambda: (line.bus.unplug(), comes_back(1))[1]),
+        ("Connect all servos of bus main", bench.connect(0, 1)),
+    )
+    assert (bench.code, opened) == (0, 5)  # when it begins, for each servo and once more, and at the end
+    assert "there is no /dev/null" in script.text
+    assert bench.servo(0) == (5, 3, 10, 70)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from typing import Annotated
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from dxlrun import Floats, ParametersModel, Sensor, SensorContext
+from dxlrun import Floats, ParametersModel, Sensor, SensorContext, open_serial
 
 _SIX = (
     "linear_acceleration.x",
@@ -96,14 +96,11 @@ class SerialImu(Sensor[SerialImuParameters]):
 
     def open(self, context: SensorContext) -> None:
         """Open the port for this process alone. Raises OSError."""
-        import serial  # not above: a check, and a robot without this sensor, load it for nothing
-
         super().open(context)
         own = self.parameters
         self._places = [index for index, column in enumerate(own.columns) if column != _IGNORED]
         self._scales = [own.scale.get(state.partition(".")[0], 1.0) for state in self.states(own)]
-        self._port = serial.Serial(own.port, own.baud_rate, timeout=0, exclusive=True)
-        self._port.reset_input_buffer()
+        self._port = open_serial(own.port, own.baud_rate)
         self._received = b""
         self._begun = False  # the first line may have begun before
         self._garbage, self._shown = 0, b""

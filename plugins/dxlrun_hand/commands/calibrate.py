@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,7 +50,7 @@ def calibrated(
     from dxlrun.compile.robot import compile_files
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import ending_with, yes
-    from dxlrun_hand.lines import opened_lines
+    from dxlrun_hand.lines import BusLines
     from dxlrun_hand.robot_text import RobotText
 
     plan, robot = result.plan, Path(result.plan.source_file)
@@ -60,8 +61,10 @@ def calibrated(
             text.check(path)
     servos = {name: plan.servos_by_joint[name][0] for name in joints}
     ports = {bus.name: bus.port for bus, _ in servos.values()}
-    with ending_with(lambda: f"{robot} is as it was"), opened_lines(ports, opened) as lines:
-        hands = [HandJoint(lines[bus.name], bus, servo) for bus, servo in servos.values()]
+    with ending_with(lambda: f"{robot} is as it was"), ExitStack() as stack:
+        lines = BusLines(ports, opened)
+        tools = {bus: stack.enter_context(lines.open(bus)) for bus in ports}
+        hands = [HandJoint(tools[bus.name], bus, servo) for bus, servo in servos.values()]
         with ending_with(lambda: _limp(hands)):
             found = measure(hands, dialogue)
         changes = []

@@ -39,7 +39,7 @@ def setup(
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     """
     from dxlrun.description.reading import read_robot
-    from dxlrun.dynamixel.port.serial_open import serial_devices
+    from dxlrun.dynamixel.port.adapters import serial_devices
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.servo_setup import SetUp
@@ -55,7 +55,7 @@ def set_up(
 ) -> int:
     """Set the servos of a robot up; return the exit code. Raises InputError, PortError."""
     from dxlrun_hand.dialogue import ending_with
-    from dxlrun_hand.lines import chosen_names, opened_lines
+    from dxlrun_hand.lines import BusLines, chosen_names
 
     servos = [servo.own_name for plan in task.plans for servo in plan.servos]
     moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))  # joints and transmissions
@@ -66,9 +66,9 @@ def set_up(
         for plan in task.plans:
             if any(servo.own_name in chosen for servo in plan.servos):
                 ports[plan.name] = _port(task, plan, devices, search=search)
-        with opened_lines(ports, opened) as lines:
-            task.connect_each(lines, chosen)
-            equal = task.compare_all(lines, chosen)
+        lines = BusLines(ports, opened)
+        task.connect_each(lines, chosen)
+        equal = task.compare_all(lines, chosen)
     return 0 if equal else 1
 
 

@@ -217,9 +217,12 @@ def _floor(rate: float) -> str:
 
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
     """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
-    items = file.robot.buses[plan.name].slow_registers.items
+    bus = file.robot.buses[plan.name]
+    items = bus.slow_registers.items
     return replace(
         plan,
+        rs485=bus.adapter.rs485,
+        boot_ns=bus.adapter.boot_time,
         servos=tuple(
             replace(
                 servo,

@@ -17,6 +17,8 @@ SIMULATED = "sim"  # The port of a simulated bus
 _HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
 _LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
 
+_LONGEST_BOOT_NS = 10_000_000_000
+
 
 def _protocol(value: float) -> float:
     if value not in (1.0, 2.0):
@@ -27,6 +29,12 @@ def _protocol(value: float) -> float:
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
         raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
+    return value
+
+
+def _boot_time(value: int) -> int:
+    if value > _LONGEST_BOOT_NS:
+        raise refuse("no board boots for so long", "write 10 s at most")
     return value
 
 
@@ -44,6 +52,17 @@ class Adapter(Form):
         "How long it may keep bytes back before it hands them over; kind says it, too (1 ms, or none).",
         "1 ms",
         16_000_000,
+    )
+    rs485: bool = key(
+        "The kernel switches its direction (TIOCSRS485), as for an RS-485 transceiver at a UART.",
+        "true",
+        False,
+    )
+    boot_time: Annotated[Duration, AfterValidator(_boot_time)] = key(
+        "How long its board needs after it was plugged in and its port is opened, at most 10 s: boards that "
+        "reset then.",
+        "2 s",
+        0,
     )
 
     @property

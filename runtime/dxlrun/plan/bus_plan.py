@@ -344,6 +344,8 @@ class BusPlan(msgspec.Struct, frozen=True):
     devices: tuple[DevicePlan, ...] = ()  # What is on the bus and is no servo
     device_margin_ns: int = 1_000_000
     """How long a device is awaited beyond the latest moment of its reply by the wire."""
+    rs485: bool = False  # The kernel switches the direction of the adapter's transceiver
+    boot_ns: int = 0  # How long its adapter boots after it was plugged in and opened
 
     @property
     def members(self) -> tuple[Member, ...]:

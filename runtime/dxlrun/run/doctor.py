@@ -6,8 +6,9 @@ import gzip
 import os
 import re
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -25,13 +26,17 @@ from dxlrun.control.realtime import (
     lockable_bytes,
     user,
 )
+from dxlrun.dynamixel.port.adapters import ONBOARD_PORTS, USB_PORTS, disturbances
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
 from dxlrun.dynamixel.port.rights import command_for_access, serial_group
+from dxlrun.dynamixel.port.serial_open import is_rate, open_serial
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
 NEEDED_PRIORITY = 32
 """The robot file's default priority for the loop, and one more for the guardian."""
+RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+"""Tried at each port, bit/s: what servos have (e-Manual, Baud Rate)."""
 FAST_MS = 1
 """The shortest latency timer of an FTDI adapter (FTDI application note AN232B-04)."""
 
@@ -55,7 +60,6 @@ _DEFAULT_SHARE = "sudo sysctl kernel.sched_rt_runtime_us=950000"
 _CLOCK_SOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
 _SLOW_CLOCKS = ("hpet", "acpi_pm", "pit", "jiffies", "refined-jiffies")
 """Sources that are read over a bus, in a microsecond or more, or that tick [i]."""
-_PORTS = ("dev/ttyUSB*", "dev/ttyACM*")
 _TIMERS = "sys/bus/usb-serial/devices/*/latency_timer"
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 
@@ -107,6 +111,16 @@ def may_schedule() -> bool:
     return True
 
 
+def set_rates(port: Path) -> Mapping[int, int]:
+    """Set rates of servos at a port that no other process has open; return what its driver set, bit/s."""
+    found: dict[int, int] = {}
+    with suppress(OSError), open_serial(str(port), RATES[0]) as line:
+        for rate in RATES:
+            line.set_rate(rate)
+            found[rate] = line.baud_rate
+    return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
     """One machine and its user, as far as checks depend on them; the tests make up others."""
@@ -127,6 +141,8 @@ class Machine:
     """Why what is compiled, the exchange with servos and the gate, cannot be used; empty: it can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
     may_write: Callable[[Path], bool] = field(default=partial(os.access, mode=os.R_OK | os.W_OK))
+    set_rates: Callable[[Path], Mapping[int, int]] = field(default=set_rates)
+    """Returns what a port's driver sets for each of `RATES`, bit/s; empty where it cannot be opened."""
 
     @classmethod
     def this(cls) -> Machine:
@@ -211,12 +227,37 @@ def _exchange(machine: Machine) -> Finding:
     return check.missing(what, how)
 
 
-def _ports(machine: Machine) -> tuple[Finding, ...]:
-    found = [path for pattern in _PORTS for path in machine.glob(pattern)]
-    if not found:
-        none = _Check("ports", "servos hang on a serial port")
-        return (none.good("no USB serial adapter is plugged in"),)
-    return tuple(_port(machine, path) for path in found)
+def _ports(machine: Machine) -> Iterator[Finding]:
+    usb, onboard = (
+        [path for pattern in patterns for path in machine.glob(f"dev/{pattern}")]
+        for patterns in (USB_PORTS, ONBOARD_PORTS)
+    )
+    if not usb:
+        yield _Check("ports", "servos hang on a serial port").good("no USB serial adapter is plugged in")
+    for path in usb:
+        yield _port(machine, path)
+    for path in onboard:
+        found = _port(machine, path)
+        # a robot on a USB adapter does not need it
+        yield replace(found, state="worse") if found.state == "missing" else found
+    for path in (*usb, *onboard):
+        yield from _rates(machine, path)
+    for one in disturbances(machine.root):
+        yield _Check(one.what, one.why).worse(one.found, one.fix)
+
+
+def _rates(machine: Machine, path: Path) -> Iterator[Finding]:
+    """The rates that the driver of a port sets as asked; nothing for a port that cannot be opened now."""
+    name = machine.shown(path)
+    check = _Check(f"baud rates of {name}", "servos do not receive what is sent at another rate than theirs")
+    found = machine.set_rates(path)
+    wrong = {rate: real for rate, real in found.items() if not is_rate(real, rate)}
+    if wrong:
+        shown = ", ".join(f"{rate} becomes {real}" for rate, real in wrong.items())
+        right = ", ".join(str(rate) for rate in found if rate not in wrong) or "none of the others"
+        yield check.worse(f"its driver does not have all rates: {shown} bit/s", f"choose a rate of: {right}")
+    elif found:
+        yield check.good(f"{', '.join(map(str, found))} bit/s are set as asked")
 
 
 def _port(machine: Machine, path: Path) -> Finding:

@@ -203,7 +203,7 @@ class Guardian:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
         lines = KeptLines(
             [
-                Wanted(path, bus.baud_rate, bus.latency_ns)
+                Wanted(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
                 for path, bus in zip(self._job.ports, self._job.buses, strict=True)
             ]
         )
@@ -212,6 +212,8 @@ class Guardian:
         self._safe_stop.report_grants(grants)
         for sentence in lines.done:
             self._safe_stop.report(sentence, Severity.INFO)
+        for sentence in lines.remarks:
+            self._safe_stop.report(sentence, Severity.WARNING)
         loop_channel, theirs = process.message_channel(_LINES_LOST)
         loop = self._execute(lines.descriptors, theirs.fileno())
         theirs.close()

@@ -23,7 +23,7 @@ from dxlrun.log.schemas import KEPT_ATTACHMENT, LogHeader
 from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 
-_LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
+_LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic")
 
 
 def log_header(

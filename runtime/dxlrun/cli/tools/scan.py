@@ -6,7 +6,7 @@ import json
 import math
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,9 +82,9 @@ def scan(
         progress_bar(hidden=as_json) as progress,
     ):
         scanned = scanning.scan(ToolLine(line, packets), search, progress)
-        latency_ns = line.latency_ns
+        latency_ns, rates = line.latency_ns, line.other_rates
     narrowed = protocol is not None or bool(baud) or ids is not None
-    _show(port, scanned, narrowed=narrowed, as_json=as_json)
+    _show(port, scanned, rates, narrowed=narrowed, as_json=as_json)
     if output is not None and scanned.servos:
         draft_file(output, port, scanned.servos, latency_ns)
         if not as_json:
@@ -135,7 +135,10 @@ def load_models() -> None:
     load_plugins()
 
 
-def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None:
+def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
+    """Show what was found; `rates`: those that the driver did not set as asked, and what it set."""
+    from dxlrun.dynamixel.port.adapters import warnings_for
+
     nothing = (
         f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
         "`dxlrun doctor` lists the adapters"
@@ -143,7 +146,12 @@ def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None
         * narrowed
     )
     errors = [] if scanned.servos else [nothing]
-    warnings = [f"{port} cannot run at {rate} bit/s, so this rate was left out" for rate in scanned.left_out]
+    set_as = {rate: f": its driver set {real}" for rate, real in rates.items()}
+    warnings = [
+        f"{port} cannot run at {rate} bit/s{set_as.get(rate, '')}; this rate was left out"
+        for rate in scanned.left_out
+    ]
+    warnings += warnings_for(port)
     warnings += [
         f"ID {servo.servo_id} at {servo.baud_rate} bit/s: {remark}"
         for servo in scanned.servos

@@ -6,14 +6,17 @@ Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c, which has the tim
 
 from __future__ import annotations
 
+import fcntl
 import os
+from array import array
 from contextlib import suppress
 from pathlib import Path
 
 import msgspec
-import serial
 
 SYSTEM = Path("/sys")
+_TIOCGSERIAL, _TIOCSSERIAL, _FLAGS, _ASYNC_LOW_LATENCY = 0x541E, 0x541F, 4, 1 << 13
+"""struct serial_struct (linux/serial.h): `flags` is the fifth integer."""
 SHIPPED_NS = 16_000_000  # The timer of an FTDI adapter as it is shipped (AN232B-04)
 _SEEN_LESS_NS = 4_000_000
 """It runs from the reply's first byte, or from what was heard before: so much less of it may be seen [i]."""
@@ -84,7 +87,7 @@ def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
     return None if found is None else LatencyTimer(found, place)
 
 
-def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
+def shorten(descriptor: int, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
     """Shorten the timer of an open line that is longer than `most_ns`, as far as this user may.
 
     Return what was done, and what is wrong still; both are empty where nothing is to be done.
@@ -92,8 +95,11 @@ def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM)
     before = latency_timer(path, system)
     if before is None or before.found_ms * 1_000_000 <= most_ns:
         return "", ""
-    with suppress(OSError, ValueError, NotImplementedError):  # also what has no such flag
-        line.set_low_latency_mode(True)
+    with suppress(OSError):  # also what has no such flag
+        settings = array("i", bytes(128))
+        fcntl.ioctl(descriptor, _TIOCGSERIAL, settings)
+        settings[_FLAGS] |= _ASYNC_LOW_LATENCY
+        fcntl.ioctl(descriptor, _TIOCSSERIAL, settings)
     now = latency_timer(path, system) or before
     if now.found_ms * 1_000_000 > most_ns:
         with suppress(OSError):

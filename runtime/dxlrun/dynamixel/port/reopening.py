@@ -15,7 +15,7 @@ import msgspec
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.dynamixel.port.latency_timer import SYSTEM, shorten
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
-from dxlrun.dynamixel.port.serial_open import kept, let_go, open_serial
+from dxlrun.dynamixel.port.serial_open import let_go, open_serial, rate_remark
 from dxlrun.errors import PortError
 
 FIRST_PAUSE_S = 0.1
@@ -48,6 +48,8 @@ class Wanted(msgspec.Struct, frozen=True):
     path: str
     baud_rate: int
     latency_ns: int  # The longest that its adapter may keep replies back
+    rs485: bool = False
+    boot_ns: int = 0  # How long its adapter boots after it was plugged in and opened
 
 
 class Opened(msgspec.Struct, frozen=True):
@@ -57,6 +59,7 @@ class Opened(msgspec.Struct, frozen=True):
     descriptor: int
     done: str  # What was done to its latency timer; empty: nothing
     wrong: str  # What is wrong with it still; empty: nothing
+    remark: str = ""  # About the rate that its driver set; empty: it is as asked
 
 
 class KeptLines:
@@ -70,6 +73,7 @@ class KeptLines:
         """Open the lines; raises PortError when one cannot be opened, or keeps replies back for too long."""
         self.descriptors: list[int] = []  # In the order of the lines
         self.done: list[str] = []  # What was done to latency timers, one sentence each
+        self.remarks: list[str] = []  # About rates that drivers did not set as asked
         self._lines = tuple(lines)
         self._system = system
         wrong: list[str] = []
@@ -78,6 +82,7 @@ class KeptLines:
                 opened = self._open(index, line.path)
                 self.descriptors.append(opened.descriptor)
                 self.done += [opened.done] if opened.done else []
+                self.remarks += [opened.remark] if opened.remark else []
                 wrong += [opened.wrong] if opened.wrong else []
             if wrong:
                 raise PortError("\n".join(wrong))
@@ -123,9 +128,10 @@ class KeptLines:
 
     def _open(self, index: int, path: str) -> Opened:
         line = self._lines[index]
-        port = open_serial(path, line.baud_rate)
-        done, wrong = shorten(port, path, line.latency_ns, self._system)
-        return Opened(index, kept(port), done, wrong)
+        port = open_serial(path, line.baud_rate, rs485=line.rs485, boot_ns=line.boot_ns)
+        done, wrong = shorten(port.fileno(), path, line.latency_ns, self._system)
+        remark = rate_remark(port, line.baud_rate)
+        return Opened(index, port.detach(), done, wrong, remark)
 
     def _keep_trying(self, index: int) -> None:
         pause_s = FIRST_PAUSE_S

@@ -5,71 +5,148 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import struct
 import termios
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-import serial
-
+from dxlrun.dynamixel.port.adapters import serial_devices
+from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.dynamixel.port.rights import command_for_access
 from dxlrun.errors import PortError
 from dxlrun.process_table import robot_of
 
+_RATE_TOLERANCE = 0.02
+"""Of 8N1: a receiver samples the tenth bit within half a bit up to 5 %, for both ends together [i]."""
+_TCGETS2, _TCSETS2, _BOTHER = 0x802C542A, 0x402C542B, 0o010000
+"""Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
+_SETTINGS = struct.Struct("4I20s2I")
+"""struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
+_TIOCSRS485 = 0x542F
+_RS485 = struct.pack("8I", 0b11, *(0,) * 7)
+"""struct serial_rs485 (linux/serial.h): enabled, RTS is high while it sends, no delays."""
 
-class ExclusiveSerial(serial.Serial):
-    """A line that no other process can open before it is closed.
+
+class SerialLine:
+    """A serial device that no other process can open before it is closed: raw, 8N1, no flow control.
 
     The lock belongs to the terminal, and the Linux kernel takes it off when no process has it open any more.
     Simulated servos keep theirs open for the next program, so closing takes it off.
+
+    Linux sets DTR when a port is opened, and boards such as an Arduino or an OpenCM reset then. It would
+    clear DTR when the port is closed; that is switched off here, so a board resets once, after it was
+    plugged in.
     """
 
+    def __init__(self, path: str, baud_rate: int) -> None:
+        """Raises OSError."""
+        self.path = path
+        self.baud_rate = 0
+        """The rate that the driver really set, bit/s."""
+        self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # which pyserial programs respect
+            self.set_dtr = bool(self._settings()[2] & termios.HUPCL)
+            """True when DTR was not set before: the port was not opened here since it was plugged in."""
+            self.set_rate(baud_rate)
+            termios.tcflush(self._descriptor, termios.TCIFLUSH)
+            fcntl.ioctl(self._descriptor, termios.TIOCEXCL)  # which every program meets, but for root's
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+
+    def __enter__(self) -> SerialLine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._descriptor
+
+    def set_rate(self, baud_rate: int) -> bool:
+        """Set the rate, bit/s; return whether the driver did, within 2 %. Raises OSError."""
+        control = termios.CS8 | termios.CREAD | termios.CLOCAL | _BOTHER
+        settings = _SETTINGS.pack(0, 0, control, 0, bytes(20), baud_rate, baud_rate)
+        fcntl.ioctl(self._descriptor, _TCSETS2, settings)
+        self.baud_rate = self._settings()[-1]
+        return is_rate(self.baud_rate, baud_rate)
+
+    def detach(self) -> int:
+        """Return the descriptor, which is the caller's from now on; `let_go` closes it."""
+        descriptor, self._descriptor = self._descriptor, -1
+        return descriptor
+
     def close(self) -> None:
-        """Let go of the line."""
-        if self.is_open:
-            _unlock(self.fileno())
-        super().close()
+        """Close the line, if it is still open here."""
+        if self._descriptor >= 0:
+            let_go([self.detach()])
+
+    def _settings(self) -> tuple[int, ...]:
+        found = fcntl.ioctl(self._descriptor, _TCGETS2, bytes(_SETTINGS.size))
+        return _SETTINGS.unpack(found)
 
 
 def let_go(descriptors: Iterable[int]) -> None:
-    """Close lines that are `kept`, by this process or by one that is dead now."""
+    """Close lines that were detached, by this process or by one that is dead now."""
     for descriptor in descriptors:
-        _unlock(descriptor)
+        with suppress(OSError):  # the adapter is gone, and the lock with it
+            fcntl.ioctl(descriptor, termios.TIOCNXCL)
         os.close(descriptor)
 
 
-def _unlock(descriptor: int) -> None:
-    with suppress(OSError):  # the adapter is gone, and the lock with it
-        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+def open_serial(path: str, baud_rate: int, *, rs485: bool = False, boot_ns: int = 0) -> SerialLine:
+    """Open a serial device for this process alone: raw, 8N1; also a pseudo-terminal.
 
+    Args:
+        path: The device.
+        baud_rate: bit/s; `SerialLine.baud_rate` is what the driver made of it.
+        rs485: Let the kernel switch the direction of an RS-485 transceiver by RTS.
+        boot_ns: How long to wait for a board that resets when its port is opened; only where this did that.
 
-def open_serial(path: str, baud_rate: int) -> serial.Serial:
-    """Open a device at `baud_rate`, 8N1, exclusively (flock and TIOCEXCL); also a pseudo-terminal.
-
-    Keep what is returned: closing it lets go of the line. Raises PortError with one sentence: there is no
-    such device, this user may not open it, another process has it, or it cannot do the baud rate.
+    Raises:
+        PortError: There is no such device, this user may not open it, another process has it, or it cannot do
+            the baud rate or RS-485.
     """
     try:
-        # exclusive=True: pyserial takes the lock that other pyserial programs respect
-        port = ExclusiveSerial(path, baud_rate, timeout=0, write_timeout=0, exclusive=True)
-    except ValueError as error:
-        raise PortError(f"{path} cannot run at {baud_rate} bit/s: {error}") from error
-    except (OSError, termios.error) as error:  # serial.SerialException is an OSError
+        line = SerialLine(path, baud_rate)
+    except OSError as error:
         raise PortError(_sentence(path, baud_rate, error)) from error
-    # and the lock that every program meets, but for root's
-    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
-    return port
+    if rs485 and not is_simulated(path):
+        try:
+            fcntl.ioctl(line.fileno(), _TIOCSRS485, _RS485)
+        except OSError as error:
+            line.close()
+            raise PortError(
+                f"the driver of {path} has no RS-485 mode ({error.strerror}): leave out `adapter: {{rs485: "
+                "true}`, and use an adapter that switches the direction itself"
+            ) from error
+    if line.set_dtr and boot_ns:
+        time.sleep(boot_ns * 1e-9)
+    return line
 
 
-def kept(port: serial.Serial) -> int:
-    """Return the descriptor of a line of `open_serial`, alone; `let_go` lets go of it."""
-    descriptor = os.dup(port.fileno())
-    serial.Serial.close(port)  # the locks stay with the descriptor
-    return descriptor
+def is_rate(found: int, asked: int) -> bool:
+    """Return whether a rate is near enough to another one, within 2 %."""
+    return abs(found - asked) <= _RATE_TOLERANCE * asked
 
 
-def _sentence(path: str, baud_rate: int, error: Exception) -> str:
-    number = _number(error)
+def rate_remark(line: SerialLine, baud_rate: int) -> str:
+    """Return a sentence for a rate that a driver did not set as asked; empty: it did."""
+    if is_rate(line.baud_rate, baud_rate):
+        return ""
+    error = line.baud_rate / baud_rate - 1.0
+    return (
+        f"{line.path} was asked for {baud_rate} bit/s, and its driver set {line.baud_rate} ({error:+.1%}): "
+        "servos may not receive what is sent; choose a rate that the adapter has"
+    )
+
+
+def _sentence(path: str, baud_rate: int, error: OSError) -> str:
+    number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return f"there is no {path}; {_what_exists()}"
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
@@ -82,26 +159,8 @@ def _sentence(path: str, baud_rate: int, error: Exception) -> str:
     if number == errno.ENOTTY:
         return f"{path} is no serial line"
     if number == errno.EINVAL:
-        return f"{path} cannot run at {baud_rate} bit/s: {error}"
+        return f"{path} cannot run at {baud_rate} bit/s: {error.strerror}"
     return f"{path} cannot be opened: {error}"
-
-
-def _number(error: BaseException | None) -> int | None:
-    while error is not None:
-        if isinstance(error, OSError) and error.errno is not None:
-            return error.errno
-        if isinstance(error, termios.error) and error.args:
-            return int(error.args[0])
-        error = error.__context__
-    return None
-
-
-def serial_devices() -> tuple[str, ...]:
-    """Return the paths of the serial adapters that this machine has, the lasting names first."""
-    names: list[str] = []
-    for folder, pattern in (("/dev/serial/by-id", "*"), ("/dev", "ttyUSB*"), ("/dev", "ttyACM*")):
-        names += sorted(str(path) for path in Path(folder).glob(pattern))
-    return tuple(names)
 
 
 def _what_exists() -> str:

@@ -232,7 +232,7 @@ def _lines(buses: Sequence[BusPlan]) -> Iterator[SerialPorts]:
     opened = []
     try:
         for bus in buses:
-            opened.append(open_serial(bus.port, bus.baud_rate))
+            opened.append(open_serial(bus.port, bus.baud_rate, rs485=bus.rs485, boot_ns=bus.boot_ns))
         yield SerialPorts(
             [SerialPort(port.fileno(), bus.port) for port, bus in zip(opened, buses, strict=True)]
         )

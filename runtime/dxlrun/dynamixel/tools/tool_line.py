@@ -19,6 +19,8 @@ from dxlrun.plan.bus_plan import Budget, BusPlan
 from dxlrun.plan.transaction import Program, Reply, Result
 
 FIRST_RATE = 57_600  # At which a port is opened, bit/s; every adapter has it
+BOOT_NS = 2_000_000_000
+"""Time for the boot loader of a board that resets when its port is opened [i: Optiboot of Arduino, 1 s]."""
 LATENCY_NS = 1_000_000
 """What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
 MOST_LATENCY_NS = 16_000_000
@@ -35,11 +37,14 @@ class TunablePort:
     """
 
     def __init__(self, path: str) -> None:
-        self._serial = open_serial(path, FIRST_RATE)
+        self._serial = open_serial(path, FIRST_RATE, boot_ns=BOOT_NS)
+        self._tuned = FIRST_RATE
+        self.other_rates: dict[int, int] = {}
+        """Rates that the driver did not set as asked, and what it set; bit/s."""
         self.name = path
         self.clock: Clock = MonotonicClock()
         self.ports: Ports = SerialPorts([SerialPort(self._serial.fileno(), path)])
-        shorten(self._serial, path, LATENCY_NS)
+        shorten(self._serial.fileno(), path, LATENCY_NS)
         timer = latency_timer(path)
         found_ns = 0 if timer is None else timer.found_ms * 1_000_000
         self.latency_ns = max(LATENCY_NS, found_ns)
@@ -59,16 +64,16 @@ class TunablePort:
         What came at the old one and was not read is thrown away.
         """
         try:
-            if self._serial.baudrate != baud_rate:
-                self._serial.baudrate = baud_rate
+            if self._tuned != baud_rate:
+                self._tuned = baud_rate
+                if not self._serial.set_rate(baud_rate):
+                    self.other_rates[baud_rate] = self._serial.baud_rate
             termios.tcflush(self._serial.fileno(), termios.TCIFLUSH)
-        except ValueError:  # pyserial, of a rate that the driver refuses
-            return False
         except (OSError, termios.error) as error:
             if error.args and error.args[0] == errno.EINVAL:
                 return False
             raise PortError(f"{self.name} is gone ({error}): was the adapter unplugged?") from error
-        return True
+        return baud_rate not in self.other_rates
 
 
 class Heard(PacketSink):
