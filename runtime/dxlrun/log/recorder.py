@@ -93,21 +93,26 @@ class Recorder:
         return finish or self._supervisor.closed
 
     def _turn(self) -> bool:
-        """Take what is there, bounded, and keep the file's rhythm; True when there may be more."""
+        """Drain each ring, at most _MOST_PER_TURN records; then split, flush and sample where that is due.
+
+        Returns:
+            True when there may be more records.
+        """
         full = [self._drain(name, ring) for name, ring in self._rings]
         if isinstance(self._log, PartWriter):
             self._log.settle()
-        if time.monotonic() >= self._next_flush:
-            self._flush()
+        self._flush_when_due()
         self._sample_machine()
         self._report()
         return any(full)
 
-    def _flush(self) -> None:
-        """Finish the chunk in progress, and set when the next one is due: counted from the end of this flush.
+    def _flush_when_due(self) -> None:
+        """Finish the chunk in progress FLUSH_S after the last flush ended.
 
-        A disk that takes longer than FLUSH_S would leave no time for the rings otherwise.
+        Counted from its begin, a disk that takes longer would leave no time for the rings.
         """
+        if time.monotonic() < self._next_flush:
+            return
         self._log.flush()
         if self._span >= 0 and self._log.error is None:
             self._log.span.store(self._span)
@@ -131,18 +136,16 @@ class Recorder:
                     meter.add(sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
-        """Write the records of a ring, at most _MOST_PER_TURN, until a flush is due.
+        """Write the records of a ring, at most _MOST_PER_TURN; return whether there may be more.
 
-        Returns:
-            True when there may be more records.
+        A flush that becomes due does not wait for the other records: a recorder that is short of processor
+        time may need seconds for them.
         """
-        lost, more = 0, True
+        lost, record = 0, None
         for _ in range(_MOST_PER_TURN):
-            if time.monotonic() >= self._next_flush:
-                break
+            self._flush_when_due()
             record = ring.read()
             if record is None:
-                more = False
                 break
             if isinstance(record, Gap):
                 lost += record.lost
@@ -155,7 +158,7 @@ class Recorder:
                 lost += 1  # whole, but not what the log can hold: declared like any other loss
         if lost:
             self._log.gap(name, lost)
-        return more
+        return record is not None
 
     def _begin_run(self, payload: Payload) -> None:
         """Begin to measure the load of the run at its first deadline; activation is part of start-up."""
