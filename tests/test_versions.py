@@ -84,6 +84,30 @@ def test_an_sdist_keeps_the_version_without_its_tree(tmp_path: Path) -> None:
     assert (found["version"], found["dependencies"]) == (OTHER, [f"dxlrun=={OTHER}"])
 
 
+def pip_install(wheel: Path, site: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Install a wheel into a folder, without a network."""
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-index",
+        "--target",
+        str(site),
+        *options,
+        str(wheel),
+    ]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+
+
+def test_pip_does_not_install_a_package_without_its_version_of_dxlrun(
+    wheels: dict[str, Path], tmp_path: Path
+) -> None:
+    refused = pip_install(wheels["dxlrun_view"], tmp_path / "site")
+    assert refused.returncode != 0
+    assert f"No matching distribution found for dxlrun=={OTHER}" in refused.stderr
+
+
 def started(name: str, site: Path) -> subprocess.CompletedProcess[str]:
     """Start the program of a package beside this dxlrun."""
     code = {
@@ -101,7 +125,7 @@ def started(name: str, site: Path) -> subprocess.CompletedProcess[str]:
 def test_a_package_refuses_another_version_of_dxlrun(
     name: str, wheels: dict[str, Path], tmp_path: Path
 ) -> None:
-    shutil.unpack_archive(wheels[name], tmp_path, "zip")  # as pip installs a wheel
+    assert pip_install(wheels[name], tmp_path, "--no-deps").returncode == 0
     ran = started(name, tmp_path)
     own, dashed = core_version(), name.replace("_", "-")
     assert ran.returncode == 2, ran.stderr
@@ -114,7 +138,7 @@ def test_a_package_refuses_another_version_of_dxlrun(
 def test_a_package_of_the_same_version_starts(tmp_path: Path) -> None:
     copy = tree(tmp_path / "tree", core_version())
     wheel = hatchling(copy / "plugins/dxlrun_view", "wheel", tmp_path / "dist")
-    shutil.unpack_archive(wheel, tmp_path / "site", "zip")
+    assert pip_install(wheel, tmp_path / "site", "--no-deps").returncode == 0
     ran = started("dxlrun_view", tmp_path / "site")
     assert ran.returncode == 2
     assert "nothing.mcap" in ran.stderr
