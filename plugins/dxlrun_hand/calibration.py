@@ -18,6 +18,7 @@ from dxlrun.description.document import KeyPath
 from dxlrun.description.reading import Replacement
 from dxlrun.description.units import distance_text
 from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -68,12 +69,12 @@ class HandJoint:
         """Raises ServoFault where its servo does not answer, is another model, or counts otherwise."""
         self.name, self.servo = servo.joint, servo
         self._label = plan.label(servo)
+        self._port = plan.port
         search = Search((plan.protocol,), (plan.baud_rate,), (servo.servo_id,))
         found = find(tool, servo.servo_id, search)
         if not found:
-            raise ServoFault(
-                f"{self._label} does not answer at {plan.baud_rate} bit/s: check cable and power"
-            )
+            remedy = choose_remedy(plan.port, CHECK)
+            raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s: {remedy}")
         self._one = OneServo(tool, found[0])
         self.table: ControlTable = self._one.table
         if self.table.model_number != servo.model_number:
@@ -136,7 +137,8 @@ class HandJoint:
         try:
             return self._one.read(["present_position"])["present_position"]
         except ServoFault:
-            raise ServoFault(f"{self._label} does not answer any more: check cable and power") from None
+            remedy = choose_remedy(self._port, CHECK)
+            raise ServoFault(f"{self._label} does not answer any more: {remedy}") from None
 
 
 def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:

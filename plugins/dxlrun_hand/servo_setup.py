@@ -11,6 +11,7 @@ from dxlrun.description.reading import Description
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
+from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.registers import compare, merged
@@ -102,7 +103,8 @@ class SetUp:
             self.dialogue.say("  not at its usual rates; every other one is tried, which takes half a minute")
             found = scan(tool).servos
         if not found:
-            raise ServoFault(f"No servo answers at {tool.port.name}: check its power and its cable.")
+            remedy = choose_remedy(tool.port.name, "check its power and its cable")
+            raise ServoFault(f"No servo answers at {tool.port.name}: {remedy}.")
         one = found[0]
         if len(found) > 1 or one.garbled:
             shown = [f"ID {each.servo_id} at {each.baud_rate} bit/s" for each in found]

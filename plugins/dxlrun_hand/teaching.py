@@ -182,9 +182,7 @@ class Teaching:
         ages = states.age_ns[rows].tolist()
         for joint, age_ns in zip(self._taught.joints, ages, strict=True):
             if not 0 <= age_ns <= LONGEST_AGE_NS:
-                raise ServoFault(
-                    f"{joint} does not answer any more: check cable and power; nothing was saved"
-                )
+                raise ServoFault(f"{joint} does not answer any more; nothing was saved")
         return states.time_ns * 1e-9, states.position[rows]
 
     def _positions(self) -> str:

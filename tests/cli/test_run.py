@@ -28,6 +28,7 @@ from dxlrun.channels.events import (
 )
 from dxlrun.errors import PortError
 from dxlrun.log.reader import read_log
+from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
@@ -145,6 +146,44 @@ def test_a_bad_run_prints_the_reason_on_stderr(
         "bioloid_torso: no real-time priority",
         "bioloid_torso: servo 3 does not answer",
     ]
+
+
+BUSY = MachineLoad(6.0, busy_s=5.2, no_idle_core_s=5.2)
+MACHINE = "The machine was too busy: no core was idle in 5.2 of 6 s. End other programs, or use --virtual."
+
+
+@pytest.mark.parametrize("skipped", [0, 2])
+def test_busy_machine_is_the_first_sentence_about_a_run_that_it_disturbed(
+    dxlrun: Callable, runs: Runs, torso: Path, skipped: int
+):
+    runs.answer = RunSummary(0, "ended", 100, skipped, 2.0, (), invalid=(0,) * 8, run_load=BUSY)
+
+    lines = dxlrun(torso).out.splitlines()
+
+    assert (lines[1] == f"  {MACHINE}") is bool(skipped)
+    assert ("The machine" in "".join(lines)) is bool(skipped)
+
+
+def test_wait_for_simulated_servos_names_the_machine(dxlrun: Callable, runs: Runs, torso: Path):
+    wait = SimulationWait(210_000_000, 3)
+    runs.answer = RunSummary(0, "ended", 100, 3, 2.0, (), simulation_wait=wait)
+
+    assert dxlrun(torso).out.splitlines()[1] == (
+        "  The machine was too busy: the loop waited 3 times, 0.21 s in all, for the process of the "
+        "simulated servos, which did not run. End other programs, or use --virtual."
+    )
+
+
+def test_busy_machine_comes_before_the_servos_that_refused_a_start(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(1, "start-up", 0, 0, 0.1, ("no servo answers",), start_up_load=BUSY)
+
+    assert dxlrun(torso).errors[1:] == [f"bioloid_torso: {MACHINE}", "bioloid_torso: no servo answers"]
+
+
+def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(0, "ended", 100, 1, 2.0, (), run_load=BUSY)
+
+    assert dxlrun(torso, "port:=/dev/ttyUSB0").out.splitlines()[1].endswith(" s. End other programs.")
 
 
 def test_a_run_without_a_cycle_suggests_no_analysis(dxlrun: Callable, runs: Runs, torso: Path):

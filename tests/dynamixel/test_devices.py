@@ -326,8 +326,7 @@ def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence
     assert str(caught.value).splitlines() == [
         "device_0 (ID 101 on bus main) answers with model number 1060, which is that of XL430-W250, and that "
         "of generic is 65000: correct `model` or the ID",
-        "device_1 (ID 102 on bus main) does not answer: check power, cable, ID, and that it runs at 1000000 "
-        "bit/s",
+        "device_1 (ID 102 on bus main) does not answer: check its ID, and that it runs at 1000000 bit/s",
     ]
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
+from dxlrun.dynamixel.port.latency_timer import is_timer
+from dxlrun.dynamixel.port.remedies import late_replies
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.log.reader import Log
 from dxlrun.plan.transaction import BROADCAST_ID

@@ -149,13 +149,14 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     robot = plan.robot
     for remark in summary.remarks:
         print_warning(f"{robot}: {remark}")
-    for sentence in summary.sentences:
-        print_error(f"{robot}: {sentence}")
     from dxlrun.run.run_summary import run_verdict
 
+    machine = summary.describe_machine(plan) if summary.sentences else ""
+    for sentence in filter(None, (machine, *summary.sentences)):
+        print_error(f"{robot}: {sentence}")
     verdict = run_verdict(summary, plan)
     lines = [f"{robot}: {_WORDS.get(verdict.exit_code, 'failed')}: {verdict.line}"]
-    lines += [f"  {sentence}" for sentence in verdict.sentences]
+    lines += [f"  {sentence}" for sentence in verdict.sentences if sentence != machine]
     if summary.log is not None:
         lines.append(_log_line(Path(summary.log), summary.messages))
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)

@@ -142,7 +142,9 @@ class JointRequests:
         if not lost:
             return None
         reboots = all(torque[rows[joint]] == Torque.REBOOTING for joint in lost)
-        hint = "it reboots as requested: try again when it is back" if reboots else "check cable and power"
+        hint = "try again when it is back; it is probed once a second"
+        if reboots:
+            hint = "it reboots as requested: try again when it is back"
         return Refusal(Code.JOINT_LOST, {"joint": lost, "servo": self._labels(lost), "hint": hint})
 
     def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:

@@ -21,6 +21,7 @@ from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelGoa
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.retry import limit_patience, pause
 from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
 from dxlrun.dynamixel.servo.life import Done
@@ -465,6 +466,10 @@ class DynamixelHardware:
             self._start_up.raise_failures()
             if not any(servos.silent for servos in self._servos):
                 break
-        silent = [name for servos in self._servos for name in servos.silent]
-        if silent:
-            raise StartUpError(f"{', '.join(silent)} did not answer {when}: check cable and power")
+        problems = [
+            f"{', '.join(servos.silent)} did not answer {when}: {choose_remedy(plan.port, CHECK)}"
+            for plan, servos in zip(self._plans, self._servos, strict=True)
+            if servos.silent
+        ]
+        if problems:
+            raise StartUpError("\n".join(problems))

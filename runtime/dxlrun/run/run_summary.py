@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from dxlrun.channels.events import EventCode, EventGroup, EventTotals
+from dxlrun.dynamixel.port.remedies import free_machine
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
@@ -90,11 +91,12 @@ class RunSummary(msgspec.Struct, frozen=True):
     simulation_wait: SimulationWait = SimulationWait()
     """Time for which the loop waited for simulated servos that had no processor."""
 
-    @property
-    def machine(self) -> str:
-        """Sentence about a machine that was too busy for this run; empty when it was not."""
+    def describe_machine(self, plan: Plan) -> str:
+        """Return the sentence about a machine that was too busy for this run; empty when it was not."""
         load = self.run_load if self.cycles else self.start_up_load
-        return describe_busy_machine(load, self.simulation_wait)
+        observed = describe_busy_machine(load, self.simulation_wait)
+        remedy = free_machine(bus.port for bus in plan.buses)
+        return observed and f"{observed} {remedy[0].upper()}{remedy[1:]}."
 
 
 @contextmanager
@@ -163,8 +165,8 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append("The states of all joints were valid in every cycle.")
     unreached = list(find_unreached_goals(loop, events.goals, ran_ns))
     sentences += [f"{'; '.join(filter(None, (one.sentence, one.remedy)))}." for one in unreached[:_MOST]]
-    if run.machine and (errors or often or run.skipped):
-        sentences.insert(0, run.machine)
+    if errors or often or run.skipped:
+        sentences[:0] = filter(None, (run.describe_machine(plan),))
     failed = errors or often or not kept or any(one.failed for one in unreached)
     exit_code = 1 if failed or (unreached and not run.exit_code) else run.exit_code
     return RunVerdict(exit_code, f"{'; '.join(happened)}.", tuple(sentences))

@@ -10,6 +10,7 @@ from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.plan.bus_plan import BusPlan, DevicePlan
 from dxlrun.plan.transaction import Outcome, Program
 
@@ -40,13 +41,19 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
     """Return what is wrong with a device, behind its name; empty: it is in order."""
     reply = yield from retry(line.ping(device.servo_id))
     if reply.outcome is Outcome.TIMEOUT:
-        return f"does not answer: check power, cable, ID, and that it runs at {plan.baud_rate} bit/s"
+        rate = f"that it runs at {plan.baud_rate} bit/s"
+        remedy = choose_remedy(
+            plan.port, f"check power, cable, ID, and {rate}", simulated=f"check its ID, and {rate}"
+        )
+        return f"does not answer: {remedy}"
     if reply.outcome is Outcome.GARBLED:
-        return "answers garbled or twice: does something else have its ID? If not, check its cable"
+        remedy = choose_remedy(plan.port, " If not, check its cable", simulated="")
+        return f"answers garbled or twice: does something else have its ID?{remedy}"
     if device.model_number is not None:
         reply = yield from retry(line.read(device.servo_id, *_MODEL_NUMBER))
         if not reply.answered:
-            return "answers pings, but its model number cannot be read: check its cable and its firmware"
+            remedy = choose_remedy(plan.port, "check its cable and its firmware")
+            return f"answers pings, but its model number cannot be read: {remedy}"
         if (number := reply.word()) != device.model_number:
             return (
                 f"answers with model number {number}{_known(number, plan.protocol)}, and that of "

@@ -50,28 +50,6 @@ def is_timer(extra_ns: float) -> bool:
     return SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS
 
 
-def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> tuple[str, str]:
-    """Return a sentence for replies that an adapter keeps back longer than planned, and what shortens it.
-
-    Both are without their full stops; the second is empty where nothing is known.
-
-    `extra_ns`: how much later than wire and return delay they come. What looks like the timer of an FTDI
-    adapter as it is shipped is named with the command that shortens it.
-    """
-    told = (
-        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and "
-        f"{planned_ns / 1e6:g} ms were planned for the adapter"
-    )
-    if not is_timer(extra_ns):
-        return told, ""
-    if is_simulated(port):
-        return f"{told}: that is what a latency timer of 16 ms does", ""
-    name = Path(port).name
-    device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
-    command = fix(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
-    return f"{told}: that is a latency timer of 16 ms", f"`{command}` shortens it"
-
-
 def timer_ms(place: Path) -> int | None:
     """Return what the Linux kernel shows at a place, ms; None: no number, or it may not be read."""
     try:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.description.bus import SIMULATED
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import (
     ControlItem,
@@ -28,6 +29,7 @@ from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import servo_read
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
+from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.registers import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import describe_error
@@ -44,7 +46,6 @@ STATUS_ERROR = "status_error"
 _IDENTITY = ("model_number", "firmware_version")
 _MODES = {"operating_mode", "control_mode"}
 _MOST_NAMED = 4  # Servos that a sentence about several names
-_SIMULATED = "sim"
 
 
 class Inspected(msgspec.Struct, frozen=True):
@@ -300,7 +301,7 @@ def _inspected(model: str, protocol: float) -> tuple[tuple[str, ...], tuple[str,
 def _refusal(one: Access, found: FoundDeviation) -> str:
     item = found.item
     command = f"dxlrun servo {one.plan.port} {one.servo.servo_id} set {item.name} {found.factory}"
-    how = "" if one.plan.port == _SIMULATED else f" (`{command}`)"
+    how = "" if one.plan.port == SIMULATED else f" (`{command}`)"
     return f"has {item.title} = {found.found}, which {found.effect}: write {found.factory} there{how}"
 
 
@@ -315,7 +316,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
             if not reply.answered:
                 problem = "answers the reading of its state garbled: do two servos have its ID?"
                 if reply.outcome is Outcome.TIMEOUT:
-                    problem = "does not answer any more: check cable and power"
+                    problem = f"does not answer any more: {choose_remedy(one.plan.port, CHECK)}"
             else:
                 raw = servo.state.position.tick(reply.parameters)
                 if again and servo.servo_id in before:
@@ -355,7 +356,8 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
     elif answered == 0:
         return None
     elif answered < PINGS - 1:
-        problem = f"answers only {answered} of {PINGS} pings: check its cable and power"
+        remedy = choose_remedy(one.plan.port, CHECK)
+        problem = f"answers only {answered} of {PINGS} pings: {remedy}"
     if problem:
         found.problems.append(f"{one} {problem}")
     return not problem
@@ -363,34 +365,37 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
 
 def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
     """Return one sentence about all servos of a bus that do not answer, with the command that looks."""
-    look = "" if plan.port == _SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
-    check = f"that it runs at {plan.baud_rate} bit/s{look}"
+    look = "" if plan.port == SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
+    rate = f"that it runs at {plan.baud_rate} bit/s{look}"
     if len(silent) == 1:
-        return f"{plan.label(silent[0])} does not answer: check power, cable, ID, and {check}"
+        remedy = choose_remedy(
+            plan.port, f"check power, cable, ID, and {rate}", simulated=f"check its ID, and {rate}"
+        )
+        return f"{plan.label(silent[0])} does not answer: {remedy}"
     named = [f"{servo.own_name} (ID {servo.servo_id})" for servo in silent[:_MOST_NAMED]]
     more = ", ".join(str(servo.servo_id) for servo in silent[_MOST_NAMED:])
     names = ", ".join(named) + (f" and those with the IDs {more}" if more else "")
     if len(silent) == len(plan.servos):
-        return (
-            f"none of the {len(silent)} servos on bus {plan.name} answers: check its power, cable and port, "
-            f"and {check}: {names}"
+        remedy = choose_remedy(
+            plan.port, f"check its power, cable and port, and {rate}", simulated=f"check {rate}"
         )
-    return (
-        f"{len(silent)} servos on bus {plan.name} do not answer: {names}: check power, cables, IDs, "
-        f"and {check}"
+        return f"none of the {len(silent)} servos on bus {plan.name} answers: {remedy}: {names}"
+    remedy = choose_remedy(
+        plan.port, f"check power, cables, IDs, and {rate}", simulated=f"check the IDs, and {rate}"
     )
+    return f"{len(silent)} servos on bus {plan.name} do not answer: {names}: {remedy}"
 
 
 def _unreadable(one: Access, title: str, reply: Reply) -> str:
     """Return why a servo that answered its pings could not be read. Silence says nothing about a register."""
     if reply.outcome is Outcome.TIMEOUT:
-        return (
-            f"answered pings, but did not answer {ATTEMPTS} reads of {title}: check its cable and power, and "
-            f"its {one.items['status_return_level'].title}"
-        )
+        level = one.items["status_return_level"].title
+        remedy = choose_remedy(one.plan.port, f"{CHECK}, and its {level}")
+        return f"answered pings, but did not answer {ATTEMPTS} reads of {title}: {remedy}"
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read{one.reason(reply)}"
-    return "answers reads garbled: do two servos have its ID? If not, check cable and ground"
+    remedy = choose_remedy(one.plan.port, " If not, check cable and ground", simulated="")
+    return f"answers reads garbled: do two servos have its ID?{remedy}"
 
 
 def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:

@@ -15,6 +15,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, limit_patience, retry
+from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access
 from dxlrun.dynamixel.servo.checks import inspect, inspect_states
@@ -30,7 +31,6 @@ FIRST_PROBE_NS = 200_000_000
 """The first time a little earlier: most losses are a loose plug or a boot, which is over by then."""
 REBOOT_NS = 3_000_000_000
 """How long a servo that a client rebooted may take until it is in order again [i]."""
-_GARBLED = "answers garbled or twice: do two servos have its ID? If not, check its cable"
 
 
 class Offline:
@@ -71,8 +71,9 @@ class Offline:
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
             if loss.reboot is not None and loss.reboot.until_ns <= now:
-                text = f"did not come back within {REBOOT_NS * 1e-9:g} s after its reboot: check its cable"
-                self._answer(index, loss, f"{text} and power; it is probed until it is in order")
+                text = f"did not come back within {REBOOT_NS * 1e-9:g} s after its reboot"
+                remedy = choose_remedy(self.life.plan.port, CHECK)
+                self._answer(index, loss, f"{text}: {remedy}; it is probed until it is in order")
 
     def switch_off(self, index: int, done: Done) -> None:
         """Switch the torque of a RELEASED servo off in the coming idle time."""
@@ -102,7 +103,10 @@ class Offline:
         reply = yield one.line.ping(one.servo.servo_id)
         if reply.answered and (read := self.reboots.read(index)) is not None:
             reply = yield from retry(read)
-        problem = _GARBLED if reply.outcome is Outcome.GARBLED else ""
+        problem = ""
+        if reply.outcome is Outcome.GARBLED:
+            remedy = choose_remedy(life.plan.port, " If not, check its cable", simulated="")
+            problem = f"answers garbled or twice: do two servos have its ID?{remedy}"
         if reply.outcome not in (Outcome.TIMEOUT, Outcome.GARBLED):
             found = Findings()
             torqued, mode = yield from self._rejoin(index, reply, found)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.plan.retry import retry
+from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
@@ -149,9 +150,8 @@ class Reboots:
                 return
         text = "started anew: it was without power, or something rebooted it"
         if self._counts[index].add(life.now_ns()):
-            text += (
-                "; it rebooted twice within a minute, so no policy gives it torque again: check its supply"
-            )
+            remedy = choose_remedy(life.plan.port, "check its supply")
+            text += f"; it rebooted twice within a minute, so no policy gives it torque again: {remedy}"
         life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
 
     def exhausted(self, index: int) -> bool:

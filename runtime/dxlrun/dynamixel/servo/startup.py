@@ -24,7 +24,7 @@ from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
 from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, limit_patience, retry, setup_line
-from dxlrun.dynamixel.port.latency_timer import late_replies
+from dxlrun.dynamixel.port.remedies import choose_remedy, describe_late_start
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, first_reach, reach
 from dxlrun.dynamixel.servo.checks import survey
@@ -168,8 +168,8 @@ class StartUp:
         for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
-                what, fix = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
-                yield f"every servo answers too late: {'; '.join(filter(None, (what, fix)))}"
+                observed = describe_late_start(plan.name, plan.port, late_ns, plan.latency_ns)
+                yield f"the loop would miss most replies: {observed}"
 
 
 def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
@@ -226,9 +226,10 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
         if not reply.answered:
             found.problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
         elif reply.parameters[0] != 1:
+            remedy = choose_remedy(plan.port, "is its supply strong enough?")
             found.problems.append(
                 f"{plan.label(servo)} lost its torque again while the others got theirs (Torque Enable "
-                f"({servo.torque_address}) is {reply.parameters[0]}): is its supply strong enough?"
+                f"({servo.torque_address}) is {reply.parameters[0]}): {remedy}"
             )
 
 

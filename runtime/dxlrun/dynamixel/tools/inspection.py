@@ -17,6 +17,7 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
+from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
@@ -210,8 +211,9 @@ def _identify(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity,
 def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
     name = plan.label(servo)
     if not reply.answered:
+        remedy = choose_remedy(plan.port, "check power, cable, and ID", simulated="check its ID")
         how = (
-            f"does not answer at {plan.baud_rate} bit/s: check power, cable, and ID"
+            f"does not answer at {plan.baud_rate} bit/s: {remedy}"
             if reply.outcome is Outcome.TIMEOUT
             else "answers garbled: do two servos have its ID?"
         )

@@ -19,6 +19,7 @@ from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
 from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line, listen
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
+from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.plan.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
@@ -126,7 +127,7 @@ def find(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[Fo
 def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
     knocked = _knock(tool, servo_id, tries)
     if (yield from (extend_timeouts(knocked) if tries == _TRIES_ALONE else knocked)):
-        return [(yield from extend_timeouts(look(tool.line, servo_id)))]
+        return [(yield from extend_timeouts(look(tool.line, servo_id, tool.port.name)))]
     return []
 
 
@@ -158,7 +159,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []
     for servo_id in sorted(there):
-        found.append((yield from extend_timeouts(look(line, servo_id))))
+        found.append((yield from extend_timeouts(look(line, servo_id, tool.port.name))))
     return found
 
 
@@ -205,14 +206,14 @@ def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
     return ping, (yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH, MOST_SPARE)))
 
 
-def look(line: Line, servo_id: int) -> Program[FoundServo]:
-    """Read the model and settings of a servo that is there; writes nothing."""
+def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
+    """Read the model and settings of a servo that is there, on a port of this name; writes nothing."""
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
     ping, reply = yield from identity(line, servo_id)
     if not reply.answered:
         garbled = Outcome.GARBLED in (ping.outcome, reply.outcome)
-        return replace(servo, garbled=garbled, remarks=(_mute(ping, reply, line),))
+        return replace(servo, garbled=garbled, remarks=(_mute(ping, reply, line, port),))
     number, firmware = reply.word(), reply.parameters[2]
     remarks = [dialect.describe_error(reply.error)] if reply.error else []
     table = next(iter(models_by_number(number, dialect.PROTOCOL, firmware)), None)
@@ -220,7 +221,9 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     if table is None and device is not None:
         known = replace(servo, model=device.model, model_number=number, firmware=firmware, device=True)
         return (
-            yield from _look_closer(line, device.items, device.spare, replace(known, remarks=tuple(remarks)))
+            yield from _look_closer(
+                line, device.items, device.spare, replace(known, remarks=tuple(remarks)), port
+            )
         )
     if table is None:
         remarks.append(f"no control table has its model number {number}: a plug-in can add one")
@@ -228,7 +231,7 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     if reply.error and (named := (yield from _hardware_error(line, servo_id, table))):
         remarks = [named]
     servo = replace(servo, model=table.model, model_number=number, firmware=firmware, remarks=tuple(remarks))
-    return (yield from _look_closer(line, table.items, table.spare, servo))
+    return (yield from _look_closer(line, table.items, table.spare, servo, port))
 
 
 def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[str]:
@@ -243,7 +246,11 @@ def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[s
 
 
 def _look_closer(
-    line: Line, table: Mapping[str, ControlItem], spare: Callable[[int, int], int], servo: FoundServo
+    line: Line,
+    table: Mapping[str, ControlItem],
+    spare: Callable[[int, int], int],
+    servo: FoundServo,
+    port: str,
 ) -> Program[FoundServo]:
     """Read what a robot file needs, and find two servos of one ID: their positions differ."""
     values: dict[str, int] = {}
@@ -261,9 +268,11 @@ def _look_closer(
         garbled = garbled or reply.outcome is Outcome.GARBLED or bool(reply.strays)
     remarks = list(servo.remarks)
     if garbled:
-        remarks.append("answers garbled now and then: do two servos have this ID? If not, check its cable")
+        remedy = choose_remedy(port, " If not, check its cable", simulated="")
+        remarks.append(f"answers garbled now and then: do two servos have this ID?{remedy}")
     elif silent:
-        remarks.append(f"did not answer {ATTEMPTS} reads of {', '.join(silent)}: check its cable and power")
+        remedy = choose_remedy(port, CHECK)
+        remarks.append(f"did not answer {ATTEMPTS} reads of {', '.join(silent)}: {remedy}")
     lowest, highest = next((pair for pair in _LIMITS if pair[0] in values and pair[1] in values), ("", ""))
     delay = values.get("return_delay_time")
     return replace(
@@ -277,14 +286,13 @@ def _look_closer(
     )
 
 
-def _mute(ping: Reply, reply: Reply, line: Line) -> str:
+def _mute(ping: Reply, reply: Reply, line: Line, port: str) -> str:
     if Outcome.GARBLED in (ping.outcome, reply.outcome):
-        return "answers garbled: do two servos have this ID? If not, check cable and ground"
+        remedy = choose_remedy(port, " If not, check cable and ground", simulated="")
+        return f"answers garbled: do two servos have this ID?{remedy}"
     if not ping.answered:
-        return "answered once, and then no more: check its cable and power"
+        return f"answered once, and then no more: {choose_remedy(port, CHECK)}"
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
-    return (
-        f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: check its cable and "
-        "power, and its Status Return Level (16)"
-    )
+    remedy = choose_remedy(port, f"{CHECK}, and its Status Return Level (16)")
+    return f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: {remedy}"
