@@ -116,7 +116,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
     assert "has ID 9; it had 1" in servo(1, "id", "9", "--yes", *NEW).out
     assert "talks at 2000000 bit/s; it did at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
     fast = ("--protocol", "2.0", "--baud", "2000000")
-    assert "started anew, and holds no torque" in servo(9, "reboot", *fast).out
+    assert "started anew, and is limp" in servo(9, "reboot", *fast).out
     reset = servo(9, "factory-reset", "--except", "id", "--yes", *fast)
     assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
     missing = servo(9, "get", *fast)
@@ -155,7 +155,7 @@ def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):
     assert refused.code == 1
     assert "holds torque, so ID (7) in its EEPROM was not written: switch the torque off" in refused.err
     assert "holds torque: its torque goes off" in servo(1, "reboot", *NEW).err
-    assert "holds no torque" in servo(1, "torque", "off", *NEW).out
+    assert "is limp" in servo(1, "torque", "off", *NEW).out
     assert "blinked 1 times" in servo(1, "blink", "1", *NEW).out
 
 

@@ -49,7 +49,7 @@ def test_a_row_has_the_state_of_a_servo():
         *("ID", "model", "torque", "goal", "deg", "present", "deg", "degC", "V", "errors", "asked", "replies")
     ]
     assert first.split() == ["1", "XL430-W250", "on", "180.0", "90.0", "31", "11.9", "-", "101", "1"]
-    assert second.split() == ["2", "XL430-W250", "-", "-", "90.0", "31", "11.9", "0x20", "102", "2"]
+    assert second.split() == ["2", "XL430-W250", "limp", "-", "90.0", "31", "11.9", "0x20", "102", "2"]
 
 
 def test_eighty_columns_hold_it_whole():

@@ -273,18 +273,18 @@ def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: Rem
     assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
     limp = "bioloid_torso: head_yaw_joint is limp; deactivated head\n"
     assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
-    assert torso.get("head_yaw_joint")["torque"] == "released"
+    assert torso.get("head_yaw_joint")["torque"] == "limp"
     assert torso.get("head_pitch_joint")["torque"] == "on"
     assert not controllers(torso)["head"]["active"]
     said = dxlrun("switch", "--activate", "head")
     assert (said.code, said.out) == (1, "")
     assert (
-        "head_yaw_joint (ID 21 on bus main) has no torque; `dxlrun torque on head_yaw_joint` gives it"
+        "head_yaw_joint (ID 21 on bus main) is limp; `dxlrun torque on head_yaw_joint` gives it torque"
         in said.err
     )
     said = dxlrun("get", "head_yaw_joint")
     assert (said.code, said.err) == (0, "")
-    assert re.search(r"torque +released", said.out)
+    assert re.search(r"torque +limp", said.out)
     assert dxlrun("torque", "off", "head_pitch_joint").out == "bioloid_torso: head_pitch_joint is limp\n"
     said = dxlrun("torque", "on", "head_yaw_joint")  # head has another limp joint, and would be refused
     assert said.out == "bioloid_torso: head_yaw_joint has torque\n"

@@ -127,8 +127,8 @@ def test_twenty_joints_fit_into_a_small_terminal() -> None:
     assert lines[0].startswith("humanoid: 50 Hz (50.0), cycle 150, late 0.30 ms (max 0.30), 2 skipped")
     rows = [line for line in lines if line.startswith("left_shoulder")]
     assert len(rows) == 20
-    assert [row.split()[-1] for row in rows[:2]] == ["on", "released"]
-    assert rows[2].endswith(("off error 0x20", "off error 0x…", "off error…", "off er…"))
+    assert [row.split()[-1] for row in rows[:2]] == ["on", "limp"]
+    assert rows[2].endswith(("limp error 0x20", "limp error 0…", "limp error…", "limp er…"))
     assert "active: arm_pid, arm" in lines[22]
     assert "s ago, arm: something happened" in lines[23]
 
@@ -158,7 +158,7 @@ def test_a_pipe_gets_one_snapshot(shown: Any) -> None:
         "28.6",
         "0.12 A",
         "57.3/s",
-        "off error 0x20",
+        "limp error 0x20",
         "lost",
         "on silent",
         "arm_pid",

@@ -292,7 +292,7 @@ def test_fallback_of_a_limp_joint_leaves_the_fault_to_the_next_fallback_or_to_th
         story.record.states.torque[story.names.index(joint)] = Torque.OFF
     story.run(8, {3: story.breaks("lower")})
     refused = [text.split(";")[0] for text in story.events.texts(EventCode.COMMAND_REFUSED)]
-    both = ["near does not take over: j0 has no torque", "far does not take over: j1 has no torque"]
+    both = ["near does not take over: j0 is limp", "far does not take over: j1 is limp"]
     assert refused == both[: len(limp)]
     story.ends(*(["far"] if len(limp) == 1 else []), reason="ended" if len(limp) == 1 else "fault")
 

@@ -371,7 +371,7 @@ def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcom
     goal = Goals(record, events, joints, lambda controller: Commanded(("j0",))).accept("arm", "move", "anna")
     goal.end(Outcome.MISSED, "", "j0", 0.2)
     assert goal.outcome == outcome
-    assert ("j0 has no torque" in seen[-1][3]) is (outcome == "aborted")
+    assert ("j0 is limp" in seen[-1][3]) is (outcome == "aborted")
 
 
 # Live parameters
@@ -609,7 +609,7 @@ def test_what_comes_later_takes_the_place_of_a_motion(story, other):
 def test_a_played_motion_of_a_limp_joint_is_aborted(story):
     story.run(12, {2: plays(story, LEG, ARM), 4: story.torque(Torque.OFF, row=1)})
     ended = {one.controller: (one.status, one.text) for _, one in story.reports}
-    limp = "joint j1 has no torque: it was reset, its torque was cut, or it shut itself down"
+    limp = "joint j1 is limp: it was reset, its torque was cut, or it shut itself down"
     assert ended["leg"] == ("aborted", f"{limp}; all commands were given")
     assert ended["arm"][0] == "reached"
 

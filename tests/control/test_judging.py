@@ -86,8 +86,8 @@ def test_a_lost_reply_at_the_end_of_a_motion_does_not_end_a_goal_without_settlin
     ("joints", "outcome", "text"),
     [
         (["a"], "missed", "goal 1 missed: too slow"),
-        (["a", "b"], "aborted", "goal 1 aborted: joint b has no torque: it was switched off; too slow"),
-        (None, "aborted", "goal 1 aborted: joint b has no torque: it was switched off; too slow"),
+        (["a", "b"], "aborted", "goal 1 aborted: joint b is limp: its torque was switched off; too slow"),
+        (None, "aborted", "goal 1 aborted: joint b is limp: its torque was switched off; too slow"),
     ],
 )
 def test_a_limp_joint_aborts_only_the_missed_goals_that_move_it(joints, outcome, text):

@@ -183,7 +183,7 @@ def test_a_reboot_is_waited_for():
     rig = Rig()
     rig.servo.boot_ns = 1_500_000_000
     rig.servo.poke("position_p_gain", 3)
-    assert one_servo.reboot(rig.one) == "started anew, and holds no torque"
+    assert one_servo.reboot(rig.one) == "started anew, and is limp"
     assert rig.servo.registers["position_p_gain"] == 800
 
 
@@ -252,7 +252,7 @@ def test_torque_comes_where_the_servo_stands(model, protocol):
     assert rig.servo.torque_on
     assert rig.servo.position == pytest.approx(before, abs=0.01)
     assert rig.one.torque(True) == ("holds torque, as before",)
-    assert rig.one.torque(False) == ("holds no torque",)
+    assert rig.one.torque(False) == ("is limp",)
     assert not rig.servo.torque_on
 
 
@@ -386,7 +386,7 @@ def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_sh
     trip(rig, 0)
     done = rig.one.write([rig.one.register("position_p_gain", 500)])
     assert done == ("Position P Gain (84) was 800 and is 500",)
-    assert rig.one.torque(False) == ("holds no torque, as before",)
+    assert rig.one.torque(False) == ("is limp, as before",)
     assert rig.servo.registers["bus_watchdog"] == 255
 
 

@@ -153,7 +153,7 @@ def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died
     rig.cycles(20)
     rig.servo(1).poke("bus_watchdog", -1)
     said = stand(rig.lines)
-    assert "has no torque, as did not acknowledge its goal" in said[0]
+    assert "is limp, as did not acknowledge its goal" in said[0]
     assert rig.torque() == [False, True]
 
 
@@ -173,7 +173,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
     rig.ports.ports[0].write = lose_the_first
     said = stand(rig.lines)
     assert lost
-    assert "main_1_joint (ID 1 on bus main) has no torque, as " in said[-1]
+    assert "main_1_joint (ID 1 on bus main) is limp, as " in said[-1]
     assert rig.torque()[0] is False
 
 

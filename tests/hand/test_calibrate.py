@@ -211,7 +211,7 @@ def test_after_ctrl_c_at_each_step_the_file_is_as_it_was(
     with pytest.raises(KeyboardInterrupt):
         arm.do(*steps, joints=("elbow",))
     assert arm.path.read_bytes() == arm.before
-    limp = "" if at in ("hold", "Write") else "without torque now: elbow\n"
+    limp = "" if at in ("hold", "Write") else "limp now: elbow\n"
     assert capsys.readouterr().err == f"{limp}{arm.path} is as it was\n"
     assert [path.name for path in arm.path.parent.iterdir()] == ["arm.yaml"]
 

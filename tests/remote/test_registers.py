@@ -109,7 +109,7 @@ def test_a_joints_state_is_answered(arm):
     arm.finish_cycle()
     status, content = arm.ask("GET", "/joints/tilt")
     assert status == 200
-    assert (content["joint"], content["position"], content["torque"]) == ("tilt", 0.25, "released")
+    assert (content["joint"], content["position"], content["torque"]) == ("tilt", 0.25, "limp")
     assert (content["effort_unit"], content["velocity"]) == ("A", None)
 
 

@@ -418,4 +418,4 @@ controllers:
     text, ended_ms = run(None)
     assert "reached" in text
     text, _ = run(ended_ms - before_ms)
-    assert re.match(r"goal 1 aborted: after .* s, joint a \(ID 1 on bus main\) has no torque", text)
+    assert re.match(r"goal 1 aborted: after .* s, joint a \(ID 1 on bus main\) is limp", text)

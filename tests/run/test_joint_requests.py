@@ -152,9 +152,8 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run):
     log = one.run()
     assert at == [0]
     assert 1 in given
-    assert (
-        one.answer(switch).text == "elbow (ID 2 on bus main) has no torque; `dxlrun torque on elbow` gives it"
-    )  # type: ignore[union-attr]  # a refusal
+    refused = "elbow (ID 2 on bus main) is limp; `dxlrun torque on elbow` gives it torque"
+    assert one.answer(switch).text == refused  # type: ignore[union-attr]
     assert isinstance(one.answer(on), Done)
     assert isinstance(one.answer(again), Done)
     assert one.torque(log, 1)[0] is Torque.RELEASED

@@ -273,7 +273,7 @@ def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_
     robot.robot.loop.events = events  # type: ignore[assignment]
     robot.run()
     assert servo.position < (HOME[3] - 20) * TICK
-    limp = "has no torque: it was reset, its torque was cut, or it shut itself down"
+    limp = "is limp: it was reset, its torque was cut, or it shut itself down"
     assert [text for text in said if "not reached" in text] == [
         "on_exit: pose home at 60 deg/s is not reached: joint pan "
         f"{limp if seen else 'is 0.352 rad off'}; now limp"

@@ -92,7 +92,7 @@ def calibrated(
 
 def _limp(hands: Sequence[HandJoint]) -> str:
     names = ", ".join(hand.name for hand in hands if hand.limp)
-    return names and f"without torque now: {names}"
+    return names and f"limp now: {names}"
 
 
 def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:

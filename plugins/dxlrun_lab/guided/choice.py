@@ -208,7 +208,7 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
     name, position = plan.name, now.position
     if now.torque not in TORQUED:
         raise ValueError(
-            f"joint {plan.label} has no torque ({now.torque}), so it cannot be moved; switch it on first: "
+            f"joint {plan.label} is {now.torque}, so it cannot be moved; switch its torque on first: "
             f"dxlrun torque on {name}"
         )
     if math.isnan(position):

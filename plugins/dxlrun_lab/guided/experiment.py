@@ -348,8 +348,7 @@ class _Stage:
         for joint in self.situation.joints:
             torque = now[joint.name].torque
             if torque not in TORQUED:
-                what = "was lost" if torque == "lost" else f"has no torque any more ({torque})"
-                return f"the servo of joint {joint.plan.label} {what}"
+                return f"joint {joint.plan.label} is {torque}"
         return None
 
     # Back

@@ -6,7 +6,7 @@ import { drawControllers } from "./controllers.js";
 
 const TOKEN = new URLSearchParams(location.search).get("token") ?? "";
 const LOOK_MS = 40, CURVES_MS = 100, SHOWN_MS = 500;
-const TORQUE = ["unknown", "on", "doubt", "off", "released", "lost", "rebooting", "given"];
+const TORQUE = ["unknown", "on", "doubt", "limp", "limp", "lost", "rebooting", "given"];
 const $ = (id) => document.getElementById(id);
 const deg = 180 / Math.PI;
 

@@ -103,7 +103,7 @@ class Code(StrEnum):
         "joint_commanded",
         "{joint}: commanded by {controller}; deactivate that first, or add --release",
     )
-    JOINT_LIMP = "joint_limp", "{servo} has no torque"
+    JOINT_LIMP = "joint_limp", "{servo} is limp"
     JOINT_LOST = "joint_lost", "{servo} does not answer"
     HARDWARE_ERROR = "hardware_error", "{servo} has a hardware error, and gets no torque"
     STILL_MOVING = (

@@ -96,14 +96,19 @@ class Torque(IntEnum):
     GIVEN = 7
     """It was just given torque where it is: the loop's goal becomes that, and its controllers start again."""
 
+    @property
+    def word(self) -> str:
+        """The state in every output; a joint without torque is `limp`, whatever the reason."""
+        return "limp" if self in LIMP else self.name.lower()
+
 
 LIMP = (Torque.OFF, Torque.RELEASED)
 """Joints that move freely."""
 OFFLINE = (Torque.LOST, Torque.REBOOTING)
 """Joints whose servos are not read."""
 _UNABLE = {
-    Torque.OFF: "has no torque: it was reset, its torque was cut, or it shut itself down",
-    Torque.RELEASED: "has no torque: it was switched off",
+    Torque.OFF: "is limp: it was reset, its torque was cut, or it shut itself down",
+    Torque.RELEASED: "is limp: its torque was switched off",
     Torque.LOST: "does not answer",
     Torque.REBOOTING: "is rebooting",
 }

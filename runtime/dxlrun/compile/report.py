@@ -191,7 +191,7 @@ _HELD = {
 
 _GROUP_ACTIONS = {
     "hold": "hold their controllers until it answers, the others go on",
-    "limp": "no torque for the group any more, the others go on",
+    "limp": "the group goes limp, the others go on",
     "stop": "end the run by on_fault",
 }
 

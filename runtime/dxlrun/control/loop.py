@@ -301,7 +301,7 @@ class Loop:
         for group in limp:
             for row in sorted(group.rows):
                 self.hardware.switch_torque(row, False, _unanswered)
-            text = f"group {group.name} lost a servo: it gets no torque until a client requests it"
+            text = f"group {group.name} lost a servo: it is limp until a client requests torque"
             self.events.emit(EventCode.POLICY, Severity.ERROR, "loop", text)
         for policy, rows in ending.items():
             names = ", ".join(self.plan.joints[row].name for row in rows)

@@ -70,7 +70,7 @@ def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig):
     ]
     assert refused(rig, "narrow", "limp", narrow=(10, 60)) == [
         "joint narrow is at 0 deg, outside of its --range; lead it inside first, or choose another",
-        "joint limp (ID 3 on bus main) has no torque (released), so it cannot be moved; switch it on first: "
+        "joint limp (ID 3 on bus main) is limp, so it cannot be moved; switch its torque on first: "
         "dxlrun torque on limp",
     ]
 

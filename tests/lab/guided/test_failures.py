@@ -47,7 +47,7 @@ def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage):
 
     _, done = stage.perform(rig, "elbow", segments)
     assert done.why in (
-        "the servo of joint elbow (ID 2 on bus main) was lost",
+        "joint elbow (ID 2 on bus main) is lost",
         "joint elbow has not answered for 100 ms",
     )
     assert [part.whole for part in done.recorded] == [True, False]

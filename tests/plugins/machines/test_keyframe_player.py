@@ -318,7 +318,7 @@ def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted():
     assert (goal.outcome, goal.judged) == (Outcome.REACHED, ["a"])
     goal = robot.ask("play", motion="alone")
     play(robot, 1.0, follow=False)
-    told = "joint b has no torque: it was switched off; played alone, without b for want of torque"
+    told = "joint b is limp: its torque was switched off; played alone, without b for want of torque"
     assert (goal.outcome, goal.text) == (Outcome.ABORTED, told)
 
 

@@ -43,7 +43,7 @@ class Stop(_Message, frozen=True, tag="stop"):
         except DxlrunError as error:
             robot.stop(wait=False)
             return Done(f"the run ends: torque off was refused ({error})")
-        return Done("STOP: torque is off, all joints are limp")
+        return Done("STOP: all joints are limp")
 
 
 class Halt(_Message, frozen=True, tag="halt"):

@@ -33,6 +33,8 @@ DRAWN_S = 3.0
 GAP_S = 1.0
 """Between two cycles that a curve does not join: no page looked, or the robot did not run."""
 _MOST_EVENTS = 400
+_TORQUE = {torque.word: torque for torque in reversed(Torque)}
+"""Numbers of the log by their words."""
 NOT_DRAWN = (EVENT_TOPIC, JOINT_STATES_TOPIC, "/goals")
 """Topics whose numbers are columns already, or none."""
 
@@ -256,7 +258,7 @@ def _of_joints(states: RobotStates) -> Iterator[Values]:
     """Yield the joints' columns as the log's cycles have them: mode and torque by their numbers."""
     special = {
         "mode": [Mode[name.upper()] for name in states.mode],
-        "torque": [Torque[name.upper()] for name in states.torque],
+        "torque": [_TORQUE[word] for word in states.torque],
     }
     for column in JOINT_COLUMNS:
         yield np.asarray(special.get(column, getattr(states, column)), np.float64)

@@ -272,7 +272,7 @@ def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
             *[servo.bus] * several,
             servo.id,
             servo.model,
-            "on" if servo.torque else "-",
+            "on" if servo.torque else "limp",
             None if servo.goal is None else math.degrees(servo.goal),
             math.degrees(servo.present),
             servo.temperature,

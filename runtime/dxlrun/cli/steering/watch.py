@@ -30,7 +30,7 @@ REFRESH_S = 0.2
 _RATE_S = 1.0
 """The rate is measured over this time."""
 _LONGEST_EVENTS = 200
-_TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "off": "warning"}
+_TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "limp": "warning"}
 
 
 @dataclass(slots=True)

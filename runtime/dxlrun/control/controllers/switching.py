@@ -212,7 +212,7 @@ class Switching:
         return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
 
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
-        """Refuse controllers for joints without torque: they would command what cannot move."""
+        """Refuse controllers for limp joints: they would command what cannot move."""
         limp: dict[str, str] = {}
         limp_rows: list[int] = []
         names: list[str] = []
@@ -226,7 +226,7 @@ class Switching:
         if not limp:
             return None
         named = list(limp) if len(limp) <= MOST_NAMED else names  # a controller stands for its joints
-        hint = f"`dxlrun torque on {' '.join(named)}` gives it"
+        hint = f"`dxlrun torque on {' '.join(named)}` gives it torque"
         outside = [self._joints[row].name for row in limp_rows if self._is_outside(row)]
         if outside:
             hint = f"move {' and '.join(outside)} inside the limits by hand, then {hint}"

@@ -142,7 +142,7 @@ class ServosTogether:
         names = " and ".join(self._labels[row] for row in limp)
         others = " and ".join(self._labels[row] for row in pulling)
         name = self._plan.couplings[index].name
-        text = f"{name}: {names} has no torque, so {others} loses its own: they move one mechanism"
+        text = f"{name}: {names} is limp, so {others} loses its torque: they move one mechanism"
         self._events.emit(EventCode.TORQUE_OFF, Severity.WARNING, name, text)
 
     def _spread(self, index: int, coupling: CouplingPlan) -> float:

@@ -192,7 +192,7 @@ class Offline:
         problem = "" if loss.rebooted else "answers, but did not start anew"
         if loss.reboot is not None and loss.reboot.had_torque and not (torqued or loss.released):
             joint = life.plan.servos[index].joint
-            problem = problem or f"is back without torque; `dxlrun torque on {joint}` gives it"
+            problem = problem or f"is back, limp; `dxlrun torque on {joint}` gives it torque"
         self._answer(index, loss, problem)
 
     def _answer(self, index: int, loss: Loss, problem: str) -> None:

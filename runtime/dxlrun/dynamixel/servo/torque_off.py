@@ -107,14 +107,14 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
         if not problem:
             sentences.append(f"{one} stands: its goal is 0")
         elif (yield from _is_off(one, LONGER_NS[0])):
-            sentences.append(f"{one} has no torque, as {problem}")
+            sentences.append(f"{one} is limp, as {problem}")
         else:
             left.append((one, problem))
     for longer_ns in LONGER_NS[1:]:  # only now: a servo that still moves does not wait for a silent one
         for one, problem in tuple(left):
             if (yield from _is_off(one, longer_ns)):
                 left.remove((one, problem))
-                sentences.append(f"{one} has no torque, as {problem}")
+                sentences.append(f"{one} is limp, as {problem}")
     for one, problem in left:
         sentences.append(f"{one} may keep moving: {problem}, and torque off was not confirmed")
     return sentences

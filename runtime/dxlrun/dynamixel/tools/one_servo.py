@@ -165,7 +165,7 @@ class OneServo:
         """
         if not on:
             written = self.write([self.register("torque_enable", 0)])
-            return ("holds no torque" + ("" if written else ", as before"),)
+            return ("is limp" + ("" if written else ", as before"),)
         cleared = self.clear_watchdog(armed=True)
         if not self.holds_torque():
             return (*cleared, self._hold())
@@ -336,7 +336,7 @@ def reboot(one: OneServo) -> str:
             raise one.fail(
                 f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
             )
-    return f"started anew, and holds {'' if one.holds_torque() else 'no '}torque"
+    return f"started anew, and {'holds torque' if one.holds_torque() else 'is limp'}"
 
 
 def factory_reset(one: OneServo, keep: Reset) -> str:

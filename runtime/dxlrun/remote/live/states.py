@@ -50,7 +50,7 @@ class RobotStates(msgspec.Struct, frozen=True):
     """Bits of the servo's Hardware Error Status."""
     mode: tuple[str, ...]
     torque: tuple[str, ...]
-    """`on`, `doubt`, `off`, `released`, `lost`, `rebooting`, `given`"""
+    """`on`, `doubt`, `limp`, `lost`, `rebooting`, `given`"""
     references: tuple[str, ...]
     reference: Floats
     """What controllers command of each other."""

@@ -39,7 +39,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
     special: dict[str, Any] = {
         "cycle": record.cycle,
         "mode": tuple(Mode(mode).name.lower() for mode in states.mode.tolist()),
-        "torque": tuple(Torque(torque).name.lower() for torque in states.torque.tolist()),
+        "torque": tuple(Torque(torque).word for torque in states.torque.tolist()),
         "controller_ns": record.controller_ns[[*timed.values()]],
     }
     return RobotStates(
