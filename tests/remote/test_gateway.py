@@ -535,6 +535,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "robot": "pair",
         "rate": 50.0,
         "paused": False,
+        "began": 1.0,
         "cycles": 1,
         "skipped": 0,
         "joints": ["pan", "tilt"],

@@ -84,6 +84,12 @@ def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:
     assert any(path.endswith("three_parts.yaml") for path in shown["motions"])
     assert not any(path.endswith("effort_arm_lift.yaml") for path in shown["motions"])
     assert until(lambda: served.look(after=0)["events"])
+    with live.asking() as robot:
+        states, info = robot.states(), robot.info()
+    began = info["began"]
+    assert abs(states.time_ns * 1e-9 - states.cycle / info["rate"] - began) < 2.0 + info["skipped"]
+    for event in served.look(after=0)["events"]:  # seconds of the run, not of the machine's clock
+        assert abs(event["run_time"] - (event["time"] - began)) < 1e-6
     begin, end = shown["span"]
     field = "/imu/imu:orientation.w"
     assert field in until(lambda: served.look(shown=True)["shown"]["fields"])

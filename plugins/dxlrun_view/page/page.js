@@ -239,7 +239,7 @@ function drawEvents(fresh) {
   for (const event of fresh) {
     const item = document.createElement("li");
     item.className = event.severity >= 40 ? "bad" : event.severity >= 30 ? "warn" : "";
-    const time = Object.assign(document.createElement("time"), { textContent: `${event.time.toFixed(2)} s` });
+    const time = Object.assign(document.createElement("time"), { textContent: `${event.run_time.toFixed(2)} s` });
     const source = Object.assign(document.createElement("span"), { textContent: event.source });
     item.append(time, source, Object.assign(document.createElement("p"), { textContent: event.text }));
     if (!page.shown?.live) { item.classList.add("far"); item.onclick = () => jump(event.time); }

@@ -224,6 +224,7 @@ class GatewayApp:
             robot=plan.robot,
             rate=link.rate,
             paused=link.paused,
+            began=None if link.began_ns is None else link.began_ns * 1e-9,
             cycles=link.heartbeat.cycles,
             skipped=link.heartbeat.skipped,
             joints=tuple(joint.name for joint in joints),

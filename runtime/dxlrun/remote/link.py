@@ -84,6 +84,8 @@ class Link:
         self.plan = plan
         self.rate = 1e9 / plan.loop.period_ns
         self.paused = False
+        self.began_ns: int | None = None
+        """Time of the first cycle; None: there was none yet."""
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
         self.events: deque[tuple[int, Event]] = deque()
@@ -116,6 +118,8 @@ class Link:
         found = self._cycles.newest()
         if found is not None and len(found.payload) == len(self._record.raw):
             self._record.raw[:] = found.payload
+            if self.began_ns is None:  # no client has changed the rate yet
+                self.began_ns = self._record.woken_ns - self._record.cycle * self.plan.loop.period_ns
         return self._record if self._record.woken_ns else None
 
     def active(self, loaded: Loaded) -> bool:
@@ -246,6 +250,8 @@ class Link:
 
     def collect(self) -> None:
         """Collect the answers and events that have come."""
+        if self.began_ns is None:
+            self.newest()
         for answered in self._answers.new():
             if answered.number in self._pending:  # else it answers a set-point of a stream
                 self._resolve(answered.number, answered.answer)

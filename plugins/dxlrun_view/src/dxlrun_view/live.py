@@ -185,12 +185,16 @@ class LiveRobot:
         self._cycle = states.cycle
 
     def _note_events(self, robot: RemoteRobot) -> None:
+        began_s = self._info.began
+        if began_s is None:
+            return  # the first cycle comes soon, and their times count from it
         found = msgspec.convert(robot.events(self._last_event)["events"], list[LiveEvent])
         for event in found:
             self._last_event = event.number
             if event.time > self._known_until_s:
                 number = self._events[-1].number + 1 if self._events else 1
-                self._events.append(msgspec.structs.replace(event, number=number))
+                run_time_s = event.time - began_s
+                self._events.append(msgspec.structs.replace(event, number=number, run_time=run_time_s))
 
     def _note_fields(self, robot: RemoteRobot) -> None:
         """Note what can be drawn of the topics' messages, by the first message that each has."""

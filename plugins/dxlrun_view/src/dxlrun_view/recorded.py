@@ -76,8 +76,9 @@ class RecordedRobot:
         self._times = self._seconds(cycles["woken_ns"])
         self._history = self._columns(cycles)
         self._events = tuple(
-            LiveEvent(number, float(self._seconds(event.t_ns)), int(event.severity), event.source, event.text)
+            LiveEvent(number, time_s, int(event.severity), event.source, event.text, time_s)
             for number, event in enumerate(sorted(read.events, key=lambda each: each.t_ns), 1)
+            for time_s in (float(self._seconds(event.t_ns)),)
         )
         self._plan = self._planned()
         self._info = self._of_run(reader.metadata.get("run", {}).get("robot_file", ""))

@@ -32,6 +32,8 @@ class RobotInfo(msgspec.Struct, frozen=True):
     robot: str
     rate: float = 0.0
     """Hz, nominal."""
+    began: float | None = None
+    """The run's first cycle, s as the curves' times; None: not known."""
     paused: bool = False
     skipped: int = 0
     """Periods."""
@@ -57,6 +59,8 @@ class LiveEvent(msgspec.Struct, frozen=True):
     """As in Python's logging: 20 is information, 30 a warning, 40 an error."""
     source: str
     text: str
+    run_time: float = 0.0
+    """s since the run's first cycle, as in its log; servos are set up before."""
 
 
 class Mark(msgspec.Struct, frozen=True):

@@ -49,6 +49,8 @@ class RobotInfo(msgspec.Struct, frozen=True):
     rate: float
     """Hz"""
     paused: bool
+    began: float | None
+    """s on the clock of the events: the first cycle, 0 s of the run's log; null: there was none yet."""
     cycles: int
     skipped: int
     joints: tuple[str, ...]
