@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from dxlrun.cli.steering.joints import source_facts
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
@@ -85,8 +86,26 @@ def test_a_command_that_no_controller_takes_names_the_type_that_would(board, mon
     )
 
 
+def test_what_is_commanded_of_a_device_is_asked_for_by_name(board):
+    names = list(board.record.layout.device_commands)
+    board.record.device_command[:] = [
+        {"board/led": 1.0, "board/register_7": 300.0}.get(one, np.nan) for one in names
+    ]
+    board.finish_cycle()
+    answer = board.ask("GET", "/joints/board/led")[1]
+    assert (answer["states"], answer["commands"]) == ({"led": 1.0}, {"led": 1.0})
+    answer = board.ask("GET", "/joints/board/register_7")[1]  # which is read nowhere
+    assert (answer["states"], answer["commands"]) == ({}, {"register_7": 300.0})
+    assert source_facts(answer) == [("register_7, commanded", "300")]
+    answer = board.ask("GET", "/joints/board")[1]
+    assert answer["commands"] == {"led": 1.0, "register_7": 300.0, "register_8": None}
+    assert ("led, commanded", "1") in source_facts(answer)
+    hint = board.ask("GET", "/joints/board/register_9")[1]["refused"]
+    assert "board/register_7" in hint
+
+
 def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
-    shown = {"valid": True, "age": 0.003, "states": {"force.x": 12.5}}
+    shown = {"valid": True, "age": 0.003, "states": {"force.x": 12.5}, "commands": {}}
     status, content = board.ask("GET", "/joints/foot/force.x")
     assert (status, content) == (200, {"source": "foot/force.x", "cycle": 1, **shown})
     assert board.ask("GET", "/joints/board")[1] == {
@@ -95,6 +114,7 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
         "valid": False,
         "age": None,
         "states": {"led": 1.0, "register_2": None},
+        "commands": {"led": None, "register_7": None, "register_8": None},
     }
     assert board.ask("GET", "/joints/neck")[1]["joint"] == "neck"
     status, content = board.ask("GET", "/joints/foot/force.y")

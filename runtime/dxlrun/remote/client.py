@@ -334,7 +334,8 @@ class RemoteRobot:
     def get(self, joint: str, item: str = "") -> dict[str, object]:
         """Return a joint's newest state, SI units, or an item of its servo's memory, read in idle time.
 
-        `joint` may be a device, a sensor, or a state of it, `imu/orientation.x`: `states`, `valid` and `age`.
+        `joint` may be a device, a sensor, or a state or command of it, `imu/orientation.x`, `board/led`:
+        `states`, `valid`, `age`, and `commands`, what controllers command of it now.
 
         Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
         """

@@ -555,7 +555,7 @@ class GatewayApp:
         plan, joint, states = self._link.plan, asked.part(), self._states()
         if (source := states.source(joint)) is not None:
             return {"source": joint, "cycle": states.cycle, **source}
-        joint_row(plan, joint, (*states.sources, *states.source_states))
+        joint_row(plan, joint, (*states.sources, *states.source_states, *states.device_commands))
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
         return {"joint": joint, "cycle": states.cycle, **states.joint(joint), **units}
 

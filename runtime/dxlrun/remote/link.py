@@ -245,13 +245,13 @@ class Link:
     async def watch(self) -> None:
         """Collect answers and events for ever."""
         while True:
+            if self.began_ns is None:
+                self.newest()
             self.collect()
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
     def collect(self) -> None:
         """Collect the answers and events that have come."""
-        if self.began_ns is None:
-            self.newest()
         for answered in self._answers.new():
             if answered.number in self._pending:  # else it answers a set-point of a stream
                 self._resolve(answered.number, answered.answer)

@@ -84,7 +84,8 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
 def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Print the state of a joint, or an item of its servo's control table: of a robot that runs.
 
-    Of a device or a sensor its states, or one of them: `dxlrun get imu/orientation.x`.
+    Of a device or a sensor its states, or one of them: `dxlrun get imu/orientation.x`; of a device what is
+    commanded, too: `dxlrun get board/led`.
 
     Parameters
     ----------
@@ -135,13 +136,15 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 
 
 def source_facts(found: Mapping[str, object]) -> list[tuple[str, str]]:
-    """Return the states of a device or a sensor, and how old they are."""
-    states = found["states"] if isinstance(found["states"], dict) else {}
+    """Return the states of a device or a sensor, how old they are, and what is commanded of it."""
+    states, commands = (
+        [(name, "-" if value is None else f"{value:.6g}") for name, value in values.items()]
+        for values in (found["states"], found["commands"])
+        if isinstance(values, dict)
+    )
     age = written(found["age"], "ms") or "none came yet"
-    return [
-        *((name, "-" if value is None else f"{value:.6g}") for name, value in states.items()),
-        ("age", age if found["valid"] else f"{age}, not valid"),
-    ]
+    of_states = [*states, ("age", age if found["valid"] else f"{age}, not valid")] if states else []
+    return [*of_states, *((f"{name}, commanded", value) for name, value in commands)]
 
 
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:

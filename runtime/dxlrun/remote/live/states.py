@@ -62,6 +62,10 @@ class RobotStates(msgspec.Struct, frozen=True):
     source_valid: Bools
     source_age_ns: Integers
     """-1: none ever came."""
+    device_commands: tuple[str, ...]
+    """Items of devices that controllers command: `board/led`."""
+    device_command: Floats
+    """What is commanded of each of them, in its unit."""
     controllers: tuple[str, ...]
     controller_ns: Integers
     """How long each controller's update took in this cycle; 0: it had none."""
@@ -73,23 +77,37 @@ class RobotStates(msgspec.Struct, frozen=True):
         return {**found, "age": int(self.age_ns[row]) * 1e-9}
 
     def source(self, name: str) -> dict[str, object] | None:
-        """Return states, `valid` and `age`, s, of a device, a sensor or a controller; None: there is no such.
+        """Return states, commands, `valid` and `age`, s, of a device, a sensor or a controller.
 
-        `name`: its own, or that of one state, `imu/orientation.x`.
+        Args:
+            name: Its own name, or that of one state or command, `imu/orientation.x`.
+
+        Returns:
+            None where there is no such source. A command is null where no controller commands it.
         """
         owner = name.partition("/")[0]
-        values = zip(self.source_states, self.source_state.tolist(), strict=True)
-        states = {
-            full.partition("/")[2]: _plain(value)
-            for full, value in values
-            if name in (full, full.partition("/")[0])
-        }
-        if not states:
+        states, commands = (
+            {
+                full.partition("/")[2]: _plain(value)
+                for full, value in zip(names, values.tolist(), strict=True)
+                if name in (full, full.partition("/")[0])
+            }
+            for names, values in (
+                (self.source_states, self.source_state),
+                (self.device_commands, self.device_command),
+            )
+        )
+        if not states and not commands:
             return None
         place = self.sources.index(owner)
         age_ns = int(self.source_age_ns[place])
         age = age_ns * 1e-9 if age_ns >= 0 else None
-        return {"valid": bool(self.source_valid[place]), "age": age, "states": states}
+        return {
+            "valid": bool(self.source_valid[place]),
+            "age": age,
+            "states": states,
+            "commands": commands,
+        }
 
 
 def encoded(states: RobotStates) -> bytes:
