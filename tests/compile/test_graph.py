@@ -52,6 +52,54 @@ def test_the_chain_of_the_page_is_right():
     assert problems_in(ROBOT.replace("controllers:\n", "") + chain) == ()
 
 
+@pytest.mark.parametrize(
+    ("reads", "warned"),
+    [
+        ("arm_pid/elbow/position", ""),  # which limiter commands
+        ("limiter/shoulder/position", "which it commands itself: it gets its value of the cycle before"),
+        ("elbow/position", ""),
+    ],
+)
+def test_a_controller_that_reads_what_it_commands_is_warned_about(reads: str, warned: str) -> None:
+    arm = "into: limiter, rate: 25}"
+    assert arm in GOOD
+    text = ROBOT + GOOD.replace(arm, f"into: limiter, rate: 25, reads: [{reads}]}}")
+    if reads.startswith("arm_pid"):
+        text = text.replace("into: limiter, rate: 25, ", "active: false, ")
+    compiled = compile_text(text)
+    found = [one for one in compiled.warnings if reads in one.what]
+    assert [one.what for one in found] == ([f"arm reads {reads}, {warned}"] if warned else [])
+    assert [one.fix for one in found] == (
+        ["read the state, shoulder/position, or take it out"] if warned else []
+    )
+
+
+def test_a_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> None:
+    low = ControllerPlan(
+        "low",
+        "part",
+        "",
+        "{}",
+        ("j",),
+        ("effort",),
+        (),
+        True,
+        1,
+        reference=("position",),
+        reads=("low/j/position",),
+    )
+    filter_ = ControllerPlan(
+        "filter", "part", "", "{}", (), (), (), True, 1, reads=("filter/x", "filter/age"), provides=("x",)
+    )
+    graph = ControllerGraph(("j",), (low, filter_))
+    assert [*graph.mistakes()] == []
+    assert graph.order == ("low", "filter")
+    assert [one.what for one in graph.warnings()] == [
+        "low reads low/j/position, its own reference, which it has without",
+        "filter reads filter/x, which it provides itself: it gets its value of the cycle before",
+    ]
+
+
 def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
     (mistake,) = ControllerGraph(("j",), (plan,)).mistakes()

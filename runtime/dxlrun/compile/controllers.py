@@ -210,8 +210,11 @@ def _check_graph(
     left_out = (*left_out_names(file.description, "devices"), *left_out_names(file.description, "sensors"))
     incomplete = frozenset(name for name in (*named, *left_out) if name not in known)
     by_name = {plan.name: plan for plan in plans}
-    for mistake in ControllerGraph(tuple(robot.joints), plans, sources, incomplete).mistakes():
+    graph = ControllerGraph(tuple(robot.joints), plans, sources, incomplete)
+    for mistake in graph.mistakes():
         file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
+    for mistake in graph.warnings():
+        file.warning(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:

@@ -95,6 +95,34 @@ class ControllerGraph:
         yield from self._circles()
         yield from self._active_claims()
 
+    def warnings(self) -> Iterator[Mistake]:
+        """Yield each interface by which a controller reads its own values back."""
+        for plan in self.controllers:
+            for index, interface in enumerate(plan.reads):
+                if found := self._read_back(plan, interface):
+                    what, fix = found
+                    at = (*_path(plan.name), "reads", index)
+                    yield Mistake(at, f"{plan.name} reads {interface}, {what}", fix)
+
+    def _read_back(self, plan: ControllerPlan, interface: str) -> tuple[str, str] | None:
+        """Return how a controller reads itself by an interface, and how to avoid that; None: it does not."""
+        source, _, name = interface.rpartition("/")
+        owner, _, joint = source.partition("/")
+        if source == plan.name and name in plan.provides:
+            return (
+                "which it provides itself: it gets its value of the cycle before",
+                "keep it in the controller",
+            )
+        if owner == plan.name and joint:
+            return "its own reference, which it has without", "take it out"
+        commanded = name in plan.command and joint in plan.joints
+        if commanded and owner in [lower.name for lower in self._exporters(plan, joint)]:
+            return (
+                "which it commands itself: it gets its value of the cycle before",
+                f"read the state, {joint}/{name}, or take it out",
+            )
+        return None
+
     def drawing(self, title: str, rate: float) -> Graph:
         """Return what is drawn of it, for a loop at this rate, Hz.
 

@@ -219,12 +219,12 @@ class GatewayApp:
     async def robot(self, asked: Asked[None]) -> RobotInfo:
         """Return the run, its controllers and the commands that they take."""
         link, plan = self._link, self._link.plan
-        joints = plan.loop.joints
+        joints, began_ns = plan.loop.joints, link.began_ns
         return RobotInfo(
             robot=plan.robot,
             rate=link.rate,
             paused=link.paused,
-            began=None if link.began_ns is None else link.began_ns * 1e-9,
+            began=None if began_ns is None else began_ns * 1e-9,
             cycles=link.heartbeat.cycles,
             skipped=link.heartbeat.skipped,
             joints=tuple(joint.name for joint in joints),

@@ -84,8 +84,7 @@ class Link:
         self.plan = plan
         self.rate = 1e9 / plan.loop.period_ns
         self.paused = False
-        self.began_ns: int | None = None
-        """Time of the first cycle; None: there was none yet."""
+        self._began_ns: int | None = None
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
         self.events: deque[tuple[int, Event]] = deque()
@@ -118,9 +117,15 @@ class Link:
         found = self._cycles.newest()
         if found is not None and len(found.payload) == len(self._record.raw):
             self._record.raw[:] = found.payload
-            if self.began_ns is None:  # no client has changed the rate yet
-                self.began_ns = self._record.woken_ns - self._record.cycle * self.plan.loop.period_ns
+            if self._began_ns is None:  # no client has changed the rate yet
+                self._began_ns = self._record.woken_ns - self._record.cycle * self.plan.loop.period_ns
         return self._record if self._record.woken_ns else None
+
+    @property
+    def began_ns(self) -> int | None:
+        """Time of the first cycle; None: there was none yet."""
+        self.newest()
+        return self._began_ns
 
     def active(self, loaded: Loaded) -> bool:
         """Return whether a controller is active in the newest cycle."""
@@ -245,7 +250,7 @@ class Link:
     async def watch(self) -> None:
         """Collect answers and events for ever."""
         while True:
-            if self.began_ns is None:
+            if self._began_ns is None:
                 self.newest()
             self.collect()
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)

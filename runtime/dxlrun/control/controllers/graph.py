@@ -35,9 +35,10 @@ def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
     providing = {plan.name for plan in plans if plan.provides}
     for plan in plans:
         reads = [name.split("/") for name in plan.reads]
-        found += [Edge(owner, plan.name) for owner, *rest in reads if len(rest) == 1 and owner in providing]
+        # what it provides or commands itself it need not await: it reads its value of the cycle before
+        providers = providing - {plan.name}
+        found += [Edge(owner, plan.name) for owner, *rest in reads if len(rest) == 1 and owner in providers]
         read = [owner for owner, *rest in reads if len(rest) == 2]
-        # what it commands itself it need not await
         found += [
             Edge(upper, plan.name)
             for owner in read
