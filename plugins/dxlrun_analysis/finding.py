@@ -41,10 +41,12 @@ class Finding:
     """One finding. Rules of every room of the analysis make them; `judge` sorts them, the worst first."""
 
     code: str
-    """A word for programs: `latency_timer`, `slow_servo` ..."""
+    """A word for programs, of `dxlrun_analysis.rules.RULES`, or ROBOT."""
     subject: str  # The bus, servo, joint, controller or process that it accuses; empty: none
     sentence: str  # What was found, for a person
-    remedy: str = ""  # What to do about it: a sentence or a command; empty: nothing is known to help
+    remedy: str = ""
+    """What to do about it, a sentence or a command: rules leave it empty unless they measured what helps, and
+    `judge` takes that of the table."""
     rank: Rank = Rank.REMARK
     share: float = 0.0
     """Findings of one rank are sorted by it, the greatest first; those of one share keep their order."""

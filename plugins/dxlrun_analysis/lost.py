@@ -16,17 +16,11 @@ INVALID_SHARE = 0.01  # More invalid states of a joint than this, and the run wa
 _FEW_INVALID = 2
 """So few are tolerated however short the run: a servo that misses three replies in a row is lost."""
 _MOST_NAMED = 3
-SPOILT = ("power_lost", "another_host", "noise", "broken_replies")  # Codes of what spoils replies
-_OF_A_SERVO = ("lossy_servo", "slow_servo", "broken_replies", "loose_cable")
-"""Codes that accuse a servo of replies that are missing."""
 
 
 def severe_of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
     """Return the errors of some codes."""
     return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
-
-
-_REPLUG = "Check the adapter's plugs and cable; `dmesg` has what the system saw of it."
 
 
 def lost_lines(totals: RunTotals) -> Iterable[Finding]:
@@ -35,19 +29,13 @@ def lost_lines(totals: RunTotals) -> Iterable[Finding]:
         times = "" if group.count == 1 else f" {group.count} times"
         line = sentence_of(group)
         sentence = f"Bus {group.source} was lost{times}: {line}" + ("" if line.endswith("?") else ".")
-        yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
+        yield Finding("bus_lost", group.source, sentence, rank=Rank.LINE, share=group.count)
 
 
 CODES = {
     EventCode.SERVO_REBOOTED: "servo_rebooted",
     EventCode.SERVO_LOST: "servo_lost",
     EventCode.SERVO_LIMP: "torque_lost",
-}
-_FIXES = {
-    EventCode.SERVO_REBOOTED: "Check its plugs, and whether the supply can give the current.",
-    EventCode.SERVO_LOST: "Check its cable, plugs and supply, at that angle, too; `dxlrun scan PORT` shows "
-    "which servos answer.",
-    EventCode.SERVO_LIMP: "Look for overload, heat, low voltage: `dxlrun servo PORT ID get` has its errors.",
 }
 _REFUSED = (
     "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
@@ -89,39 +77,15 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
     rebooted = first == EventCode.SERVO_REBOOTED
-    fix = _REFUSED if ordered[0][0] in totals.returns else _FIXES[first]
-    if _share_a_cable(totals, by_source):
+    fix = _REFUSED if ordered[0][0] in totals.returns else ""
+    if _failed_together(totals, by_source):
         sentence += f" It was at once, while others of their bus {'ran on' if rebooted else 'answered'}: "
         sentence += "they share a supply or a cable."
         fix = "Look at the cable, the plug or the fuse that they share, between them and the others."
-    subject = ordered[0][0]
-    if bus := _disturbed(totals, by_source):
-        sentence += f" Bytes that belong to no packet came on bus {bus} then, and others missed replies, too."
-        subject, fix = bus, "Look for what disturbed the line then: its shield, ground and termination."
-    yield Finding(CODES[first], subject, sentence, fix, Rank.SERVO)
+    yield Finding(CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
 
 
-def _disturbed(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> str:
-    """Return the bus whose noise made it lose all servos that failed; empty: none did.
-
-    It came just before, and two others at least missed replies of their own: a servo's broken replies cost
-    those behind it theirs, but none that they could have given.
-    """
-    bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
-    bus, *more = {bus_of.get(source, "") for source in failed}
-    groups = [group for of_one in failed.values() for group in of_one]
-    lost = all(group.code == EventCode.SERVO_LOST and group.count == 1 for group in groups)
-    begins = [one.t_ns for one in totals.events if one.code == EventCode.BUS_NOISE and one.source == bus]
-    then = any(0 <= group.t_ns - begin <= _AT_ONCE_NS for begin in begins for group in groups)
-    others = [
-        servo
-        for servo in totals.servos
-        if servo.bus == bus and servo.joint not in failed and servo.losses and servo.losses.lost
-    ]
-    return bus if lost and then and not more and len(others) >= _FEWEST_OF_BUS else ""
-
-
-def _share_a_cable(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
+def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
     """Return whether several servos of a bus failed in the same way and at once, and not all that it has."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
     bus, *others = {bus_of.get(source, "") for source in failed}
@@ -144,8 +108,7 @@ def lost_devices(totals: RunTotals) -> Iterable[Finding]:
             name if lost[name] == 1 else f"{name} {lost[name]} times" for name in ordered[:_MOST_NAMED]
         )
         sentence = f"Devices were lost: {named}{_more('; and', len(ordered))}."
-        fix = "Check its cable, plugs and supply; its states kept their last values meanwhile."
-        yield Finding("device_lost", ordered[0], sentence, fix, Rank.SERVO)
+        yield Finding("silent", ordered[0], sentence, rank=Rank.SERVO)
 
 
 def whole_buses(totals: RunTotals) -> Iterable[Finding]:
@@ -157,21 +120,19 @@ def whole_buses(totals: RunTotals) -> Iterable[Finding]:
         joints = {servo.joint for servo in servos if servo.bus == bus}
         if _all_at_once(totals, EventCode.SERVO_REBOOTED, joints) is not None:
             what = f"All {len(joints)} servos of bus {bus} rebooted at once: their supply failed."
-            fix = "Check the supply, its plug and its switch."
-            yield Finding("power_lost", bus, what, fix, Rank.SERVO_CAUSE, 2.0)
+            yield Finding("power_lost", bus, what, rank=Rank.SERVO_CAUSE, share=2.0)
         elif (t_ns := _all_at_once(totals, EventCode.SERVO_LOST, joints)) is not None:
             silent[bus] = t_ns
     if len(silent) > 1 and max(silent.values()) - min(silent.values()) <= _AT_ONCE_NS:
         named = _joined(tuple(silent))
-        what = f"All servos of buses {named} were lost at once: it is no servo, and no single bus."
-        fix = "Check what these buses share: the machine, a USB hub, a supply."
-        yield Finding("silent_bus", "machine", what, fix, Rank.SERVO_CAUSE)
+        what = f"All servos of buses {named} were lost at once: it is what these buses share."
+        yield Finding("servo_lost", "machine", what, rank=Rank.SERVO_CAUSE)
         return
     for bus in silent:
         count = sum(servo.bus == bus for servo in servos)
         what = f"All {count} servos of bus {bus} were lost at once: it is not one of them."
         fix = "Check the adapter, the first cable and the supply of the bus."
-        yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE)
+        yield Finding("servo_lost", bus, what, fix, Rank.SERVO_CAUSE)
 
 
 def _all_at_once(totals: RunTotals, code: EventCode, joints: set[str]) -> int | None:
@@ -190,45 +151,21 @@ def _joined(parts: Sequence[str]) -> str:
 
 def invalid_states(totals: RunTotals) -> Iterable[Finding]:
     """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
-    cycles, counts = totals.periods.records, _invalid(totals)
+    cycles, counts = totals.periods.records, invalid_joints(totals)
     if not counts:
         return
     waited = waited_in_vain(totals)
-    ordered = sorted((-count / cycles, joint) for joint, count in counts.items() if joint not in waited)
-    most = max(counts.values()) / cycles
-    if ordered:
-        named = ", ".join(f"{joint} in {-share:.1%}" for share, joint in ordered[:_MOST_NAMED])
-        more = _more(", and", len(ordered), "more joint", "more joints")
-        subject = ordered[0][1]
-        sentence = f"States were invalid: {named} of the cycles{more}"
-        sentence += (
-            f", and of {len(waited)} more because replies before theirs were missing" if waited else ""
-        )
-    else:
-        buses = sorted({mover.bus.name for joint in waited for mover in totals.plan.movers[joint]})
-        subject = buses[0] if len(buses) == 1 else ""
-        joints = counted(len(waited), "joint", "joints")
-        sentence = (
-            f"States of {joints} on bus {_joined(buses)} were invalid, in up to {most:.1%} of the cycles, as "
-            f"whole chains of replies were missing{_why_missing(totals, buses)}"
-        )
-    yield Finding(
-        "invalid_states", subject, f"{sentence}; {INVALID_SHARE:.0%} tolerated.", rank=Rank.SHARE, share=most
-    )
+    ordered = sorted((joint in waited, -count / cycles, joint) for joint, count in counts.items())
+    named = ", ".join(f"{joint} in {-share:.1%}" for _, share, joint in ordered[:_MOST_NAMED])
+    more = _more(", and", len(ordered), "more joint", "more joints")
+    behind = f", {len(waited)} of them because replies before theirs were missing" if waited else ""
+    sentence = f"States were invalid: {named} of the cycles{more}{behind}; {INVALID_SHARE:.0%} tolerated."
+    share = max(counts.values()) / cycles
+    subject = ordered[0][2] if len(waited) < len(counts) else totals.bus_of(ordered[0][2])
+    yield Finding("invalid_states", subject, sentence, rank=Rank.SHARE, share=share)
 
 
-def _why_missing(totals: RunTotals, buses: Sequence[str]) -> str:
-    """Return what whole chains wait for: their first servo, or the line where no finding accuses that."""
-    heads = [one for one in totals.servos if one.bus in buses and one.losses and one.losses.broken_off]
-    name = _name(heads[0]) if len(heads) == 1 else ""
-    accused = {one.subject for one in totals.findings if one.code in _OF_A_SERVO}
-    if name and heads[0].subject in accused:
-        return f" behind {name}"
-    first = f"the first servo of the chain{f', {name},' if name else ''}"
-    return f": either {first} is silent, or the instruction is lost on the line"
-
-
-def _invalid(totals: RunTotals) -> dict[str, int]:
+def invalid_joints(totals: RunTotals) -> dict[str, int]:
     """Return how many states of each joint were invalid, where they were so too often."""
     cycles = totals.periods.records
     return {
@@ -240,7 +177,7 @@ def _invalid(totals: RunTotals) -> dict[str, int]:
 
 def waited_in_vain(totals: RunTotals) -> set[str]:
     """Return the joints that were invalid too often, but mostly not by lost replies of their own servos."""
-    counts = _invalid(totals)
+    counts = invalid_joints(totals)
     servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
     found = set()
     for joint, movers in totals.plan.movers.items():
@@ -253,16 +190,11 @@ def waited_in_vain(totals: RunTotals) -> set[str]:
 
 
 def implausible(totals: RunTotals) -> Iterable[Finding]:
-    """Name joints whose positions the loop did not believe, where their bus has no spoilt replies."""
-    named = {one.subject for one in totals.findings if one.code in (*SPOILT, "position_jumped")}
+    """Name joints whose positions the loop did not believe."""
+    named = {one.subject for one in totals.findings if one.code == "position_jumped"}
     for group in totals.events:
-        movers = totals.plan.movers.get(group.source, ())
-        if group.code == EventCode.IMPLAUSIBLE and movers and not named & {group.source, movers[0].bus.name}:
-            sentence = (
-                f"{sentence_of(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
-            )
-            fix = "Turn it by hand without torque, and watch its position."
-            yield cause("position_jumped", group.source, sentence, fix, 4.0)
+        if group.code == EventCode.IMPLAUSIBLE and group.source in totals.plan.movers.keys() - named:
+            yield cause("position_jumped", group.source, f"{sentence_of(group)}.", share=4.0)
 
 
 def missing_replies(totals: RunTotals) -> Iterable[Finding]:
@@ -276,7 +208,7 @@ def missing_replies(totals: RunTotals) -> Iterable[Finding]:
     ):
         return  # they answered while they were asked; what was lost is told above
     if not losers:
-        yield Finding("all_answered", "", f"{_all(asked)} answered every time.")
+        yield Finding("replies", "", f"{_all(asked)} answered every time.")
         return
     named = ", ".join(
         f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
@@ -286,7 +218,7 @@ def missing_replies(totals: RunTotals) -> Iterable[Finding]:
     rest = len(asked) - len(losers)
     others = f"; {rest} of {len(asked)} {_kinds(asked)} answered every time" if rest else ""
     sentence = f"Replies are missing: {named}{more}{others}."
-    yield Finding("missing_replies", losers[0].subject, sentence)
+    yield Finding("replies", losers[0].subject, sentence)
 
 
 def _all(asked: Sequence[ServoTraffic]) -> str:
@@ -309,7 +241,7 @@ def servo_errors(totals: RunTotals) -> Iterable[Finding]:
     )
     more = _more("; and", len(troubled))
     sentence = f"Servos reported errors: {named}{more}."
-    yield Finding("servo_errors", troubled[0].subject, sentence, rank=Rank.ERROR)
+    yield Finding("servo_error", troubled[0].subject, sentence, rank=Rank.ERROR)
 
 
 def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:

@@ -26,23 +26,20 @@ _FAILED = {
     EventCode.SERVO_REBOOTED: "rebooted",
 }
 _REASONS = {
-    "run_failed": "a process of the run failed",
-    "never_ran": "{sentence}",
+    "run_failed": "{sentence}",
     "goal_missed": "",
-    "motion_cut": "",
     "another_host": "another host sent on bus {subject}",
     "noise": "noise on bus {subject}",
-    "sensor_hangs": "sensor {subject} hung",
-    "device_hangs": "device {subject} stood still",
-    "jammed_joint": "{subject} was blocked",
+    "frozen": "{subject} was frozen",
+    "silent": "{subject} was lost",
     "bus_lost": "bus {subject} was lost",
-    "device_lost": "device {subject} was lost",
-    "skipped_periods": "the loop did not keep its rate",
-    "servo_errors": "{subject} reported errors",
+    "skipped": "the loop did not keep its rate",
+    "servo_error": "{subject} reported errors",
     "errors_logged": "{text}",
+    "invalid_states": "states of {subject} were often invalid",
     "log_not_whole": "the log is not whole",
 }
-"""By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
+"""By code; of others the code itself says it: `stood still`. Goals are named in any case."""
 _RELEASED = "torque off: "
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100
@@ -54,7 +51,7 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
     facts = (one for one in found if one.rank in _FACTS)
     worst = next(facts, next((one for one in found if one.rank == Rank.SERVO_CAUSE), None))
     if worst is not None and not parts:
-        parts.append(_reason(worst, totals, found))
+        parts.append(_reason(worst))
     parts += _goals_not_reached(totals)
     parts.append(_played(totals))
     goals = totals.conduct.goals
@@ -65,16 +62,9 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
     return Finding(ROBOT, "", f"{word.capitalize()}: {'; '.join(filter(None, parts))}.")
 
 
-def _reason(worst: Finding, totals: RunTotals, found: Sequence[Finding]) -> str:
-    if worst.code == "invalid_states":
-        if ("position_jumped", worst.subject) in {(one.code, one.subject) for one in found}:
-            return f"positions of {worst.subject} were often not believed"
-        on_bus = "joints on bus " if worst.subject in totals.plan.by_name else ""
-        return f"states of {on_bus}{worst.subject} were often invalid"
-    if worst.code in ("error_grew", "joint_shakes") and not worst.remedy:
-        worst = found[0]  # which it follows from
+def _reason(worst: Finding) -> str:
     text = worst.sentence.partition(f"of {worst.subject}: ")[2] or worst.subject
-    if worst.subject == "loop":  # what it ended with, behind how long it ran
+    if worst.subject == "loop":  # why it ended, after how long it ran
         text = text.partition(": ")[2] or text
     words = f"{worst.subject}: {worst.code.replace('_', ' ')}"
     sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"

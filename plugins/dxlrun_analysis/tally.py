@@ -19,10 +19,8 @@ from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun.plan.played_goals import UnreachedGoal, find_unreached_goals
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
-from dxlrun_analysis.conduct.clients import Clients
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.sensors import Sensors
-from dxlrun_analysis.conduct.spikes import Spikes
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
@@ -32,6 +30,8 @@ from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
+_SHORT_RUN_S = 2.0
+"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 _ANSWERS = " answers "  # What a servo does that is lost all the same: it cannot be taken back
 
 
@@ -83,6 +83,17 @@ class RunTotals:
         found = find_unreached_goals(self.plan.loop, conduct.goals, ran_ns)
         return [goal for goal in found if conduct.whole or goal.report is not None]
 
+    @property
+    def tolerated_skips(self) -> float:
+        """How many periods the run may skip."""
+        fewest = _SHORT_RUN_S * self.periods.rate_hz
+        return self.plan.loop.tolerated_skips * max(self.periods.elapsed, fewest)
+
+    @property
+    def kept_rate(self) -> bool:
+        """Whether the loop ran, and skipped no more periods than that."""
+        return bool(self.periods.records) and self.periods.skipped <= self.tolerated_skips
+
     def bus_of(self, subject: str) -> str:
         """Return the bus of a servo that a finding accuses; of another subject itself."""
         return next((servo.bus for servo in self.servos if servo.subject == subject), subject)
@@ -96,7 +107,6 @@ class Tally:
         self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
         self._trends, self._tracking = Trends(), Tracking()
         self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
-        self._clients, self._spikes = Clients(), Spikes()
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
         self._granted = False
@@ -107,7 +117,6 @@ class Tally:
         for take in (
             *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
             *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
-            *(self._clients.take, self._spikes.take),
         ):
             take(log)
         for event in log.events:
@@ -153,8 +162,10 @@ class Tally:
             gaps=gaps,
             damage=log.damage,
             findings=(
-                *(*self._traffic.findings, *movement, *self._trends.findings(movement)),
-                *(*self._sensors.findings(), *self._spikes.findings(), *self._clients.findings()),
+                *self._traffic.findings,
+                *movement,
+                *self._trends.findings(movement),
+                *self._sensors.findings(),
             ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),

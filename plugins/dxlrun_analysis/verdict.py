@@ -14,9 +14,8 @@ was not good when
   `dxlrun.plan.played_goals`;
 - an error was logged, a servo reported one, or the log is not whole.
 
-All else is reported and tolerated: a lost packet is data. Wake-ups are *rough* when more than 1 % are later
-than 150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a
-real-time kernel). Replies are *late* when the adapter adds 2 ms more than the plan expects.
+All else is reported and tolerated: a lost packet is data. What each rule counts stands in rules.py, whether
+it may speak in evidence.py.
 """
 
 from __future__ import annotations
@@ -30,10 +29,9 @@ import msgspec
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
-from dxlrun_analysis.accused import accused, wake_up_remedy
-from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.causes.rules import cause_findings
+from dxlrun_analysis.causes.rules import own_work
 from dxlrun_analysis.conduct.steering import Act, Pause
+from dxlrun_analysis.evidence import accused, busy_machine
 from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.lost import (
     implausible,
@@ -50,10 +48,11 @@ from dxlrun_analysis.lost import (
 from dxlrun_analysis.robot_line import robot_line
 from dxlrun_analysis.tally import RunTotals
 
-_SHORT_RUN_S = 2.0
-"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
-ROUGH_SHARE = 0.01
-_OFTEN = 0.01  # Of the cycles: a goal beyond a limit now and then is what limits are for
+_LEAST_CYCLES = 3
+_LARGE_PART = 5  # Of the excess of long cycles: what has less than a fifth is not worth its words
+_ROUGH_SHARE = 0.01
+"""Of the wake-ups: M. A. Araujo (UFU, 2017) measured 1.74 % beyond 150 us at 1 kHz under stress on a stock
+kernel, none on a real-time one."""
 _OF_LOOP = [
     "switch",
     "rate",
@@ -81,31 +80,28 @@ class Verdict(msgspec.Struct, frozen=True):
 
 def judge(totals: RunTotals) -> Verdict:
     """Return whether a run was good, and what was and what was not."""
-    found = (
-        *(
-            Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
-            for failed in totals.failures
+    judged = accused(
+        totals,
+        (
+            *_never_ran(totals),
+            *totals.findings,
+            *_robot(totals),
+            *_loop(totals),
+            *lost_lines(totals),
+            *whole_buses(totals),
+            *lost_servos(totals),
+            *lost_devices(totals),
+            *invalid_states(totals),
+            *implausible(totals),
+            *own_work(totals.causes),
+            *_machine(totals),
+            *_steered(totals.acts, totals.pauses),
+            *missing_replies(totals),
+            *servo_errors(totals),
+            *_events(totals),
+            *_log(totals),
         ),
-        *totals.findings,
-        *_robot(totals),
-        *_beyond(totals),
-        *_loop(totals),
-        *lost_lines(totals),
-        *whole_buses(totals),
-        *lost_servos(totals),
-        *lost_devices(totals),
-        *invalid_states(totals),
-        *implausible(totals),
-        *_causes(totals),
-        *_slow(totals),
-        *_rough(totals),
-        *_steered(totals.acts, totals.pauses),
-        *missing_replies(totals),
-        *servo_errors(totals),
-        *_events(totals),
-        *_log(totals),
     )
-    judged = accused(totals, found)
     ordered = sorted(judged, key=lambda finding: finding.order)
     good = all(finding.rank >= Rank.CAUSE for finding in ordered)
     word = "good" if good else "not good"
@@ -126,102 +122,67 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
         yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
     for goal in totals.unreached_goals:
         subject = (goal.report and goal.report.joint) or goal.controller
-        code = "goal_missed" if goal.failed else "motion_cut"
         remedy = f"{goal.remedy[:1].upper()}{goal.remedy[1:]}." if goal.remedy else ""
-        yield Finding(code, subject, f"{goal.sentence}.", remedy, rank=Rank.ERROR)
+        yield Finding("goal_missed", subject, f"{goal.sentence}.", remedy, rank=Rank.ERROR)
 
 
-def _beyond(totals: RunTotals) -> Iterable[Finding]:
-    """Report commands beyond position limits, which the last gate changed."""
-    clamped = {one.name: one.clamped for one in totals.tracking}
-    for group in totals.events:
-        joint, _, what = group.text.partition(", ")
-        count = clamped.get(joint, 0)
-        if (
-            group.code == EventCode.GATE
-            and group.severity >= Severity.WARNING
-            and "position limit" in what
-            and count > _OFTEN * totals.periods.records
-        ):
-            by, _, done = what.removeprefix("controller ").partition(": ")
-            cycles = counted(count, "cycle", "cycles")
-            sentence = f"Commands of {by} for {joint} were beyond its limits in {cycles}: {done}."
-            yield Finding("beyond_limits", by, sentence, share=0.5)
-
-
-def _loop(totals: RunTotals) -> Iterable[Finding]:
-    account, wake_ups = totals.periods, totals.latency
-    if not account.records:
+def _never_ran(totals: RunTotals) -> Iterable[Finding]:
+    """Report processes of the run that failed, and a loop that never ran a cycle."""
+    for failed in totals.failures:
+        yield Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
+    if not totals.periods.records:
         none = "The log has no cycle of the loop" if totals.damage else "The loop never ran a cycle"
         refused = severe_of(totals.events, EventCode.SETUP)
         why = f": {sentence_of(refused[0])}" if refused else ""
-        yield Finding("never_ran", "loop", f"{none}{why}.", rank=Rank.NEVER_RAN)
+        yield Finding("run_failed", "loop", f"{none}{why}.", rank=Rank.NEVER_RAN)
+
+
+def _loop(totals: RunTotals) -> Iterable[Finding]:
+    """Report whether the loop kept its rate, how late it woke, and its longest cycle."""
+    account = totals.periods
+    if not account.records:
         return
-    share = account.skipped / account.elapsed
-    judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
-    tolerable = account.skipped <= totals.plan.loop.tolerated_skips * judged
-    kept = "kept" if tolerable else "did not keep"
-    wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
-    wake_up = ", on virtual time" if totals.virtual else wake_up
+    wake_ups = ", on virtual time" if totals.virtual else ""
+    if totals.latency is not None and not totals.virtual:
+        late, worst = totals.latency.share_over_150_us, microseconds(totals.latency.max_us)
+        often = f", {late:.1%} more than 150 us" if late > _ROUGH_SHARE else ""
+        wake_ups = f", worst wake-up {worst} late{often}"
     elapsed = counted(account.elapsed, "period", "periods")
     if totals.plan.loop.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
-        yield Finding("sequential", "", f"Cycles followed each other, not the clock: {took}{wake_up}.")
+        yield Finding("kept_rate", "", f"Cycles followed each other, not the clock: {took}{wake_ups}.")
         return
+    share = account.skipped / account.elapsed
     tolerated = f"{totals.plan.loop.tolerated_skips * 100:.4g}% tolerated"
-    if judged > account.elapsed:
-        tolerated = f"{totals.plan.loop.tolerated_skips * judged:.0f} tolerated in a short run"
+    if totals.tolerated_skips > totals.plan.loop.tolerated_skips * account.elapsed:
+        tolerated = f"{totals.tolerated_skips:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
-    sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
-    if tolerable:
-        yield Finding("rate_kept", "", sentence)
+    kept = "kept" if totals.kept_rate else "did not keep"
+    sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_ups}"
+    sentence += f"{_longest(totals)}."
+    if totals.kept_rate:
+        yield Finding("kept_rate", "", sentence)
     else:
-        yield Finding("skipped_periods", "loop", sentence, rank=Rank.SHARE, share=share)
+        yield Finding("skipped", "loop", sentence, rank=Rank.SHARE, share=share)
 
 
-def _causes(totals: RunTotals) -> Iterable[Finding]:
-    """Report what made cycles too long; of a bus only where nothing else explains its late replies."""
-    if totals.plan.loop.schedule == "sequential":
-        return
-    explained = {finding.subject for finding in totals.findings if finding.rank == Rank.CAUSE}
-    explained |= {servo.bus for servo in totals.servos if servo.subject in explained}
-    for finding in cause_findings(totals.causes, wake_up_remedy(totals.real_time)):
-        if totals.bus_of(finding.subject) not in explained:
-            yield finding
-
-
-def _slow(totals: RunTotals) -> Iterable[Finding]:
-    """Report the longest step of the cycle that exceeds its period most."""
+def _longest(totals: RunTotals) -> str:
+    """Return how long the longest cycle took, where that was more than its period, and its main cause."""
     slowest = totals.slowest
     if slowest is None:
-        return
+        return ""
     steps = ((slowest.read_ns, "read"), (slowest.update_ns, "update"), (slowest.write_ns, "write"))
     longest_ns, name = max(steps)
-    yield Finding(
-        "long_cycle",
-        "loop",
-        f"A cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, longer than its period of "
-        f"{microseconds(slowest.period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}"
-        f"{_why(totals.causes)}.",
-    )
+    worst = max(totals.causes.worst, key=lambda one: one.written_us - one.woken_us, default=None)
+    why = f": {worst.causes[0].name}" if worst is not None and worst.causes else ""
+    took = f"a cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, its {name}"
+    return f"; {took} {microseconds(longest_ns / 1e3)}{why}"
 
 
-def _why(causes: Causes) -> str:
-    """Return the main cause of the cycle that took longest, as the end of a sentence."""
-    longest = max(causes.worst, key=lambda one: one.written_us - one.woken_us, default=None)
-    if longest is None or longest.written_us - longest.woken_us <= longest.period_us or not longest.causes:
-        return ""
-    share = longest.causes[0]
-    return f": {share.name} {microseconds(share.us)}"
-
-
-def _rough(totals: RunTotals) -> Iterable[Finding]:
-    wake_ups = totals.latency
-    if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
-        return
-    late = f"{wake_ups.share_over_150_us:.1%} came later than 150 us"
-    helps = wake_up_remedy(totals.real_time)
-    yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
+def _machine(totals: RunTotals) -> Iterable[Finding]:
+    if parts := busy_machine(totals):
+        sentence = f"The machine was too busy: {', '.join(parts)}."
+        yield Finding("busy_machine", "machine", sentence, rank=Rank.CAUSE, share=10.0)
 
 
 def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:

@@ -155,20 +155,6 @@ def test_a_servo_that_was_silent_is_named(write: Make) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("silent", "words"), [(3, "(100.00%)."), (4, ", and 1 more servo."), (5, ", and 2 more servos.")]
-)
-def test_at_most_three_silent_servos_are_named(write: Make, silent: int, words: str) -> None:
-    packets = [
-        Wire(PacketKind.INSTRUCTION, number, number * 1000, bytes([255, 255, number, 4, 2, 36, 6, 0]))
-        for number in range(1, silent + 1)
-    ]
-    packets.append(Wire(PacketKind.INSTRUCTION, 254, 1_000_000, GOALS))
-    sentence = analyze_log(write([], packets)).verdict.sentences[2]
-    assert sentence.endswith(words)
-    assert sentence.count("(main)") == 3
-
-
 def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make) -> None:
     packets = [Wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), Wire(PacketKind.STATUS, 5, 500, ANSWER)]
     packets.append(Wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
@@ -210,15 +196,12 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
 
 def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make) -> None:
     sentences = analyze_log(write([Cycle(0), Cycle(1, read=23_000)])).verdict.sentences
-    assert sentences[2] == (
-        "A cycle took up to 23.40 ms, longer than its period of 20.00 ms; its read took 23.00 ms: "
-        "own work 23.35 ms."
-    )
+    assert sentences[1].endswith("; a cycle took up to 23.40 ms, its read 23.00 ms: own work.")
 
 
 def test_rough_wake_ups_are_reported(write: Make) -> None:
     report = analyze_log(write([Cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
-    assert "3.0% came later than 150 us" in report.verdict.sentences[2]
+    assert "worst wake-up 200 us late, 3.0% more than 150 us." in report.verdict.sentences[1]
 
 
 def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:

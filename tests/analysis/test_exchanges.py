@@ -74,12 +74,7 @@ def test_the_first_reply_of_a_servo_answers_and_one_that_was_not_asked_does_not(
 
 @pytest.mark.parametrize(("kind", "loss"), [(LATE, Loss.LATE), (STATUS, Loss.OWN)])
 def test_a_reply_that_came_late_is_neither_missing_nor_broken(kind: PacketKind, loss: Loss) -> None:
-    wires = [
-        (ASK, 7, PING_7, 0),
-        (NOISE, 254, bytes(3), 1),
-        (ASK, 254, PING_ALL, 2),
-        (kind, 7, status(7), 3),
-    ]
+    wires = [(ASK, 7, PING_7, 0), (NOISE, 254, bytes(3), 1), (ASK, 254, PING_ALL, 2), (kind, 7, status(7), 3)]
     found = paired(wires)
     assert losses(found) == {7: loss}
     assert bool(found.due.broken[0]) == (loss is Loss.OWN)
@@ -145,7 +140,7 @@ def test_a_reply_that_nothing_asked_for(wires: Wires, unasked: list[int]) -> Non
     ("count", "ids", "told"),
     [
         (9, (4,), ""),
-        (10, (4,), "10 replies came that this run did not ask for (of ID 4), or that servo sends by itself."),
+        (10, (4,), "10 replies came that this run did not ask for (of ID 4)."),
         (12, (4, 9), "12 replies came that this run did not ask for (of IDs 4, 9)."),
     ],
 )

@@ -54,5 +54,5 @@ def test_joint_is_blocked_only_beyond_its_tolerance(
     assert verdict.good == good, verdict.sentences
     first = verdict.sentences[0]
     assert ("1 of 1 goal reached" in first) == good
-    still = {"frozen_position", "jammed_joint", "far_from_goal", "goes_no_further", "torque_limit"}
+    still = {"stood_still", "follows_worse"}
     assert bool(still & {one.code for one in verdict.findings}) != good, verdict.sentences

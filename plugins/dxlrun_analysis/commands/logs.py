@@ -50,7 +50,7 @@ def logs(
         The directory with the logs, or s3://BUCKET/PREFIX, where `dxlrun upload` has put some.
     where
         Only logs that meet this condition in SQL, such as "not good and lost > 10", or
-        "list_contains(findings, 'latency_timer')". A wrong name is answered with all names.
+        "list_contains(findings, 'late_replies')". A wrong name is answered with all names.
     sort
         Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
     sql

@@ -13,7 +13,7 @@ long as the values ever stayed before, and a second at least.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,40 +175,27 @@ class Sensors:
             lively = sum(_trembled(each.recent) >= _FEWEST_VALUES for each in one.each)
             inside = sum(stay.inside for stay in still.values())
             if name in sensors and whole.hung_s and whole.moved:
-                yield Finding(
-                    "sensor_hangs",
-                    name,
-                    f"Sensor {name} hangs: all its values were the same for {whole.hung_s:.1f} s while "
-                    f"joints moved, from {whole.from_s:.1f} s of the run on, and changed all the time "
-                    "before.",
-                    "Look at its driver and its plug: samples came, but nothing was measured.",
-                    Rank.SERVO_CAUSE,
-                    5.0,
-                )
+                yield self._frozen(name, "all its values", whole, " while joints moved")
             elif still and len(still) == lively and _at_once(still.values()):
                 if 2 * inside >= lively and any(each.moved or each.rested for each in still.values()):
                     stay = max(still.values(), key=lambda stay: stay.from_s)
-                    what = f"{listed(list(still), _MOST_NAMED)} {'was' if len(still) == 1 else 'were'}"
-                    yield self._stands(name, what, stay, Rank.SERVO_CAUSE)
+                    yield self._frozen(name, listed(list(still), _MOST_NAMED), stay)
             else:
                 for state, stay in still.items():
                     if stay.values >= _FEWEST_ALONE and stay.inside and lively > len(still):
-                        others = "; its other values went on"
-                        yield self._stands(name, f"{state} was", stay, Rank.CAUSE, others)
+                        others = ", while its other values went on"
+                        yield replace(self._frozen(name, state, stay, others), rank=Rank.CAUSE)
 
-    def _stands(self, name: str, what: str, stay: _Stay, rank: Rank, others: str = "") -> Finding:
+    def _frozen(self, name: str, values: str, stay: _Stay, then: str = "") -> Finding:
         found = [(bus, each) for bus in self._plan.buses for each in bus.devices if each.name == name]
         where = "".join(f" (ID {each.servo_id} on bus {bus.name})" for bus, each in found)
-        return Finding(
-            "device_hangs" if found else "sensor_hangs",
-            name,
-            f"{'Device' if found else 'Sensor'} {name}{where} stands still: {what} unchanged to the bit for "
-            f"{stay.hung_s:.1f} s while it answered, from {stay.from_s:.1f} s of the run on"
-            f"{others}; before, it trembled, and stayed for {stay.usual_s * 1e3:.0f} ms at most.",
-            "Its values are old: look at what it measures with, and switch it off and on.",
-            rank,
-            5.0,
+        kind = "Device" if found else "Sensor"
+        sentence = (
+            f"{kind} {name}{where} is frozen: {values} stayed the same to the bit for "
+            f"{stay.hung_s:.1f} s{then}, from {stay.from_s:.1f} s of the run on; before, for "
+            f"{stay.usual_s * 1e3:.0f} ms at most."
         )
+        return Finding("frozen", name, sentence, rank=Rank.SERVO_CAUSE, share=5.0)
 
 
 def _trembled(values: Floats) -> int:

@@ -1,21 +1,29 @@
-"""How a joint follows: how far it is off where a joint like it would be, turn by turn and place by place.
+"""Joints that follow, but otherwise than they did: compared place by place, and each way by itself.
 
 A servo with a position control is behind its trajectory by a constant time, whatever its speed. So a joint is
 compared with its trajectory as late as joints of its kind are, and what is left is what weighs on it, rubs,
-or gives: its own.
+or gives: its own. A *visit* is a stay at a place where the joint was before, going the same way as fast, or
+at rest; it is compared with the stays before. A joint *follows worse* where it is off by 2 deg more, or takes
+an eighth of its torque more or less, at three visits and half a second, and by three times as much as any
+other joint that moved, or any but one: where others show it too, it is the motion, the ground or the supply.
+It *oscillates* where it swings evenly around its goal, by 0.6 deg, ten times in a row, and that does not.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.failing import joint_finding
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Samples
 
@@ -35,26 +43,22 @@ _AGAIN_S = 0.5  # A joint that was at a place so long ago comes there again
 _CREEPS_RAD_S = 0.1  # By less it is nearly at rest, and may be on either side of what rubs
 _FASTER = 1.5
 _MOST_BEFORE = 12  # Stays at a place that later ones are compared with: the first ones of a run
-_AT_ONCE_S = 0.08
 _BENDS_RAD_S = 0.6
 """A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
-_BENDS_S, _BENT_S = 0.1, 0.16  # So long before and behind it that is measured, and so long it is thrown off
-_NEAR_RAD = 0.006
+_BENDS_S = 0.1  # So long before and behind it that is measured
 _SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or as many ticks
 _SWING_S = 0.2
 _UNEVEN = 0.4  # What swings by itself does so evenly
+_OTHERS = 3.0  # So many times what any other joint shows
+_FEWEST_OTHERS = 4
+_SIDE = re.compile("left|right|(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
+_OFF_RAD = 0.035  # 2 deg
+_LOAD = 0.12  # Of its torque
+_FEWEST_VISITS, _LASTS_S = 3, 0.5
+_SWINGS = 10  # In a row, to and fro being two
+_WAYS = ((1, "upwards"), (-1, "downwards"), (0, "at rest"))
 
 Flags = NDArray[np.bool_]
-
-
-class Turn(NamedTuple):
-    """Where a joint turns: what differs between its ways there and back, over the same places."""
-
-    at_s: float
-    behind: float  # rad, more than joints of its kind, in each direction
-    load: float  # More of it forth than back, halved: what the movement itself takes
-    stood: float  # rad that its goal went back before it did
-    speed: float  # rad/s, on the two ways
 
 
 class Visit(NamedTuple):
@@ -68,6 +72,7 @@ class Visit(NamedTuple):
     load: float
     load_was: float
     even: bool  # Its speed stays nearly the same: more or less of it takes no load
+    direction: int  # 0: nearly at rest
 
     @property
     def change(self) -> float:
@@ -114,45 +119,6 @@ class Followed(NamedTuple):
     load: Floats  # As a part of its torque
     speed: Floats
 
-    def turns(self) -> list[Turn]:
-        """Return how it turns, where it goes at least 6 deg there and back."""
-        found = []
-        edges = np.flatnonzero(np.diff(np.isfinite(self.goal), prepend=False, append=False))
-        for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            at = [begin + index for index in _turning(self.goal[begin:end], STROKE_RAD)]
-            for three in zip(at, at[1:], at[2:], strict=False):
-                turn = self._turn(*three)
-                if turn is not None:
-                    found.append(turn)
-        return found
-
-    def _turn(self, begin: int, at: int, end: int) -> Turn | None:
-        there, back = slice(begin, at + 1), slice(at, end + 1)
-        sign = 1.0 if self.goal[at] > self.goal[begin] else -1.0
-        ends = np.sort([[self.goal[begin], self.goal[at]], [self.goal[at], self.goal[end]]], axis=1)
-        low, high = ends[:, 0].max(), ends[:, 1].min()
-        margin = 0.2 * (high - low)
-        values = []
-        for way in (there, back):
-            inside = (self.goal[way] > low + margin) & (self.goal[way] < high - margin)
-            known = inside & np.isfinite(self.off[way])
-            if high - low < STROKE_RAD or known.sum() < max(3.0, 0.8 * inside.sum()):
-                return None
-            quantities = (self.off, self.load, np.abs(self.speed))
-            values.append([float(np.median(each[way][known])) for each in quantities])
-        (off, load, speed), (off_back, load_back, speed_back) = values
-        far = sign * self.position[begin : end + 1]
-        near = max(2 * self.joint.tick / self.joint.share, _NEAR_RAD)
-        stays = np.flatnonzero(sign * self.position[back] >= np.nanmax(far) - near)
-        stood = abs(self.goal[at + stays[-1]] - self.goal[at]) - near if len(stays) else 0.0
-        return Turn(
-            float(self.at_s[at]),
-            sign * (off_back - off) / 2,
-            sign * (load - load_back) / 2,
-            max(0.0, float(stood)),
-            (speed + speed_back) / 2,
-        )
-
     def visits(self, least: float, least_load: float) -> Iterator[Visit]:
         """Yield each stay at a place where it was before, going the same way as fast, or at rest.
 
@@ -191,7 +157,7 @@ class Followed(NamedTuple):
             if before:
                 seconds, middle = stay.end_s - at_s + self.step_s, (here + 0.5) * _PLACE_RAD
                 even = not bends[begin:end].any()
-                yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even)
+                yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even, stay.direction)
 
     def _load_at_rest(self) -> Floats:
         """Return the load without what the speed takes."""
@@ -218,17 +184,6 @@ class Followed(NamedTuple):
         pairs = zip(edges[::2], edges[1::2], strict=True)
         turns = [begin + at for begin, end in pairs for at in _turning(values[begin:end], least)[1:-1]]
         return self.at_s[turns]
-
-    def jerks(self) -> Floats:
-        """Return by how much it is off otherwise 80 ms later.
-
-        0 where its goal went as far; NaN where its trajectory bends.
-        """
-        at_once, bent = _samples(_AT_ONCE_S, self.step_s), _samples(_BENT_S, self.step_s)
-        change, went = (np.abs(each[at_once:] - each[:-at_once]) for each in (self.off, self.goal))
-        change = np.append(np.where(change > went, change, 0.0), np.full(at_once, np.nan))
-        change[np.convolve(self._bends(), np.ones(2 * bent + 1), "same") > 0] = np.nan
-        return change
 
     def _bends(self) -> Flags:
         """Return where the speed of its trajectory changes within 0.2 s, or is not known."""
@@ -342,3 +297,89 @@ def _even(at_s: Floats) -> bool:
 def _nearest(value: float, before: Sequence[float]) -> float:
     """Return what is nearest to a value between the least and the greatest before; itself where none was."""
     return min(max(value, min(before)), max(before)) if before else value
+
+
+# The rules
+
+
+class _Shown(NamedTuple):
+    """What one joint shows: its visits and swings, and the most of each."""
+
+    one: Followed
+    visits: list[Visit]
+    swings: Floats
+
+    @property
+    def off(self) -> float:
+        return max((visit.change for visit in self.visits), default=0.0)
+
+    @property
+    def load(self) -> float:
+        return max((visit.load_change for visit in self.visits), default=0.0)
+
+
+def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
+    """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
+    seen = [
+        _Shown(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
+        for one in joints
+        if one.row not in named
+    ]
+    for mine in seen:
+        others = [each for each in seen if each is not mine]
+        found = _swings(mine, others) or _follows_worse(mine, others)
+        if found is not None:
+            yield found
+
+
+def _most(values: Iterable[tuple[float, str]], name: str) -> float:
+    """Return the most that others show, 0.0 at least; `values`: each with the name of the joint.
+
+    Of many others the worst may be another one that is not well; unless it is its mirror image, which the
+    same happens to.
+    """
+    ordered = sorted((value, _SIDE.sub("", other) == _SIDE.sub("", name)) for value, other in values)
+    alone = len(ordered) >= _FEWEST_OTHERS and not ordered[-1][1]
+    return max(0.0, ordered[-2 if alone else -1][0]) if ordered else 0.0
+
+
+def _follows_worse(mine: _Shown, others: Sequence[_Shown]) -> Finding | None:
+    joint = mine.one.joint
+    least = max(_OFF_RAD, _OTHERS * _most(((one.off, one.one.joint.name) for one in others), joint.name))
+    heavy = max(_LOAD, _OTHERS * _most(((one.load, one.one.joint.name) for one in others), joint.name))
+    off = [one for one in mine.visits if one.change > least]
+    bad = off if _lasts(off) else [one for one in mine.visits if one.load_change > heavy]
+    if not _lasts(bad):
+        return None
+    parts = [text for way, name in _WAYS if (text := _compared(mine.one, name, bad, way))]
+    text = f"follows otherwise than before at the same places: {'; '.join(parts)}"
+    found = joint_finding("follows_worse", joint, text, bad[0].at_s, brief=True)
+    return found if bad is off else replace(found, rank=Rank.REMARK)
+
+
+def _lasts(visits: Sequence[Visit]) -> bool:
+    return len(visits) >= _FEWEST_VISITS and sum(each.seconds for each in visits) >= _LASTS_S
+
+
+def _compared(one: Followed, name: str, visits: Iterable[Visit], way: int) -> str:
+    """Return by how much a joint is off in one direction, how late, and with what load; empty: not at all."""
+    mine = [visit for visit in visits if visit.direction == way]
+    if not mine:
+        return ""
+    off, was = (float(np.median([visit[at] for visit in mine])) for at in (3, 4))
+    loads = np.array([(each.load, each.load_was) for each in mine if math.isfinite(each.load_was)])
+    text = f"{name} it is off by {math.degrees(off):.1f} deg instead of {math.degrees(was):.1f}"
+    if len(loads):
+        load, load_was = np.median(np.abs(loads), axis=0).tolist()
+        text += f", with {load:.0%} of its torque instead of {load_was:.0%}"
+    return text
+
+
+def _swings(mine: _Shown, others: Sequence[_Shown]) -> Finding | None:
+    at_s, joint = mine.swings, mine.one.joint
+    theirs = _most(((float(len(one.swings)), one.one.joint.name) for one in others), joint.name)
+    if len(at_s) < max(_SWINGS, _OTHERS * theirs):
+        return None
+    hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
+    text = f"oscillates around its goal, {hertz:.0f} times a second, {len(at_s) // 2} times in a row"
+    return replace(joint_finding("oscillates", joint, text, float(at_s[0]), brief=True), rank=Rank.REMARK)

@@ -16,12 +16,19 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Bins
-from dxlrun_analysis.joints.failing import AWAY, AWAY_RAD, MOVED_RAD, WORSE, Windows, failure_of
-from dxlrun_analysis.joints.following import followed
-from dxlrun_analysis.joints.kinds import KINDS, distance, finding, finding_of
+from dxlrun_analysis.joints.failing import (
+    AWAY,
+    AWAY_RAD,
+    MOVED_RAD,
+    WORSE,
+    Windows,
+    distance,
+    failure_of,
+    joint_finding,
+)
+from dxlrun_analysis.joints.following import changed, followed
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Trail
-from dxlrun_analysis.joints.wear import worn
 
 _NONE: Mapping[str, float] = {}
 _WINDOW_S = 0.5
@@ -62,7 +69,7 @@ class _Jumps:
         times = "" if self.count == 1 else f" {self.count} times"
         most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
         text = f"shows a position that jumped{times}, by up to {most}, faster than its model turns"
-        return finding("position_jumped", joint, text, since_s)
+        return joint_finding("position_jumped", joint, text, since_s, brief=True)
 
 
 class Movement:
@@ -158,7 +165,7 @@ class Movement:
         return np.maximum(self._swings(cycles, way), np.where(begins, 2.0 * rate, 0.0))
 
     def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
-        """Name joints that stand still, are blocked or weak, or follow worse than before.
+        """Name joints that stand still, oscillate, or follow worse than before, and positions that jumped.
 
         Args:
             reached_off: Distance at which a goal of a joint was reached, rad or m. A joint is not at
@@ -166,34 +173,32 @@ class Movement:
         """
         allowed = [max(reached_off.get(one.name, 0.0), one.logged.tolerance or 0.0) for one in self._joints]
         short, windows = self._windows(0.0, allowed), self._windows(_WINDOW_S, allowed)
-        bad = [(brief.joint, *failure_of(brief, each)) for brief, each in zip(short, windows, strict=True)]
-        shared = [joint for joint, _, failing in bad if failing is not None and KINDS[failing.code].shared]
-        together = len(shared) > max(1, len(bad) // 2)
+        found = [failure_of(brief, each) for brief, each in zip(short, windows, strict=True)]
+        shared = sum(failing is not None and failing.shared for _, failing in found)
+        together = shared > max(1, len(found) // 2)  # then it is the line, the supply, the load, the motion
         named: set[int] = set()
-        for row, (joint, one, failing) in enumerate(bad):
+        for row, (one, failing) in enumerate(found):
             if self._jumps[row].count:
+                yield self._jumps[row].finding(one.joint, self.bins.begin_ns)
+            if self._jumps[row].count or failing is not None:
                 named.add(row)
-                yield self._jumps[row].finding(joint, self.bins.begin_ns)
-            if failing is None:
+            if failing is None or (failing.shared and together):
                 continue
-            named.add(row)
-            if together and joint in shared:
-                continue
-            all_of_them = short if one is short[row] else windows
-            peers = [each.typical(AWAY, failing.when) for each in all_of_them if each is not one]
-            usual = float(np.nanmedian(peers)) if KINDS[failing.code].shared and peers else math.nan
-            if not one.typical(AWAY, failing.when) < WORSE * usual:
-                yield finding_of(one, failing, usual)
+            peers = [each for each in (short if one is short[row] else windows) if each is not one]
+            usual = [each.typical(AWAY, failing.when) for each in peers] if failing.shared else []
+            if not (usual and one.typical(AWAY, failing.when) < WORSE * float(np.nanmedian(usual))):
+                yield failing.finding(one)
         if together:
-            buses = {joint.bus for joint in shared}
+            buses = {one.joint.bus for one, failing in found if failing is not None and failing.shared}
             yield Finding(
-                "error_grew",
+                "follows_worse",
                 buses.pop() if len(buses) == 1 else "",
-                f"{len(shared)} of {len(bad)} joints followed badly, or worse than before, so it is none.",
-                "Look at what they share: the line, the supply, the load, the motion.",
-                Rank.SERVO,
+                f"{shared} of {len(found)} joints followed badly at once, or worse than before: it is what "
+                "they share, the line, the supply, the load or the motion.",
+                rank=Rank.SERVO,
             )
-        yield from worn(followed(self._joints, self._trail.samples()), named)
+        else:
+            yield from changed(followed(self._joints, self._trail.samples()), named)
 
     def _windows(self, seconds: float, allowed: Sequence[float]) -> list[Windows]:
         length_s, *values = self.bins.joined(seconds)

@@ -36,7 +36,6 @@ _LEAST_V = 0.3
 _FEWEST_VOLTAGES = 6
 _FEWEST_OTHERS = 2
 _DIPS_S = 1.5  # So long a servo's voltage has to be lower than the others': each is read about once a second
-_LOADED = 1.3  # So many times the load with which it is not lower is load that pulls it down
 _MOST_SAMPLES = 100_000  # Voltages kept
 
 
@@ -54,11 +53,10 @@ class Trend:
 
 
 class _Sample(NamedTuple):
-    """A voltage when it was read as another one, and the loads then, as shares of what the servos can."""
+    """A voltage when it was read as another one, and the loads of its bus then, as parts of the most."""
 
     joint: int
     volts: float
-    load: float
     bus_load: float
 
 
@@ -87,9 +85,9 @@ class Trends:
         for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
             for value in np.unique(values).tolist():
                 faults.update(joint.faults(value))
-        self._supply(cycles)
+        self._keep_volts(cycles)
 
-    def _supply(self, cycles: NDArray[np.void]) -> None:
+    def _keep_volts(self, cycles: NDArray[np.void]) -> None:
         """Keep the voltages that were read, each with the loads at that moment."""
         volts = cycles["voltage"]
         before = np.vstack([self._volts, volts[:-1]])
@@ -102,7 +100,7 @@ class Trends:
         for row, joint in zip(rows.tolist(), joints.tolist(), strict=True):
             if len(self._samples) < _MOST_SAMPLES:
                 bus_load = float(load[row, buses == buses[joint]].sum())
-                self._samples.append(_Sample(joint, volts[row, joint], load[row, joint], bus_load))
+                self._samples.append(_Sample(joint, volts[row, joint], bus_load))
 
     # Results
 
@@ -123,7 +121,7 @@ class Trends:
         )
 
     def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
-        """Name hot joints, overloaded ones that `movement` does not name, and low and sagging supplies."""
+        """Name hot and overloaded servos, those that `movement` names left out, and supplies."""
         if not self._joints:
             return
         named = {finding.subject for finding in movement}
@@ -131,106 +129,81 @@ class Trends:
         for index, joint in enumerate(self._joints):
             coldest = float(np.fmin.reduce(least[0, :, index], initial=math.nan))
             hottest = float(np.fmax.reduce(most[0, :, index], initial=math.nan))
-            yield from self._joint(index, joint, coldest, hottest, moves_badly=joint.name in named)
+            parts = list(self._heat(index, joint, coldest, hottest))
+            if "overload" in self._faults[index] and joint.name not in named:
+                parts.append("reported overload")
+            if parts:
+                yield cause(
+                    "servo_error", joint.name, f"{joint.name} ({joint.servos}) {' and '.join(parts)}."
+                )
         buses = np.array([joint.bus for joint in self._joints])
         for bus in dict.fromkeys(buses.tolist()):
             members = np.flatnonzero(buses == bus)
-            yield from self._power(
+            yield from self._supplies(
                 bus, members, least[1][:, members], mean[1][:, members], most[1][:, members]
             )
 
-    def _joint(
-        self, index: int, joint: PlannedJoint, coldest: float, hottest: float, *, moves_badly: bool
-    ) -> Iterable[Finding]:
-        faults = self._faults[index]
-        where = f"{joint.name} ({joint.servos})"
+    def _heat(self, index: int, joint: PlannedJoint, coldest: float, hottest: float) -> Iterable[str]:
         if hottest - coldest > _NONSENSE_C or hottest > _NONSENSE_C:
-            yield cause(
-                "temperature_sensor",
-                joint.name,
-                f"{where} reads temperatures that it cannot have: from {coldest:.0f} to {hottest:.0f} deg C.",
-                "Feel it: where it is not hot, its temperature sensor is broken, and does not protect it.",
-            )
+            yield f"reads temperatures that it cannot have, from {coldest:.0f} to {hottest:.0f} deg C"
             return
-        limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
-        if "overheating" in faults or hottest >= joint.hottest - _NEAR_LIMIT_C:
-            shut = ", and reported overheating" if "overheating" in faults else ""
-            measured = f"was hot, at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
-            yield cause(
-                "hot_joint",
-                joint.name,
-                f"{where} {measured}{shut}.",
-                "Let it cool; give it less load, pauses or air, and look for what makes it work at rest.",
-            )
-        if "overload" in faults and not moves_badly:
-            yield cause(
-                "overload",
-                joint.name,
-                f"{where} reported overload: its load is more than its torque.",
-                "Take load off the joint, or move it slower; a reboot clears the error.",
-            )
+        reported = "overheating" in self._faults[index]
+        if hottest >= joint.hottest - _NEAR_LIMIT_C:
+            yield f"was hot, at {hottest:.0f} deg C of {joint.hottest:.0f} deg C that it may have"
+        elif reported and math.isfinite(hottest):
+            yield f"was at {hottest:.0f} deg C"
+        if reported:
+            yield "reported overheating"
 
-    def _power(
+    def _supplies(
         self, bus: str, members: Numbers, least: Floats, mean: Floats, most: Floats
     ) -> Iterable[Finding]:
-        """Name the supply of a bus or of one servo; voltages in shape (bins, members)."""
+        """Name the supply of a bus, or of one servo; voltages in shape (bins, members)."""
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
         reported = np.array(["voltage" in self._faults[index] for index in members])
-        joints = [self._joints[index] for index in members]
-        above = highest > np.array([joint.highest_volts for joint in joints]) + _STEP_V / 2
-        if 2 * above.sum() > len(members):
-            limit = min(joint.highest_volts for joint in joints)
-            yield cause(
-                "overvoltage",
-                bus,
-                f"The supply of bus {bus} is too high: up to {highest.max():.1f} V, and its servos may have "
-                f"{limit:.1f} V; the lowest in the run was {lowest.min():.1f} V.",
-                "Take it off, and check the supply, its setting, or the charger and the number of cells.",
-                4.0,
-            )
-            return
-        falls = lowest < (1 - _SAG) * highest
+        above = highest > np.array([self._joints[index].highest_volts for index in members]) + _STEP_V / 2
         samples = [one for one in self._samples if one.joint in members]
-        if 2 * falls.sum() > len(members) > 1 and _falls_with_load(samples):
-            yield cause(
-                "sagging_supply",
-                bus,
-                f"The supply of bus {bus} {_how_it_falls(samples)}: from {highest.max():.1f} V to "
-                f"{lowest.min():.1f} V.",
-                "Use a stronger supply or a fresh battery, thicker and shorter cables, and feed the bus "
-                "at more than one end.",
-                2.0,
-            )
-            return
-        for index, volts in zip(members.tolist(), mean.T, strict=True):
-            found = self._own_supply(index, volts, mean[:, members != index])
-            if found is not None:
-                reported[members == index] = False
-                yield found
-        if reported.any():
-            alone = reported.sum() == 1 < len(members)
-            names = [joint.name for joint, bad in zip(joints, reported, strict=True) if bad]
-            low, high = (
-                max(joint.lowest_volts for joint in joints),
-                min(joint.highest_volts for joint in joints),
-            )
-            where = f"bus {bus}" if 2 * len(names) > len(members) > 1 else ", ".join(names)
-            measured = lowest[reported].min(), highest[reported].max()
-            yield cause(
-                "undervoltage",
-                names[0] if alone else bus,
-                _describe_voltage(where, (low, high), measured),
-                "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
-                4.0,
-            )
+        falls = (lowest < (1 - _SAG) * highest) & _falls_with_load(samples)
+        together = 2 * (falls | above).sum() > len(members)
+        for at in range(len(members)):
+            others = np.delete(mean, at, axis=1)
+            if not together and self._has_own_supply(mean[:, at], others):
+                reported[at] = False
+                how = f", while the others of bus {bus} had {np.nanmedian(others):.1f} V"
+                yield self._supply(bus, members[[at]], least[:, [at]], most[:, [at]], how)
+        for which, how in (
+            (above, ""),
+            (falls, _how_it_falls(samples) if falls.any() else ""),
+            (reported, ""),
+        ):
+            rows = np.flatnonzero(which)
+            of_bus = 2 * len(rows) > len(members) > 1
+            if of_bus or (which is reported and len(rows)):
+                said = "; an input voltage error was reported" if reported.any() else ""
+                rows = np.arange(len(members)) if of_bus else rows
+                yield self._supply(bus, members[rows], least[:, rows], most[:, rows], how + said)
+                return
 
-    def _own_supply(self, index: int, volts: Floats, others: Floats) -> Finding | None:
-        """Name a servo whose voltage falls while those of the others stay.
+    def _supply(self, bus: str, members: Numbers, least: Floats, most: Floats, how: str) -> Finding:
+        """Return what was measured of the voltage of some servos of a bus; shape (bins, members)."""
+        joints = [self._joints[index] for index in members]
+        alone = len(joints) == 1
+        where = f"at {joints[0].name} ({joints[0].servos})" if alone else f"of bus {bus}"
+        low, high = max(one.lowest_volts for one in joints), min(one.highest_volts for one in joints)
+        limits = f"; {low:.1f} to {high:.1f} V are allowed" if math.isfinite(high - low) else ""
+        measured = "is not known"
+        if np.isfinite(least).any():
+            lowest = np.fmin.reduce(least, axis=1)
+            at_s = float(np.nanargmin(lowest)) * self._bins.bin_ns / 1e9
+            measured = f"was {np.nanmin(lowest):.1f} V at {at_s:.1f} s of the run, its lowest, and "
+            measured += f"{np.nanmax(most):.1f} V at most"
+        sentence = f"The supply voltage {where} {measured}{how}{limits}."
+        return cause("supply", joints[0].name if alone else bus, sentence, share=4.0)
 
-        Where it reported that, it is left to `undervoltage` unless it falls with the servo's load.
-        """
+    def _has_own_supply(self, volts: Floats, others: Floats) -> bool:
+        """Return whether the voltage of a servo falls while those of the others stay."""
         if others.shape[1] < _FEWEST_OTHERS or not np.isfinite(volts).any():
-            return None
+            return False
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # before the first voltage there is none
             usual = np.nanmedian(others, axis=1)
@@ -241,45 +214,13 @@ class Trends:
             lowest = np.fmin.reduce(others, axis=1)
         least = np.maximum(_SAG * usual, _LEAST_V)
         dips = (below > least) & (usual - lowest < least)
-        if dips.sum() * self._bins.bin_ns / 1e9 < _DIPS_S:
-            return None
-        joint, at = self._joints[index], np.nanargmax(np.where(dips, below, -np.inf))
-        level = np.nanmax(volts) - least[at]
-        mine = [one for one in self._samples if one.joint == index]
-        loads = [[one.load for one in mine if (one.volts < level) == low] for low in (True, False)]
-        falls = np.count_nonzero(dips[1:] & ~dips[:-1])
-        loaded = falls > 1 and all(loads) and np.mean(loads[0]) > _LOADED * np.mean(loads[1])
-        if "voltage" in self._faults[index] and not loaded:
-            return None
-        return cause(
-            "own_supply",
-            joint.name,
-            f"The voltage at {joint.name} ({joint.servos}) falls{' with its load' if loaded else ''} to "
-            f"{np.nanmin(volts[dips]):.1f} V while the others of bus {joint.bus} stay at {usual[at]:.1f} V.",
-            "Check its plug and the cable that leads to it alone: contacts with a high resistance.",
-            4.0,
-        )
-
-
-def _describe_voltage(where: str, limits: tuple[float, float], measured: tuple[float, float]) -> str:
-    """Describe the voltage of servos that reported an error of it; `measured`: lowest and highest."""
-    (low, high), (lowest, highest) = limits, measured
-    bounds = f" of {low:.1f} to {high:.1f} V" if math.isfinite(high - low) else ""
-    volts = f"{lowest:.1f} V" if f"{lowest:.1f}" == f"{highest:.1f}" else f"{lowest:.1f} to {highest:.1f} V"
-    if not math.isfinite(lowest):
-        return f"The voltage of {where} is out of its limits{bounds}."
-    if bounds and low <= lowest and highest <= high:
-        return (
-            f"An input voltage error of {where} was reported, but each voltage that was read is within the "
-            f"limits{bounds}: {volts}. A dip or a peak between two readings is not seen."
-        )
-    return f"The voltage of {where} is out of its limits{bounds}: {volts}."
+        return bool(dips.sum() * self._bins.bin_ns / 1e9 >= _DIPS_S)
 
 
 def _how_it_falls(samples: list[_Sample]) -> str:
-    volts, load = np.array(samples)[:, 1], np.array(samples)[:, 3]
+    volts, load = np.array(samples)[:, 1], np.array(samples)[:, 2]
     by_load, by_time = (abs(np.corrcoef(volts, one)[0, 1]) for one in (load, np.arange(len(volts))))
-    return "runs down in the run, as a battery does" if by_time > by_load else "sags under load"
+    return "; it fell in the course of the run" if by_time > by_load else "; it falls while the load is high"
 
 
 def _falls_with_load(samples: list[_Sample]) -> bool:
@@ -287,7 +228,7 @@ def _falls_with_load(samples: list[_Sample]) -> bool:
     if len(samples) < _FEWEST_VOLTAGES:
         return False
     table = np.array(samples)
-    volts, load = table[:, 1], table[:, 3]
+    volts, load = table[:, 1], table[:, 2]
     loaded = load > np.median(load)
     if not loaded.any():
         return False

@@ -1,37 +1,27 @@
-"""Plots of findings: the curve of the joint that one names, and the median of the other joints; of a late
-servo its reply times by angle and temperature.
-"""
+"""Plots of findings: the curve of the joint that one names, and the median of the other joints."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
-from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.bins import Series
-from dxlrun_analysis.joints.kinds import KINDS
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Plot
 from dxlrun_analysis.page.joints import shown_in
 from dxlrun_analysis.report import Report
-from dxlrun_analysis.servos.traffic import ServoTraffic
 
-_SUPPLY = frozenset(("own_supply", "undervoltage"))
+_MOVEMENT = frozenset(("stood_still", "follows_worse", "position_jumped", "oscillates"))
 _PLOTS = {
     "machine-busy": "busy_machine",
-    "lateness": "rate_kept rough_wake_ups late_wake_ups throttled_processor",
-    "steps": "skipped_periods slow_writes own_work",
-    "worst-0": "long_cycle",
-    "replies": "latency_timer late_replies late_replies_everywhere slow_servo return_delay all_answered",
-    "lost": "missing_replies loose_cable lossy_servo shared_cable lossy_line silent_bus broken_replies "
-    "invalid_states noise",
-    "all-temperature": "hot_joint",
-    "all-voltage": "sagging_supply undervoltage power_lost",
-    "all-effort": "overload",
-    "events-timeline": "servo_errors errors_logged another_host",
+    "lateness": "kept_rate",
+    "steps": "skipped own_work",
+    "replies": "late_replies slow_servo replies",
+    "lost": "lossy_servo lossy_line broken_replies invalid_states noise",
+    "all-voltage": "supply power_lost",
+    "events-timeline": "servo_error errors_logged another_host",
 }
 """Plots of the page, and the codes of the findings that each shows."""
 
@@ -46,13 +36,10 @@ def finding_plots(canvas: Canvas, report: Report) -> list[Plot]:
     units = {joint.name: joint.unit for joint in report.joints}
     plots: list[Plot] = []
     for number, finding in enumerate(report.verdict.findings):
-        if finding.code == "slow_servo":
-            plots += _by_place(canvas, number, finding, report.servos)
-            continue
         of = next((trend for trend in report.trends if trend.joint == finding.subject), None)
-        if of is None or finding.code not in KINDS.keys() | _SUPPLY:
+        if of is None or finding.code not in _MOVEMENT | {"supply"}:
             continue
-        moves = finding.code in KINDS
+        moves = finding.code in _MOVEMENT
         unit, scale = shown_in(units[of.joint]) if moves else ("V", 1.0)
         label = f"{'error' if moves else 'voltage'}, {unit}"
         others = [
@@ -73,21 +60,6 @@ def finding_plots(canvas: Canvas, report: Report) -> list[Plot]:
         plot.named(of.joint, plot.model.line(times, own, color=ERROR))
         plots.append(plot)
     return plots
-
-
-def _by_place(
-    canvas: Canvas, number: int, finding: Finding, servos: Sequence[ServoTraffic]
-) -> Iterator[Plot]:
-    own = next((servo.own for servo in servos if servo.own and servo.joint == finding.subject), None)
-    by = () if own is None else (own.by_angle, own.by_temperature)
-    for label, points in zip(("angle of the servo, deg", "temperature, deg C"), by, strict=False):
-        if len(points) > 1:
-            axes = (label, "reply time, us")
-            plot = canvas.free(f"finding-{number}-{label[:5]}", finding.code, axes, 150)
-            plot.text = finding.sentence
-            at, us = zip(*points, strict=True)
-            plot.named(f"{finding.subject}: median", plot.model.line(at, us, color=ERROR))
-            yield plot
 
 
 def _values(trend: Trend, *, moves: bool) -> Floats:

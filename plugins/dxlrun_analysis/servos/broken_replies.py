@@ -1,4 +1,4 @@
-"""Broken replies: whether bytes that belong to no packet come where one ID alone is due, and nowhere else."""
+"""Bytes that belong to no packet: where one ID alone is due, and nowhere else, or anywhere on a bus."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.requests import IDS
 
 _FEWEST = 5
+_FEWEST_NOISY, _NOISY_SHARE = 10, 0.005  # Exchanges, and their share, from which it is no plug that is moved
 _BESIDE = 12  # Bytes of a status packet beside its data, at most; others that came belong to another sender
 _ALONE = 0.7  # Share of the exchanges of a bus with such bytes from which they are one ID's
 
 
 class BrokenReplies:
-    """Counts broken replies of each ID."""
+    """Counts broken replies of each ID, and noise."""
 
     def __init__(self, buses: int) -> None:
         self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
         """Of each servo; of these as the first of several, none of them intact; and at the end of a shared
         status packet."""
-        self._noisy = np.zeros(buses, np.int64)  # Exchanges of each bus
+        self._noisy, self._disturbed, self._asked = np.zeros((3, buses), np.int64)
+        """Exchanges of each bus with such bytes, those where they are no cut reply, and all."""
 
     def take(self, exchanges: Exchanges) -> None:
         """Count those of some exchanges."""
@@ -44,16 +46,35 @@ class BrokenReplies:
         self._broken += np.bincount(servo, minlength=buses * IDS)
         self._cut += np.bincount(cut, minlength=buses * IDS)
         self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
+        # in an incomplete fast status they are cut blocks
+        cut_blocks = exchanges.requests.fast[exchanges.request]
+        cut_blocks[np.setdiff1d(np.arange(len(cut_blocks)), due.exchange[due.reply < 0])] = False
+        disturbed = (exchanges.noise > 0) & ~cut_blocks
+        self._disturbed += np.bincount(exchanges.bus[disturbed], minlength=buses)
+        self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
-        """Name the one ID of a bus whose replies are broken; not where that depends on the joint's angle."""
+        """Name the one ID of a bus whose replies are broken, or noise on it."""
+        return self._broken_ones(index, bus, losses) or self._noise(index, bus)
+
+    def _noise(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
+        noisy, asked = int(self._disturbed[index]), int(self._asked[index])
+        if noisy < max(_FEWEST_NOISY, _NOISY_SHARE * asked):
+            return ()
+        after = f"{counted(noisy, 'instruction', 'instructions')} of {asked}"
+        sentence = f"Noise on bus {bus.name}: bytes that belong to no packet came after {after}."
+        return (cause("noise", bus.name, sentence, share=noisy / max(asked, 1)),)
+
+    def _broken_ones(
+        self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]
+    ) -> Sequence[Finding]:
         mine = self._broken[index * IDS : (index + 1) * IDS]
         total = int(self._noisy[index])
         if total < _FEWEST or len(losses) < 2:  # of a single servo it is the line
             return ()
         servo_id = int(np.argmax(mine))
         broken, lost = int(mine[servo_id]), losses.get(servo_id)
-        if broken < _ALONE * total or lost is None or lost.angles is not None:
+        if broken < _ALONE * total or lost is None:
             return ()
         # in a short chain the line spoils the first one often, too
         head = int(self._first[index * IDS + servo_id])
@@ -61,17 +82,8 @@ class BrokenReplies:
         if not behind and not has_them_alone(broken, total - broken):
             return ()
         (name, named), asked = bus.called(servo_id), lost.asked + lost.broken_off
+        times = f"{counted(broken, 'time', 'times')} of {asked}"
         end = self._cut[index * IDS + servo_id] >= _ALONE * broken
-        cut = "; or the end of the status packet that all share, which is its part, is lost" if end else ""
-        return (
-            cause(
-                "broken_replies",
-                name,
-                f"The replies of {named} come broken, "
-                f"{counted(broken, 'time', 'times')} of {asked}, and those of the others do not: two "
-                f"servos have its ID, or its own driver or plug is bad{cut}.",
-                f"Unplug {name} and run `dxlrun scan {bus.port or 'PORT'}`: if ID {servo_id} still answers, "
-                "two servos have it; else check its plugs, and exchange it where a new cable does not help.",
-                broken / max(asked, 1),
-            ),
-        )
+        cut = "; it is the last part of the status packet that all share" if end else ""
+        sentence = f"The replies of {named} come broken, {times}, and those of the others do not{cut}."
+        return (cause("broken_replies", name, sentence, share=broken / max(asked, 1)),)

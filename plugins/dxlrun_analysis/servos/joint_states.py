@@ -1,7 +1,4 @@
-"""Angles and temperatures of the joints in each cycle, and how long each was at which, as plain counts.
-
-Places of a joint are its angles in bins of 5 deg, then its temperatures in whole deg C.
-"""
+"""At which angle, speed and temperature each joint was in each cycle, and for how long, in bins of each."""
 
 from __future__ import annotations
 
@@ -19,23 +16,21 @@ from dxlrun_analysis.plan import LoggedPlan
 Numbers = NDArray[np.int64]
 
 _IDS = 256
-BIN_DEG = 5
-ANGLES = 720 // BIN_DEG  # From -360 to 360 deg; what is beyond is in the outer ones
-STEP_RAD_S = 0.1
-SPEEDS = 200  # From 0 to 20 rad/s; what is faster is in the last one
-PLACES = ANGLES + 112  # Then 0 to 111 deg C, with what is beyond in the outer ones, too
+BINS = 200
+QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
+_STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: what one bin has
+_FIRST = np.array([-BINS // 2, 0, 0])  # The number of steps where the first bin begins
 _MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a whole log they are those of 20 s
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where the joints were in some cycles; shape (cycles, joints), -1: not known, or offline."""
+    """Where the joints were in some cycles."""
 
     cycle: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
     """Their numbers, ascending; shape (cycles,)."""
-    angle: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
-    temperature: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))
-    speed: Numbers = field(default_factory=lambda: np.zeros((0, 0), np.int64))  # In bins of 0.1 rad/s
+    bins: Numbers = field(default_factory=lambda: np.zeros((0, len(QUANTITIES), 0), np.int64))
+    """Of each quantity, -1: not known, or offline; shape (cycles, quantities, joints)."""
 
 
 class JointStates:
@@ -48,9 +43,7 @@ class JointStates:
         """Row of the joint that each servo moves; one that moves several counts with the first."""
         self.share = np.ones(len(joints))
         """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
-        self.time_ns, self.crossed = (np.zeros((len(joints), PLACES), np.int64) for _ in range(2))
-        """How long each joint was at each place, and how often it came to it from below or left it so."""
-        self.speed_ns = np.zeros((len(joints), SPEEDS), np.int64)  # How long each joint was how fast
+        self.time_ns = np.zeros((len(joints), len(QUANTITIES), BINS), np.int64)  # Spent in each bin
         self._held: list[tuple[Numbers, Numbers, Floats, NDArray[np.bool_], Floats]] = []
         indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}
@@ -86,37 +79,28 @@ class JointStates:
             known = np.isfinite(angle[:, row])
             if known.any() and not known.all():
                 angle[:, row] = np.interp(numbers, numbers[known], angle[known, row])
-        speed = _speeds(numbers, period_ns, angle)[:end]
         self._held = [(numbers[end:], period_ns[end:], angle[end:], usable[end:], heat[end:])]
-        binned = np.floor(np.degrees(np.nan_to_num(angle[:end])) / BIN_DEG).astype(np.int64) + ANGLES // 2
-        known = usable[:end] & np.isfinite(angle[:end])
-        angles = np.where(known, np.clip(binned, 0, ANGLES - 1), -1)
-        degrees = np.rint(np.nan_to_num(heat[:end])).astype(np.int64) + ANGLES
-        known = usable[:end] & np.isfinite(heat[:end])
-        temperatures = np.where(known, np.clip(degrees, ANGLES, PLACES - 1), -1)
-        for places in (angles, temperatures):
-            self._count(places, period_ns[:end])
-        known = usable[:end] & np.isfinite(speed)
-        steps = np.minimum(np.nan_to_num(speed) / STEP_RAD_S, SPEEDS - 1).astype(np.int64)
-        speeds = np.where(known, steps, -1)
-        for row, mine in enumerate(speeds.T):
-            ns = period_ns[:end][mine >= 0]
-            self.speed_ns[row] += np.bincount(mine[mine >= 0], ns, SPEEDS).astype(np.int64)
-        return Places(numbers[:end], angles, temperatures, speeds)
+        found = np.stack([angle, _speeds(numbers, period_ns, angle), heat], axis=1)[:end]
+        known = np.isfinite(found) & usable[:end, None]
+        steps = np.floor(np.where(known, found, 0.0) / _STEPS[:, None]).astype(np.int64)
+        bins = np.where(known, np.clip(steps - _FIRST[:, None], 0, BINS - 1), -1)
+        for joint in range(len(self.share)):
+            for quantity in QUANTITIES:
+                mine = bins[:, quantity, joint]
+                spent = np.bincount(mine[mine >= 0], period_ns[:end][mine >= 0], BINS)
+                self.time_ns[joint, quantity] += spent.astype(np.int64)
+        return Places(numbers[:end], bins)
 
-    def _count(self, places: Numbers, period_ns: Numbers) -> None:
-        for row, mine in enumerate(places.T):
-            known = mine >= 0
-            self.time_ns[row] += np.bincount(mine[known], period_ns[known], PLACES).astype(np.int64)
-            low, high = np.sort([mine[known][:-1], mine[known][1:]], axis=0)
-            ends = np.bincount(low + 1, minlength=PLACES + 1) - np.bincount(high + 1, minlength=PLACES + 1)
-            self.crossed[row] += np.cumsum(ends)[:PLACES]
-
-    def range_text(self, servo: int, low: float, high: float) -> str:
-        """Write a range of a servo's angles, rad, for people, in the unit of its joint."""
-        share = float(self.share[self.joint_of[servo]])
+    def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
+        """Write a range of bins for people, the last one included, in the unit of the joint."""
+        begin, end = ((at + _FIRST[quantity]) * _STEPS[quantity] for at in (low, high + 1))
+        if quantity == TEMPERATURE:
+            return f"from {begin:.0f} deg C on" if high == BINS - 1 else f"at {begin:.0f} to {end:.0f} deg C"
+        share = float(self.share[joint])
         factor, unit = (math.degrees(1.0), "deg") if share == 1.0 else (share * 1e3, "mm")
-        return f"between {low * factor:.0f} and {high * factor:.0f} {unit}"
+        if quantity == SPEED:
+            return f"when it is faster than {begin * factor:.0f} {unit}/s"
+        return f"between {begin * factor:.0f} and {end * factor:.0f} {unit}"
 
 
 def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
@@ -126,8 +110,3 @@ def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
         took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)
         found[1:-1] = np.abs(angle[2:] - angle[:-2]) / took_s[:, None]
     return found
-
-
-def edge_rad(place: int) -> float:
-    """Return the lower edge of a bin of angles, rad."""
-    return math.radians((place - ANGLES // 2) * BIN_DEG)

@@ -1,91 +1,49 @@
-"""Missing replies: whose they are, at which angle of the joint, and which servos miss theirs together.
+"""Missing replies: who failed in the same cycles as whom, over all buses, and who answered meanwhile.
 
-Whose: of a chain of replies only the first that is missing is a servo's own, those behind wait for it in vain
-(ROBOTIS e-Manual, Protocol 2.0, Sync Read; see `Loss`). Where nothing arrived of a chain, its instruction may
-be lost: that is the line's, but for the test of angles, for which it may be the first servo's.
+An *outage* is what a servo misses until it answers again; it begins with a loss that may be its own: of a
+chain of replies only the first that is missing is, those behind wait for it in vain (ROBOTIS e-Manual,
+Protocol 2.0, Sync Read; see `Loss`). Outages that overlap, or begin in one cycle, are one *occasion*. Whose
+it is:
 
-Independent: losses are one episode until the servo has answered again, and for 0.2 s. A cable that is cut for
-a second is one, however often its servo is read. At which angle or speed they begin is asked of those that
-are 0.2 s behind the last loss: of a contact that flickers only the first.
+- of the machine, or of what buses share, where servos of several buses failed in it. It counts against no
+  servo and no single bus;
+- of the bus, where several failed, and no reply came from the first loss to the last;
+- else of the servos that failed, together: others of their bus answered.
 
-At which angle: each joint has a histogram of the time it spent in bins of 5 deg, and of the angles at which
-episodes began; the angle at a lost reply is taken from the states before and behind it. A range is named that
-has at least 90 % of the episodes, and four times as large a share of them as of the time: six of them, or
-five in a tenth of the time.
-
-At which speed: the same with bins of 0.1 rad/s, but for all lost replies, and above a speed, where at least
-90 % of them are, in four episodes, and which the joint had in at most 60 % of the time; five times as often.
-
-Together: episodes of several servos that begin within 0.2 s, while the others of the bus answer.
+Where nothing came of a chain, it is open whether its instruction or its first servo is why. It is that
+servo's where instructions to single servos are hardly ever lost: a line would spoil those, too, two fifths as
+often as they are shorter [i].
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE
 from dxlrun.errors import counted
-from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
-from dxlrun_analysis.servos.joint_states import (
-    ANGLES,
-    BIN_DEG,
-    SPEEDS,
-    STEP_RAD_S,
-    JointStates,
-    Places,
-    edge_rad,
+from dxlrun_analysis.servos.joint_states import ANGLE, BINS, QUANTITIES, JointStates, Places
+from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
+
+_APART_NS = (
+    200_000_000  # Occasions of one part count as one until so long after the first: a plug that flickers
 )
-from dxlrun_analysis.servos.requests import IDS, Numbers
-
-_ROWS = 40
-_EPISODE_NS = 200_000_000
-_WIDEST = 90 // BIN_DEG  # Bins of the widest range that is tried
-
-_FEWEST = 5  # Episodes from which a cause is named
-_MANY, _NARROW = 6, 0.1  # Fewer episodes are named only in so small a part of the time
-_TIMES_MORE = 4.0
-"""So much more often than by the time spent there a reply is missing in a range that is named."""
-_INSIDE = 0.9  # Share of the episodes in it
-_SLOWEST = 3  # Bins of speeds below which a joint hardly moves
-_FEWEST_FAST, _FEWEST_TIMES, _MOST_TIME, _FAST_MORE = 12, 4, 0.6, 5.0
-"""Of losses at high speed: replies, episodes, share of the time, and how much more often than else."""
-_EVEN = 0.6  # A servo that has more of all episodes of its bus loses them alone
-_ALONE = 0.8
-"""A servo that has so many of the lost replies of its bus is named for losing them when it is fast."""
-_SHORTER = 0.4
-_LOSSY_LINE = 10  # Episodes of a whole bus from which its line is named
-_TOGETHER = 0.7
-"""Share of the episodes of a bus that are of several servos at once, or of these at once that are of each."""
-_MOST_EPISODES = 100_000  # Kept for each run
-_NOISY_SHARE = 0.005
-_FEWEST_NOISY = 10
-
-
-@dataclass(frozen=True, slots=True)
-class AngleRange:
-    """Where a joint's replies go missing, rad; the last bins included."""
-
-    low: float
-    high: float
-    episodes: int  # That began in it
-    time_share: float  # Of the run that the joint was there
-
-
-class Fast(NamedTuple):
-    """The speed above which a joint's replies go missing."""
-
-    rad_s: float
-    lost_share: float  # Of its lost replies
-    time_share: float  # Of the run that the joint was so fast
+_UNKNOWN_NS = 10_000_000  # Without cycles those are of one moment that are so close: a period of many robots
+_FEWEST = 5  # Occasions from which a part is named
+_TIMES_MORE = 10  # than another servo of the bus has in the median
+_TOGETHER = 0.7  # Share of the occasions of two servos that are of both: of a cable that they share
+_MOST = 0.6  # Share of a bus' occasions from which they are those of several buses
+_SHORTER = 0.4  # Bytes of an instruction to one servo, beside those of one to a chain
+_MOST_KEPT = 100_000  # Outages of a run, and cycles with late replies
+_INSIDE = 0.9  # Share of the losses in a range of angles, speeds or temperatures that is told
+_CHANCE = 1e-3  # With which they would be there if they did not depend on it
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,314 +52,320 @@ class ServoLosses:
 
     asked: int  # Those that it could have answered: none before them in a chain was missing
     lost: int
-    episodes: int
     broken_off: int = 0  # Reads of several in which it answers first, of which nothing came
-    angles: AngleRange | None = None  # The range of angles in which they are, where chance is excluded
-    fast: Fast | None = None  # The speed above which they are
+
+
+@dataclass(slots=True)
+class _Outage:
+    """What one servo misses until it answers again."""
+
+    servo: int
+    at_ns: int
+    cycle: int
+    places: list[int]  # Bins of its joint's angle, speed and temperature
+    answers: int  # Of its bus before its end; it has an end when it is new
+    answered: int  # By the servo itself
+    line: bool  # The whole chain was missing, at first
+    last: int = 0  # Cycle of its last loss, within 0.2 s
+    last_answers: int = 0  # Of its bus before that
+    late: bool = False  # No loss at all: a reply that came late
+
+
+@dataclass(slots=True)
+class _Count:
+    """Occasions of one part: all, and those that are so far apart that they count by themselves."""
+
+    apart: int = 0
+    last_ns: int = -(1 << 62)
+    places: list[list[int]] = field(default_factory=list)
+
+    def add(self, at_ns: int, places: list[int]) -> None:
+        if at_ns - self.last_ns > _APART_NS:
+            self.apart, self.last_ns = self.apart + 1, at_ns
+            self.places.append(places)
 
 
 class Losses:
-    """Collects missing replies and noise, in memory that does not grow with the log."""
+    """Collects outages, and cycles with late replies, in memory that does not grow with the log."""
 
     def __init__(self, states: JointStates) -> None:
-        self._states = states
-        servos = len(states.joint_of)
-        self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
-        self._last_ns, self._begun_ns = np.full((2, servos), -(1 << 62), np.int64)
-        """When each servo's last reply was lost, and when its last episode began."""
-        self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // IDS), np.int64)
+        self._states, servos = states, len(states.joint_of)
+        self._asked, self._lost, self._answered = np.zeros((3, servos), np.int64)
         self._chains, self._broken_off, self._alone, self._lost_alone = np.zeros((4, servos), np.int64)
         """Reads of several servos, by the first; those of which nothing came; reads of one; lost ones."""
-        self._answered = np.zeros(servos, np.int64)
-        self._answered_before = np.full(servos, -1, np.int64)  # The same before the last loss
-        self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
-        self._fast, self._begun_fast = np.zeros((2, len(states.share), SPEEDS), np.int64)
-        """Lost replies, and episodes, by the joint's speed."""
-        self._episodes_at: list[tuple[int, int, int]] = []  # Bus, time in ns and ID of each servo's own
+        self._answers = np.zeros(servos // IDS, np.int64)  # Of each bus so far
+        self._open: dict[int, _Outage] = {}  # The last outage of each servo
+        self._outages: list[_Outage] = []
+        self._late: list[_Outage] = []  # Cycles of a bus with late replies
+
+    # Collecting
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
-        """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""
-        due, ended = exchanges.due, exchanges.ended[exchanges.due.exchange]
-        # those that are a servo's own, and chains of which nothing came: they may be the first servo's
-        may_be = (due.loss == Loss.OWN) | ((due.loss == Loss.LINE) & (due.place == 0))
-        rows = np.flatnonzero(ended & may_be)
-        exchange, servo, own = due.exchange[rows], due.servo[rows], due.loss[rows] == Loss.OWN
-        bus, count = servo // IDS, exchanges.requests.servos[exchanges.request]
-        several, asked = count > 1, exchanges.ended & (count > 0)
-        head = np.zeros(len(count), np.int64)
-        head[due.exchange[due.place == 0]] = due.servo[due.place == 0]
-        # those up to the first missing one could have answered
+        """Take the missing replies of some exchanges; `places`: of the joints in their cycles."""
+        due, count = exchanges.due, exchanges.requests.servos[exchanges.request]
+        ended, exchange, bus = exchanges.ended[due.exchange], due.exchange, due.servo // IDS
+        cycles = _moments(exchanges)
+        came = (due.reply >= 0) | (due.loss == Loss.LATE)
+        missing = ended & ~came
+        own, several = missing & (due.loss == Loss.OWN), count > 1
+        nothing = missing & (due.loss == Loss.LINE) & (due.place == 0)
         first = np.full(len(count), IDS, np.int64)
-        first[exchange] = due.place[rows]
-        could = ended & (due.reply >= 0) & (due.place < first[due.exchange])
-        episodes, begins = self._begins(exchanges, servo, exchange)
-        for counts, servos in (
-            (self._chains, head[asked & several]),
-            (self._broken_off, head[exchange[~own]]),
-            (self._alone, head[asked & ~several]),
-            (self._lost_alone, head[exchange[own & ~several[exchange]]]),
-            (self._asked, np.append(due.servo[could], servo[own])),
-            (self._lost, servo[own]),
-            (self._episodes, servo[episodes & own]),
-            (self._line_episodes, bus[episodes]),
-            (self._exchanges, exchanges.bus[exchanges.request > 0]),
-            (self._noisy, exchanges.bus[_noisy(exchanges)]),
+        first[exchange[own | nothing]] = due.place[own | nothing]
+        could = ended & (due.reply >= 0) & (due.place < first[exchange])
+        asked = ended & (count > 0)[exchange]
+        for counts, rows in (
+            (self._chains, asked & several[exchange] & (due.place == 0)),
+            (self._broken_off, nothing),
+            (self._alone, asked & ~several[exchange]),
+            (self._lost_alone, own & ~several[exchange]),
+            (self._asked, could | own),
+            (self._lost, own),
         ):
-            np.add(counts, np.bincount(servos, minlength=len(counts)), out=counts)
-        begun = begins & own & (self._states.joint_of[servo] >= 0)
-        columns = (bus[begun], exchanges.asked_ns[exchange[begun]], servo[begun] % IDS)
-        at = list(zip(*(column.tolist() for column in columns), strict=True))
-        self._episodes_at += at[: _MOST_EPISODES - len(self._episodes_at)]
-        self._count_places(servo, exchanges.cycle[exchange], begins, places)
+            np.add(counts, np.bincount(due.servo[rows], minlength=len(counts)), out=counts)
+        answers = _before(bus, came, self._answers)
+        answered = _before(due.servo, came, self._answered)
+        rows = np.flatnonzero(missing)
+        joint = self._states.joint_of[due.servo[rows]]
+        at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]])
+        for row, of, place in zip(rows.tolist(), joint.tolist(), at.tolist(), strict=True):
+            servo, at_ns = int(due.servo[row]), int(exchanges.asked_ns[exchange[row]])
+            cycle, seen = int(cycles[exchange[row]]), int(answers[row])
+            out = self._open.get(servo)
+            if out is not None and out.answered == answered[row]:
+                if at_ns - out.at_ns <= _APART_NS:
+                    out.last, out.last_answers = cycle, seen
+            elif (own[row] or nothing[row]) and len(self._outages) < _MOST_KEPT:
+                known = of >= 0 and place < len(places.cycle)
+                where = places.bins[place, :, of].tolist() if known else [-1] * len(QUANTITIES)
+                whole, now = bool(nothing[row]), int(answered[row])
+                out = _Outage(servo, at_ns, cycle, where, seen, now, whole, cycle, seen)
+                self._open[servo] = out
+                self._outages.append(out)
 
-    def _begins(self, exchanges: Exchanges, servo: Numbers, exchange: Numbers) -> NDArray[np.bool_]:
-        """Return which losses begin an episode: its servo has answered since the last loss, and the last
-        episode began a while ago; and of which the last loss was so long ago. Shape (2, losses)."""
-        due = exchanges.due
-        answered, answers = due.servo[due.reply >= 0], due.exchange[due.reply >= 0]
-        keys = np.sort((answered << _ROWS) + answers) if len(servo) else answers
-        before = np.searchsorted(keys, (servo << _ROWS) + exchange) - np.searchsorted(keys, servo << _ROWS)
-        before += self._answered[servo]
-        self._answered += np.bincount(answered, minlength=len(self._answered))
-        begins = np.zeros((2, len(servo)), np.bool_)
-        for at in np.argsort(exchange, kind="stable").tolist():
-            one, at_ns = servo[at], exchanges.asked_ns[exchange[at]]
-            since = before[at] - self._answered_before[one]
-            past_ns = at_ns - np.array([self._begun_ns[one], self._last_ns[one]])
-            begins[:, at] = (since > 0) & (past_ns > _EPISODE_NS)
-            if begins[0, at]:
-                self._begun_ns[one] = at_ns
-            self._answered_before[one], self._last_ns[one] = before[at], at_ns
-        return begins
-
-    def _count_places(
-        self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], places: Places
-    ) -> None:
-        joint = self._states.joint_of[servo]
-        row = np.searchsorted(places.cycle, cycle)
-        usable = (joint >= 0) & (row < len(places.cycle))
-        joint, begins = joint[usable], begins[usable]
-        angle = places.angle[row[usable], joint]
-        speed = places.speed[row[usable], joint]
-        for places_of, all_of_them, those_that_begin in (
-            (angle, self._lost_at, self._begun),
-            (speed, self._fast, self._begun_fast),
-        ):
-            known = places_of >= 0
-            for counts, which in ((all_of_them, known), (those_that_begin, known & begins)):
-                np.add.at(counts, (joint[which], places_of[which]), 1)
+    def late(self, bus: Numbers, exchanges: Exchanges, rows: Numbers) -> None:
+        """Take exchanges whose replies were late, and their buses: one for each cycle."""
+        if len(self._answers) < 2:
+            return
+        cycles = _moments(exchanges)[rows]
+        _, first = np.unique(np.stack([bus, cycles]), axis=1, return_index=True)
+        for row in first.tolist()[: _MOST_KEPT - len(self._late)]:
+            cycle, at_ns = int(cycles[row]), int(exchanges.asked_ns[rows[row]])
+            one = _Outage(int(bus[row]) * IDS, at_ns, cycle, [], 0, 0, line=False, last=cycle, late=True)
+            self._late.append(one)
 
     # Results
 
     def finish(self) -> dict[tuple[int, int], ServoLosses]:
         """Return the losses of each servo that was asked, by index of the bus and ID."""
-        found = {}
-        for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
-            row = int(self._states.joint_of[servo])
-            angles = fast = None
-            if row >= 0:
-                fast = when_fast(self._states.speed_ns[row], self._fast[row], self._begun_fast[row])
-                angles = concentration(
-                    self._states.time_ns[row, :ANGLES], self._begun[row], self._lost_at[row]
-                )
-            found[divmod(servo, IDS)] = ServoLosses(
-                int(self._asked[servo]),
-                int(self._lost[servo]),
-                int(self._episodes[servo]),
-                int(self._broken_off[servo]),
-                angles,
-                fast,
+        return {
+            divmod(servo, IDS): ServoLosses(
+                int(self._asked[servo]), int(self._lost[servo]), int(self._broken_off[servo])
             )
+            for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist()
+        }
+
+    def occasions(self, always_late: Iterable[int] = ()) -> Occasions:
+        """Return whose each occasion is; `always_late`: buses whose late replies are no occasions."""
+        found = Occasions(self._states, self._heads())
+        skipped = set(always_late)
+        late = (one for one in self._late if one.servo // IDS not in skipped)
+        outages = sorted((*self._outages, *late), key=lambda one: one.cycle)
+        begin, end = 0, -(1 << 62)
+        for at, one in enumerate(outages):
+            if one.cycle > end and at:
+                found.add(outages[begin:at])
+                begin = at
+            end = max(end, one.last)
+        if outages:
+            found.add(outages[begin:])
         return found
 
-    def findings(self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses]) -> Iterable[Finding]:
-        """Name loose cables, servos that lose replies alone or together, and a lossy or noisy line."""
-        names = bus.names
-        together, times = self._group(index)
-        if together:
-            *before, last = (names.get(servo_id) or str(servo_id) for servo_id in together)
-            yield cause(
-                "shared_cable",
-                bus.name,
-                f"{', '.join(before)} and {last} on bus {bus.name} were lost together {times} times while "
-                "the other servos answered: the cable that leads to them, or a plug there.",
-                "Check the cable and the plug through which they are connected, and their supply.",
-                0.5,
-            )
-            losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
-        loose = set()
-        all_lost = sum(each.lost for each in losses.values())
-        for servo_id, each in losses.items():
-            name, named = bus.called(servo_id)
-            if (angles := each.angles) is not None:
-                where = self._states.range_text(index * IDS + servo_id, angles.low, angles.high)
-                seen = f"{where}: {counted(angles.episodes, 'time', 'times')} there, where it spent "
-                seen += f"{angles.time_share:.0%} of the time."
-                fix = "Move the joint there by hand, and check its cable and plugs,"
-            elif (fast := each.fast) is not None and each.lost >= _ALONE * all_lost:
-                share = self._states.share[self._states.joint_of[index * IDS + servo_id]]
-                factor, unit = (math.degrees(1.0), "deg/s") if share == 1.0 else (share * 1e3, "mm/s")
-                above = f"{fast.rad_s * factor:.0f} {unit}"
-                seen = (
-                    f"when it is fast: {fast.lost_share:.0%} of {each.lost} above {above}, where it was for "
-                )
-                seen += f"{fast.time_share:.0%} of the time: a contact that shakes."
-                fix = "Shake its plugs and its cable while it is read,"
-            else:
-                continue
-            loose.add(servo_id)
-            sentence = f"{named} loses its replies {seen}"
-            yield cause("loose_cable", name, sentence, f"{fix} and those on the way to it.")
-        rest = {servo_id: each for servo_id, each in losses.items() if servo_id not in loose}
-        noisy, exchanges = int(self._noisy[index]), int(self._exchanges[index])
-        if noisy >= max(_FEWEST_NOISY, _NOISY_SHARE * exchanges):
-            yield cause(
-                "noise",
-                bus.name,
-                f"Noise disturbs bus {bus.name}: bytes that belong to no packet came after "
-                f"{counted(noisy, 'instruction', 'instructions')} of {exchanges}.",
-                "Check its shield, ground and termination; unplug one servo after the other to find one that "
-                "sends unasked.",
-                noisy / exchanges if exchanges else 0.0,
-            )
+    def _heads(self) -> set[int]:
+        """Return first servos of chains of which nothing came, where lost instructions cannot be why."""
+        found = set()
+        for servo in np.flatnonzero(self._broken_off).tolist():
+            ids = slice(servo // IDS * IDS, (servo // IDS + 1) * IDS)
+            others, theirs = (int(each[ids].sum() - each[servo]) for each in (self._alone, self._lost_alone))
+            as_often = _SHORTER * int(self._broken_off[servo]) / max(int(self._chains[servo]), 1) * others
+            if as_often >= max(_FEWEST, _TIMES_MORE * theirs):
+                found.add(servo)
+        return found
+
+
+class Occasions:
+    """Counts the occasions of each part."""
+
+    def __init__(self, states: JointStates, heads: set[int]) -> None:
+        """`heads`: first servos of chains whose silence is their own."""
+        self._states, self._heads = states, heads
+        self._all: Counter[int] = Counter()  # Of each bus, and those that it shared with others
+        self._shared: Counter[int] = Counter()
+        self._late: Counter[int] = Counter()  # Of those that were shared those with late replies
+        self._machine = _Count()
+        self._bus: dict[int, _Count] = {}
+        self._servos: dict[int, _Count] = {}
+        self._pairs: Counter[tuple[int, int]] = Counter()
+        """Of two servos, or of one twice: all, not only those that are apart."""
+
+    def add(self, outages: Sequence[_Outage]) -> None:
+        """Count one occasion."""
+        buses, begin = {one.servo // IDS for one in outages}, outages[0]
+        self._all.update(buses)
+        if len(buses) > 1:
+            self._shared.update(buses)
+            self._late.update(buses if any(one.late for one in outages) else ())
+            self._machine.add(begin.at_ns, [])
             return
-        if not (loose or together):
-            yield from self._line(index, bus, rest, names)
-
-    def _line(
-        self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], names: dict[int, str]
-    ) -> Iterable[Finding]:
-        total = sum(each.episodes for each in losses.values())
-        worst = max(losses.items(), key=lambda item: item[1].episodes, default=None)
-        asked = sum(each.asked for each in losses.values())
-        if worst is not None and len(losses) > 1:
-            servo_id, each = worst
-            if has_them_alone(each.episodes, total - each.episodes):
-                seen = f"lost {each.lost} of {each.asked} replies, in "
-                seen += f"{counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
-                seen += f"{total - each.episodes}"
-                yield _lossy(bus, servo_id, seen, each.lost / max(each.asked, 1))
-                return
-        if head := tuple(self._head(index, bus)):
-            yield from head
+        lost = [one for one in outages if not one.late]
+        if not lost:
             return
-        line = int(self._line_episodes[index])
-        if line >= _LOSSY_LINE and (len(losses) == 1 or worst is None or worst[1].episodes < _EVEN * line):
-            lost = sum(each.lost for each in losses.values())
-            single = counted(lost, "reply", "replies")
-            most = max(losses.items(), key=lambda item: item[1].lost)
-            if len(losses) == 1:
-                how = f"replies of its only servo: {lost}, in {line} episodes"
-            elif most[1].lost >= _EVEN * lost:
-                # of a chain of which nothing came it is open whether it is the first servo's or the line's
-                name = names.get(most[0]) or f"servo {most[0]}"
-                heads = np.flatnonzero(self._broken_off[index * IDS : (index + 1) * IDS])
-                first = f", {names.get(int(heads[0]), heads[0])}," if len(heads) == 1 else ""
-                how = f"replies, in {line} episodes, mostly a whole chain: either its first servo{first} is "
-                how += "silent, or the instruction is lost"
-                how += f"; of {single} of single servos {most[1].lost} are of {name}" if lost else ""
-            else:
-                how = f"replies of its servos evenly: {lost} replies of single servos, in {line} episodes"
-            yield cause(
-                "lossy_line",
-                bus.name,
-                f"Bus {bus.name} loses {how}.",
-                "Check adapter, plugs, termination, ground and the cable's length, or lower baud_rate.",
-                lost / max(asked, 1),
-            )
+        own = len({one.servo for one in lost}) == 1 and (not lost[0].line or lost[0].servo in self._heads)
+        if not own and max(one.last_answers for one in lost) <= min(one.answers for one in lost):
+            self._bus.setdefault(lost[0].servo // IDS, _Count()).add(begin.at_ns, [])
+            return
+        for one in {one.servo: one for one in reversed(lost)}.values():
+            self._servos.setdefault(one.servo, _Count()).add(one.at_ns, one.places)
+            self._pairs.update((one.servo, servo) for servo in {each.servo for each in lost})
 
-    def _head(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
-        """Name the first servo of a chain of which nothing comes, where lost instructions cannot be why.
+    def together(self) -> tuple[tuple[int, ...], bool]:
+        """Return the buses that lost replies, or had them late, in the same cycles; and whether late."""
+        found = tuple(
+            bus
+            for bus, shared in sorted(self._shared.items())
+            if self._machine.apart >= _FEWEST and shared >= max(_FEWEST, _MOST * self._all[bus])
+        )
+        late = sum(self._late[bus] for bus in found) >= sum(self._shared[bus] for bus in found) / 2
+        return (found if len(found) > 1 else ()), late
 
-        The line would spoil instructions to single servos, too, two fifths as often as they are shorter [i].
+    def machine(self, buses: Sequence[LoggedBus], longest_ms: float) -> Iterator[Finding]:
+        """Name the machine, or what buses share, where they fail in the same cycles."""
+        shared, late = self.together()
+        if not shared:
+            return
+        *before, last = (buses[index].name for index in shared)
+        came = f"came late at once, by up to {longest_ms:.0f} ms" if late else "were lost at once"
+        sentence = f"Replies on buses {', '.join(before)} and {last} {came}, "
+        sentence += f"{counted(self._machine.apart, 'time', 'times')}."
+        yield cause("late_replies" if late else "lossy_line", "machine", sentence, share=1.2)
+
+    def findings(
+        self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], explained: set[int]
+    ) -> Iterator[Finding]:
+        """Name servos that lose replies alone or together, and a bus that does as a whole.
+
+        `losses`: of each servo of the bus that was asked; `explained`: those whose losses have another cause.
         """
-        ids = slice(index * IDS, (index + 1) * IDS)
-        chains, broken_off, alone, lost = (
-            each[ids] for each in (self._chains, self._broken_off, self._alone, self._lost_alone)
-        )
-        servo_id = int(np.argmax(broken_off))
-        silent, asked = int(broken_off[servo_id]), int(chains[servo_id])
-        others, theirs = (int(each.sum() - each[servo_id]) for each in (alone, lost))
-        as_often = _SHORTER * silent / max(asked, 1) * others
-        if as_often < max(_FEWEST, 10 * theirs):
-            return
-        seen = (
-            f"is silent now and then: nothing came of {silent} of {asked} reads in which it answers first, "
-        )
-        seen += f"while {others} instructions to single servos behind it lost {theirs} replies"
-        yield _lossy(bus, servo_id, seen, silent / asked)
+        base = index * IDS
+        counts = {servo % IDS: count for servo, count in self._servos.items() if servo // IDS == index}
+        times = {servo: counts[servo].apart if servo in counts else 0 for servo in {*losses, *counts}}
+        whole = self._bus[index].apart if index in self._bus else 0
+        named = set(explained)
+        for servo in sorted(times, key=lambda one: (-times[one], one)):
+            group = self._group(base, servo, times)
+            rest = [self._pairs[base + one, base + one] for one in times if one not in group | explained]
+            enough = _TIMES_MORE * float(np.median(rest)) if rest else math.inf
+            if servo in named or times[servo] < _FEWEST or self._pairs[base + servo, base + servo] < enough:
+                continue
+            named |= group
+            yield self._servo(bus, sorted(group), times[servo], base, losses)
+        left = [times[servo] for servo in times if servo not in named]
+        even = sum(left) - (max(left, default=0) if len(times) > 1 else 0)
+        if whole + even >= max(_FEWEST, (whole + sum(left)) / 2):
+            heads = [servo for servo, one in losses.items() if one.broken_off]
+            open_ = len(heads) == 1 and not any(times[one] for one in times if one not in {*named, *heads})
+            chain = f", of a chain that begins with {bus.called(heads[0])[0]}" if open_ else ""
+            parts = [f"{counted(whole, 'time', 'times')} no servo answered{chain}"] if whole else []
+            if sum(left):
+                each = "its only servo" if len(times) == 1 else "single servos, evenly,"
+                parts.append(f"{counted(sum(left), 'time', 'times')} {each} did not")
+            asked = sum(one.asked for one in losses.values())
+            sentence = f"Bus {bus.name} lost replies: {'; '.join(parts)}."
+            yield cause("lossy_line", bus.name, sentence, share=(whole + sum(left)) / max(asked, 1))
 
-    def _group(self, index: int) -> tuple[tuple[int, ...], int]:
-        """Return the servos of a bus that are lost together, most of the time that any is, and how often."""
-        clusters: list[set[int]] = []
-        last_ns = -_EPISODE_NS
-        for _, at_ns, servo_id in sorted(one for one in self._episodes_at if one[0] == index):
-            if at_ns - last_ns >= _EPISODE_NS:
-                clusters.append(set())
-                last_ns = at_ns
-            clusters[-1].add(servo_id)
-        several = [cluster for cluster in clusters if len(cluster) > 1]
-        if len(several) < max(_FEWEST, _TOGETHER * len(clusters)):
-            return (), 0
-        found = Counter(servo_id for cluster in several for servo_id in cluster)
-        members = {servo_id for servo_id, count in found.items() if count >= _TOGETHER * len(several)}
-        others = sum(count for servo_id, count in found.items() if servo_id not in members)
-        all_of_bus = np.count_nonzero(self._states.joint_of[index * IDS : (index + 1) * IDS] >= 0)
-        named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
-        return (tuple(sorted(members)), len(several)) if named else ((), 0)
+    def _group(self, base: int, servo: int, times: dict[int, int]) -> set[int]:
+        """Return a servo, and those that lose their replies at the same occasions."""
+        own = self._pairs[base + servo, base + servo]
+        return {servo} | {
+            other
+            for other in times
+            if own
+            and self._pairs[base + servo, base + other]
+            >= _TOGETHER * max(own, self._pairs[base + other, base + other])
+        }
+
+    def _servo(
+        self, bus: LoggedBus, group: list[int], times: int, base: int, losses: dict[int, ServoLosses]
+    ) -> Finding:
+        if len(group) > 1:
+            *before, last = (bus.names.get(servo) or f"servo {servo}" for servo in group)
+            who = f"{', '.join(before)} and {last} on bus {bus.name} were lost together"
+            sentence = f"{who}, {counted(times, 'time', 'times')}, while the other servos answered."
+            return cause("lossy_servo", bus.name, sentence, share=0.5)
+        (servo,) = group
+        name, named = bus.called(servo)
+        mine = losses.get(servo, ServoLosses(0, 0))
+        where = self._where(base + servo)
+        silent = f", and {mine.broken_off} chains of which it is the first" if mine.broken_off else ""
+        sentence = f"{named} lost {mine.lost} of {mine.asked} replies{silent}, in "
+        sentence += f"{counted(times, 'episode', 'episodes')}{where}; others of its bus answered meanwhile."
+        share = (mine.lost + mine.broken_off) / max(mine.asked + mine.broken_off, 1)
+        return cause("lossy_servo", name, sentence, share=share)
+
+    def _where(self, servo: int) -> str:
+        """Return at which angle, speed or temperature of its joint a servo's occasions begin; empty: any."""
+        joint = int(self._states.joint_of[servo])
+        if joint < 0:
+            return ""
+        found = []
+        at = np.array(self._servos[servo].places)
+        for quantity in QUANTITIES:
+            begun = np.bincount(at[:, quantity][at[:, quantity] >= 0], minlength=BINS)
+            time_ns = self._states.time_ns[joint, quantity]
+            if (part := narrowest(time_ns, begun, open_above=quantity != ANGLE)) is not None:
+                low, high, inside, share = part
+                text = self._states.range_text(joint, quantity, low, high)
+                found.append((share, f", {inside} of them {text}, where it was for {share:.0%} of the time"))
+        return min(found, default=(0.0, ""))[1]
 
 
-def _lossy(bus: LoggedBus, servo_id: int, seen: str, share: float) -> Finding:
-    name, named = bus.called(servo_id)
-    fix = "Check its plugs and its cable; exchange the servo where a new cable does not help."
-    return cause("lossy_servo", name, f"{named} {seen}.", fix, share)
+def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, int, int, float] | None:
+    """Return the bins, the first and the last, in which a joint is when its replies are lost.
 
-
-def _noisy(exchanges: Exchanges) -> NDArray[np.bool_]:
-    """Return exchanges with bytes that are no packet; in an incomplete fast status they are cut blocks."""
-    complete = np.ones(len(exchanges.request), np.bool_)
-    complete[exchanges.due.exchange[exchanges.due.reply < 0]] = False
-    noisy: NDArray[np.bool_] = complete | ~exchanges.requests.fast[exchanges.request]
-    return noisy & (exchanges.noise > 0)
-
-
-def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | None:
-    """Return the range of angles in which a joint's episodes are; None where they may be anywhere.
-
-    Of each bin: how long the joint was there, episodes that began there, lost replies. See the module
-    for the rule.
+    Of each bin: how long it was there, and occasions that began there. With them come how many are inside,
+    and the share of the time there. None: they may be anywhere, but for one in a thousand such joints.
+    `open_above`: the range has no upper end.
     """
-    total, spent_in_all = int(begun.sum()), int(time.sum())
-    if total < _FEWEST or not spent_in_all:
-        return None
-    spent, ends = np.append(0, np.cumsum(time)), np.append(0, np.cumsum(begun))
+    total, spent = int(begun.sum()), int(time.sum())
     at = np.flatnonzero(begun)
-    low, high = (each.ravel() for each in np.meshgrid(at, at + 1, indexing="ij"))
-    inside, share = ends[high] - ends[low], (spent[high] - spent[low]) / spent_in_all
-    enough = (inside >= max(_FEWEST, _INSIDE * total)) & (high - low <= _WIDEST) & (high > low)
-    enough &= (share <= inside / total / _TIMES_MORE) & ((inside >= _MANY) | (share <= _NARROW))
-    if not enough.any():
+    if total < _FEWEST or not spent:
         return None
-    best = max(np.flatnonzero(enough).tolist(), key=lambda row: (inside[row], -share[row]))
-    bins = np.flatnonzero(lost[low[best] : high[best]]) + low[best]
-    first, last = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (int(low[best]), int(high[best]))
-    return AngleRange(edge_rad(first), edge_rad(last), int(inside[best]), float(share[best]))
+    ends, times = np.append(0, np.cumsum(begun)), np.append(0, np.cumsum(time)) / spent
+    lasts = np.array([len(begun) - 1]) if open_above else at
+    low, high = (each.ravel() for each in np.meshgrid(at, lasts, indexing="ij"))
+    inside, share = ends[high + 1] - ends[low], times[high + 1] - times[low]
+    enough = np.flatnonzero((inside >= _INSIDE * total) & (high >= low))
+    best = min(enough.tolist(), key=lambda row: (share[row], -inside[row]))
+    count, part = int(inside[best]), float(share[best])
+    # so many in any window of that width (Naus 1965, to the first order)
+    chance = math.log(count * math.comb(total, count)) + (count - 1) * math.log(max(part, 1e-9))
+    if chance > math.log(_CHANCE) or part > 1 / 2:
+        return None
+    return int(low[best]), int(high[best]), count, part
 
 
-def when_fast(time: Numbers, lost: Numbers, begun: Numbers) -> Fast | None:
-    """Return the speed above which a joint's replies go missing; None where it does not depend on it.
+def _moments(exchanges: Exchanges) -> Numbers:
+    """Return the cycle of each exchange; where none is known, a number for each 10 ms."""
+    before = exchanges.asked_ns // _UNKNOWN_NS - (1 << 60)
+    return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 
-    Of each bin: how long the joint was so fast, lost replies, episodes that began. The module has the rule.
-    """
-    total, in_all = int(lost.sum()), int(time.sum())
-    if total < _FEWEST_FAST or not in_all:
-        return None
-    above, times, share = (np.cumsum(each[::-1])[::-1] for each in (lost, begun, time / in_all))
-    slow_rate = (total - above) / np.maximum(1.0 - share, 1e-9)
-    enough = (above >= _INSIDE * total) & (times >= _FEWEST_TIMES) & (share <= _MOST_TIME) & (share > 0)
-    enough &= above >= _FAST_MORE * slow_rate * share
-    enough[:_SLOWEST] = False
-    if not enough.any():
-        return None
-    at = int(np.flatnonzero(enough)[-1])
-    return Fast(at * STEP_RAD_S, float(above[at] / total), float(share[at]))
+
+def _before(group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
+    """Return how many replies came of the group of each row before it, and add all to those so far."""
+    order = np.argsort(group, kind="stable")
+    count = np.cumsum(came[order])
+    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
+    earlier: Numbers = np.repeat(count[begins] - came[order][begins], np.diff(np.append(begins, len(order))))
+    found = np.empty(len(group), np.int64)
+    found[order] = count - came[order] - earlier + so_far[group[order]]
+    so_far += np.bincount(group[came], minlength=len(so_far))
+    return found

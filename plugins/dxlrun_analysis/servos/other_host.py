@@ -22,6 +22,9 @@ from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, instruction_of
 
+SPOILS, _FAILED = 1.5, 5.0
+"""Shares of a finding about a host that wrote goals, or whose replies may be taken for those of this run, and
+about one by which a servo failed."""
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits.
 Of those that write items of a servo one is enough."""
@@ -80,22 +83,15 @@ class OtherHosts:
         """Name the other host of a bus, or an adapter that began to echo; none: neither."""
         echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
-            return (
-                cause(
-                    "echo",
-                    bus.name,
-                    f"The adapter of bus {bus.name} echoes now and then: {echoes} of {asked} own "
-                    "instructions came back.",
-                    "Check what switches its direction: the adapter, or its driver's RS-485 settings.",
-                    1.5,
-                ),
+            sentence = (
+                f"Instructions come back on bus {bus.name}: its adapter echoed {echoes} of {asked} own ones."
             )
+            return (cause("another_host", bus.name, sentence, share=1.5),)
         values, counts = self._of(index)
         total = int(counts.sum())
         written, failed = self.writes.of(index)
-        where = f" (`fuser {bus.port}` shows it)" if bus.port else ""
         if total < _FEWEST and not written:
-            return tuple(self._by_replies(index, bus, where))
+            return tuple(self._by_replies(index, bus))
         instructions = values // IDS
         codes = sorted(set(instructions.tolist()), key=lambda code: -int(counts[instructions == code].sum()))
         kinds = [
@@ -105,32 +101,23 @@ class OtherHosts:
         if len(codes) > _MOST_NAMED:
             kinds.append("others")
         wrote = f"; it wrote {written}" if written else ""
-        return (
-            cause(
-                "another_host",
-                bus.name,
-                f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} "
-                f"that this run did not send ({', '.join(kinds)}){wrote}.",
-                f"Stop the other program{where}, or unplug the other adapter: its packets collide with those "
-                "of the run, and its commands move the same servos.",
-                5.0 if failed else 1.5 if self.explains(index) else 0.0,
-            ),
+        sentence = (
+            f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} that "
         )
+        sentence += f"this run did not send ({', '.join(kinds)}){wrote}."
+        share = _FAILED if failed else 1.0 if self.explains(index) else 0.0
+        share = max(share, SPOILS if "goal_" in written else 0.0)
+        return (cause("another_host", bus.name, sentence, share=share),)
 
-    def _by_replies(self, index: int, bus: LoggedBus, where: str) -> Iterable[Finding]:
+    def _by_replies(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
         """Name another host of which only the replies to it are seen."""
         ids, counts = self._unasked.of(index)
-        if (total := int(counts.sum())) < _FEWEST_UNASKED:
-            return
-        one = ", or that servo sends by itself" if len(ids) == 1 else ""
-        yield cause(
-            "another_host",
-            bus.name,
-            f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did not "
-            f"ask for (of {_ids(ids.tolist())}){one}.",
-            f"Stop the other program{where}: it takes replies of the run, and the replies to it spoil them.",
-            1.5 if self.explains(index) else 0.0,
-        )
+        if (total := int(counts.sum())) >= _FEWEST_UNASKED:
+            sentence = (
+                f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did "
+            )
+            sentence += f"not ask for (of {_ids(ids.tolist())})."
+            yield cause("another_host", bus.name, sentence, share=SPOILS)
 
 
 def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:

@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.port.latency_timer import is_timer
-from dxlrun.dynamixel.port.remedies import late_replies
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.log.reader import Log
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, median, quantile
-from dxlrun_analysis.finding import Finding, cause
+from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
-from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
-from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested, slow_servo
+from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlrun_analysis.servos.requests import IDS, Numbers
 
 _BYTES = 256
-LATE_US = 2000  # An adapter that adds so much more than the plan expects is late
-_LATE_SHARE = 0.1  # Of the complete exchanges, from which a bus is late
-_NOW_AND_THEN = 0.01
-_FEWEST_MOMENTS = 10
-_FEWEST_SERVOS = 4  # Of so many it is no chance that only one was late
-_FEWEST = 20
-_FEWEST_ALONE = 10
-_OFTEN = 3  # Late replies of a servo from which they are no chance
 _KINDS = max(PacketKind) + 1
 
 
@@ -60,7 +48,6 @@ class ServoTraffic:
     several servos at once, those that answer later have the replies before theirs in it."""
     reply_max_us: float
     reply_p99_us: float = 0.0
-    own: ReplyTime | None = None  # What of that is its own; None where its replies never came one by one
     losses: ServoLosses | None = None
     """Of `lost`, what is its own and not that of a servo before it in a chain."""
     device: bool = False  # It is a device of the plan, and no servo
@@ -87,12 +74,6 @@ class BusTraffic:
     None where the log's plan does not have it, and where replies wait for the next cycle."""
     planned_latency_us: float | None = None  # What the plan expects of that
     port: str = ""
-    late_share: float = 0.0
-    """Of the exchanges, those that took 2 ms longer than the plan expects, or that were given up too soon:
-    a reply came behind the next instruction."""
-    late_us: float = 0.0
-    """How much longer than wire and return delay three quarters of these took at most: those behind a reply
-    that was given up may have waited for several."""
 
 
 class Traffic:
@@ -101,18 +82,15 @@ class Traffic:
     def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
         """`watch` is called with all exchanges, too: they are paired once."""
         self._pairing, self._watch = Pairing(), watch
-        self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
+        self._extra_us, self._reply_us = Counts(), Counts()
         self.findings: tuple[Finding, ...] = ()  # By the rules of this room; known when all is finished
         self._size(0, JointStates())
 
     def _size(self, buses: int, states: JointStates) -> None:
-        self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(states)
-        self._broken, self._late_replies = BrokenReplies(buses), LateReplies(buses)
-        self._others = OtherHosts(buses)
+        self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(buses)
+        self._broken, self._others = BrokenReplies(buses), OtherHosts(buses)
         servos = buses * IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
-        self._late, self._alone = np.zeros((2, 2, servos), np.int64)
-        """Of reads of one servo those that were late, and all; behind an exchange, and after a rest."""
         self._instructions, self._asked, self._lost, self._replies, self._reply_max_ns = (
             np.zeros(servos, np.int64) for _ in range(5)
         )
@@ -147,76 +125,45 @@ class Traffic:
         addressed[BROADCAST_ID::IDS] = 0
         servos = np.flatnonzero(self._seen | (addressed > 0)).tolist()
         plans = self._pairing.buses
-        own, losses = self._reply_times.finish(plans), self._losses.finish()
-        found = tuple(
-            replace(
-                self._servo(servo), own=own.get(divmod(servo, IDS)), losses=losses.get(divmod(servo, IDS))
-            )
-            for servo in servos
-        )
-        buses = tuple(self._bus(index, plan) for index, plan in enumerate(plans))
-        findings: list[Finding] = []
-        now_and_then = [index for index, bus in enumerate(buses) if not usually_late(bus)]
-        together = self._late_replies.together(now_and_then)
-        if together:
-            findings.append(self._late_replies.everywhere(together, plans))
-        for index, (bus, plan) in enumerate(zip(buses, plans, strict=True)):
-            findings += self._others.findings(index, plan)
+        losses = self._losses.finish()
+        found = tuple(replace(self._servo(servo), losses=losses.get(divmod(servo, IDS))) for servo in servos)
+        self.findings = tuple(self._findings(plans, losses))
+        return found, tuple(self._bus(index, plan) for index, plan in enumerate(plans))
+
+    def _findings(
+        self, plans: Sequence[LoggedBus], losses: Mapping[tuple[int, int], ServoLosses]
+    ) -> Iterator[Finding]:
+        """Name what is wrong with replies: first what several buses share, then bus by bus."""
+        occasions = self._losses.occasions(self._reply_times.always_late())
+        shared, are_late = occasions.together()
+        yield from occasions.machine(plans, self._reply_times.longest_ms())
+        for index, plan in enumerate(plans):
+            yield from self._others.findings(index, plan)
             if self._others.explains(index):
                 continue  # what is late, missing or spoilt then is a consequence
-            somewhere = tuple(self._reply_times.somewhere(index, plan))
-            if index not in together:
-                ids = slice(index * IDS, (index + 1) * IDS)
-                alone = (self._late[:, ids].sum(axis=0), self._alone[:, ids].sum(axis=0))
-                if not somewhere and is_late(bus, len(plan.servos), *alone):
-                    findings.append(_late_replies(bus))
+            alone = not (are_late and index in shared)
+            slow = tuple(self._reply_times.servos(index, plan, now_and_then=alone))
+            yield from slow
+            if alone:
+                late = tuple(self._reply_times.line(index, plan, [one.subject for one in slow]))
+                yield from late
+                if late:
                     continue
-                findings += somewhere or self._late_replies.findings(index, plan)
-            findings += self._reply_times.findings(index, plan)
-            if index not in together and not {one.subject for one in findings} & {
-                plan.name,
-                *plan.names.values(),
-            }:
-                findings += self._now_and_then(index, bus, plan)
             mine = {each: lost for (of, each), lost in losses.items() if of == index}
-            findings += self._broken.findings(index, plan, mine) or self._losses.findings(index, plan, mine)
-        self.findings = tuple(findings)
-        return found, buses
-
-    def _now_and_then(self, index: int, bus: BusTraffic, plan: LoggedBus) -> Iterable[Finding]:
-        """Name the one servo that is late where it is asked alone; else the bus, where that is often."""
-        names, moments = plan.names, self._late_replies.moments(index)
-        ids = slice(index * IDS, (index + 1) * IDS)
-        late, asked = self._late[:, ids], self._alone[:, ids]
-        one = int(np.argmax(late.sum(axis=0)))
-        mine, others = late[:, one], late.sum(axis=1) - late[:, one]
-        # after a rest of the line it is mostly the first of each cycle, with what wakes the adapter
-        as_often = mine[1] / max(asked[1, one], 1) * (asked[1].sum() - asked[1, one])
-        alone = ((mine >= _OFTEN) & (others == 0) & (np.array([_OFTEN, as_often]) >= _OFTEN)).any()
-        if bus.late_share < _NOW_AND_THEN:
-            return
-        if alone and len(names) >= _FEWEST_SERVOS:
-            seen = f"answers late: {mine.sum()} times where it was asked alone, by up to "
-            seen += f"{bus.late_us / 1e3:.0f} ms; the others never"
-            fix = "Compare its Return Delay Time and firmware with those of the others, and check its supply."
-            yield slow_servo(plan, one, seen, bus.late_share, fix)
-        elif moments >= _FEWEST_MOMENTS:
-            yield cause(
-                "late_now_and_then",
-                plan.name,
-                f"Replies on bus {plan.name} come late now and then: {moments} times, by up to "
-                f"{bus.late_us / 1e3:.0f} ms; the log does not show whether it is one servo or the adapter.",
-                "Check adapter and USB hub, and what else runs on the machine (`dxlrun doctor`).",
-                bus.late_share,
-            )
+            spoilt = tuple(self._broken.findings(index, plan, mine))
+            yield from spoilt
+            if "noise" not in {one.code for one in spoilt}:
+                named = {one.subject for one in (*slow, *spoilt)}
+                explained = {servo for servo, name in plan.names.items() if name in named}
+                yield from occasions.findings(index, plan, mine, explained)
 
     def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
             return
         self._watch(exchanges)
         places = self._states.until(int(exchanges.cycle.max(initial=-1)), everything=final)
-        self._reply_times.take(exchanges, places)
         self._losses.take(exchanges, places)
+        self._reply_times.take(exchanges, self._losses)
         self._broken.take(exchanges)
         self._others.take(exchanges)
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
@@ -250,19 +197,6 @@ class Traffic:
         rows = last[complete]
         extra_ns = np.maximum(replies.last_ns[rows] - replies.due_ns[rows], 0)
         self._extra_us.take(exchanges.bus[complete], extra_ns // 1000)
-        late = exchanges.late  # of several late replies of an exchange the first one counts
-        given_up, first = np.unique(late.exchange, return_index=True)
-        given_up, late_ns = given_up[given_up >= 0], late.late_ns[first[given_up >= 0]]
-        self._given_up_us.take(exchanges.bus[given_up], late_ns // 1000)
-        limits = np.array([bus.latency_ns + LATE_US * 1000 for bus in self._pairing.buses], np.int64)
-        in_time = np.flatnonzero(complete)[extra_ns >= limits[exchanges.bus[complete]]]
-        self._late_replies.take(exchanges, in_time, replies.last_ns[last[in_time]])
-        rows = np.concatenate([in_time, given_up[late_ns >= limits[exchanges.bus[given_up]]]])
-        alone, after_rest = np.flatnonzero(due == 1), rested(exchanges).astype(np.int64)
-        servo = exchanges.bus * IDS + exchanges.requests.ids[exchanges.request, -1]
-        for counts, at in ((self._late, np.intersect1d(rows, alone)), (self._alone, alone)):
-            found = np.bincount(after_rest[at] * len(self._asked) + servo[at], minlength=counts.size)
-            np.add(counts, found.reshape(counts.shape), out=counts)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS
@@ -288,16 +222,6 @@ class Traffic:
 
     def _bus(self, index: int, plan: LoggedBus) -> BusTraffic:
         packets, size = self._packets[index].tolist(), self._bytes[index].tolist()
-        extras = self._extra_us.of(index)
-        extra_us = median(*extras)
-        known = bool(plan.baud_rate)
-        values, counts = (
-            np.concatenate(one) for one in zip(extras, self._given_up_us.of(index), strict=True)
-        )
-        late = values >= plan.latency_ns / 1e3 + LATE_US
-        order = np.argsort(values[late])
-        total = int(counts.sum())
-        share = float(counts[late].sum() / total) if total >= _FEWEST else 0.0
         return BusTraffic(
             name=plan.name,
             instructions=packets[PacketKind.INSTRUCTION],
@@ -306,55 +230,10 @@ class Traffic:
             noise_bytes=size[PacketKind.NOISE],
             bytes_out=size[PacketKind.INSTRUCTION],
             bytes_in=size[PacketKind.STATUS] + size[PacketKind.NOISE],
-            extra_us=extra_us if known else None,
+            extra_us=median(*self._extra_us.of(index)) if plan.baud_rate else None,
             planned_latency_us=plan.latency_ns / 1e3 if plan.baud_rate else None,
             port=plan.port,
-            late_share=share if known else 0.0,
-            late_us=quantile(values[late][order], counts[late][order], 0.75) if known else 0.0,
         )
-
-
-def usually_late(bus: BusTraffic) -> bool:
-    """Return whether half of the exchanges of a bus or more take 2 ms longer than the plan expects."""
-    if bus.extra_us is None or bus.planned_latency_us is None:
-        return False
-    return bus.extra_us >= bus.planned_latency_us + LATE_US
-
-
-def is_late(bus: BusTraffic, servos: int, late: Numbers, alone: Numbers) -> bool:
-    """Return whether the adapter of a bus keeps replies back longer than planned.
-
-    `servos`: how many it has; `late`: how often each was late when it was asked alone, and `alone`: how often
-    it was asked so, shape (256,). Where only one of several was late then, or none although as many of
-    those replies as of all would be ten, it is a servo, not the adapter.
-    """
-    if bus.extra_us is None or bus.planned_latency_us is None:
-        return False
-    if not usually_late(bus) and bus.late_share < _LATE_SHARE:
-        return False
-    if servos < 2:
-        return True
-    most = int(np.argmax(late))
-    expected = bus.late_share * int(alone.sum() - alone[most])
-    if expected >= _FEWEST_ALONE and late.sum() - late[most] < expected / _FEWEST_ALONE:
-        return False
-    return int(np.count_nonzero(late >= _OFTEN)) != 1
-
-
-def _late_replies(bus: BusTraffic) -> Finding:
-    late_us = (bus.extra_us or 0.0) if usually_late(bus) else bus.late_us
-    what, fix = late_replies(bus.name, bus.port, late_us * 1e3, (bus.planned_latency_us or 0.0) * 1e3)
-    code = "latency_timer" if is_timer(late_us * 1e3) else "late_replies"
-    sentence = f"{what[0].upper()}{what[1:]}."
-    remedy = (
-        f"{fix}."
-        if fix
-        else (
-            "Check adapter, driver and USB hub; or write what is true: "
-            f"`adapter: {{latency: {math.ceil(late_us / 1e3)} ms}}`."
-        )
-    )
-    return cause(code, bus.name, sentence, remedy, bus.late_share)
 
 
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:

@@ -216,9 +216,7 @@ FLIPPED = [
 
 @pytest.mark.parametrize("flipped", FLIPPED, ids=[one[-1] for one in FLIPPED])
 def test_a_flipped_bit_of_a_reference_is_found_and_named(
-    story: Callable[[str], Path],
-    changed: Callable[..., Path],
-    flipped: tuple[int, int, str | None, str, str],
+    story: Callable[[str], Path], changed: Callable[..., Path], flipped: tuple[int, int, str | None, str, str]
 ) -> None:
     place, cycle, controller, joint, name = flipped
     report, first = differing(changed(story("a fallback"), flip("reference", cycle, place)))

@@ -37,12 +37,7 @@ def test_one_bit_of_one_value_is_named(
     row, cycle = bit % 3, 7 + bit % 40
     report, first = differing(changed(pair_log, flip(field, cycle, row, bit)))
     assert (report.compared, report.different) == (50, 1)
-    assert (first.cycle, first.joint, first.controller, first.what) == (
-        cycle,
-        JOINTS[row],
-        OWNERS[row],
-        what,
-    )
+    assert (first.cycle, first.joint, first.controller, first.what) == (cycle, JOINTS[row], OWNERS[row], what)
     assert first.time_s == pytest.approx(cycle * 0.02)
     assert first.recorded != first.replayed
     (joint,) = report.joints

@@ -67,7 +67,7 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
     )
     assert report.verdict.good
     sentence = "Cycles followed each other, not the clock: 320 periods of 320 Hz took 1."
-    assert report.verdict.sentences[1].startswith(sentence)
+    assert any(one.startswith(sentence) for one in report.verdict.sentences)
     assert judge(totals_of(log)).sentences[1] == report.verdict.sentences[1]
     assert report.periods.rates_hz == (320.0,)
     assert (report.periods.elapsed, report.periods.skipped, report.periods.agree) == (320, 0, True)

@@ -247,11 +247,7 @@ def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, l
 
 FLIPPED: dict[str, tuple[str, Change, int]] = {
     "who is switched": ("switches", command("switch", data=switch([], ["all_inputs"]).data), 4),
-    "a set-point": (
-        "a stream that ends",
-        command("positions", data=np.array([0.04, 0.5]).tobytes()),
-        4,
-    ),
+    "a set-point": ("a stream that ends", command("positions", data=np.array([0.04, 0.5]).tobytes()), 4),
     "a lease": ("a stream that ends", command("positions", 10, lease_ns=0), 17),
     "a pause": ("a pause in a motion", command("pause", kind="resume"), 16),
     "what is loaded": (

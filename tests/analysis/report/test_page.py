@@ -199,22 +199,6 @@ def test_findings_lead_to_their_plots(whole: Made) -> None:
     assert set(plots.values()) <= set(reader.ids)
 
 
-def test_the_legend_has_the_colours_of_the_curves(whole: Made) -> None:
-    text, _ = whole
-    (figure,) = re.findall(r'<figure id="joint-0">.*?</figure>', text)
-    legend = dict(re.findall(r'<button [^>]*color: (#\w+)">([^<]+)<', figure))
-    assert len(legend) >= 3  # no two alike
-    (root,) = (
-        one["attributes"]
-        for one in data(text, "plots")["documents"]["run"]["roots"]
-        if one["attributes"]["name"] == "joint-0"
-    )
-    for one in root["renderers"]:
-        colour = one["attributes"]["glyph"]["attributes"]["line_color"]
-        colour = colour if isinstance(colour, str) else colour["value"]
-        assert legend[colour] == one["attributes"]["name"]
-
-
 def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> None:
     _, reader = whole
     cells = reader.words("th", "td")
@@ -230,13 +214,6 @@ def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
     assert "</script><b>ValueError</b> & \\x1b[31m" in reader.words("td")
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, count: int) -> None:
-    text, reader = made(write([Cycle(number) for number in range(count)], close=False))
-    assert "has no end" in text
-    assert ("left_elbow_joint" in reader.words("h3")) == (count > 0)
-
-
 def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
     write: Make, run: Path, tmp_path: Path
 ) -> None:
@@ -247,15 +224,6 @@ def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
     cut.write_bytes(data[: len(data) * 2 // 3])
     _, reader = made(cut)
     assert any("has no end" in text or "cannot be read" in text for text in reader.words("p"))
-
-
-def test_a_single_late_wake_up_among_many_is_drawn(write: Make) -> None:
-    late = [3 + number % 2 for number in range(5000)]
-    late[3141] = 7777
-    _, reader = made(write([Cycle(number, late=us) for number, us in enumerate(late)]))
-    captions = " ".join(reader.words("figcaption"))
-    assert "maximum 7777 us" in captions
-    assert "1 of 5000 wake-ups (0.020%) are later than 150 us" in captions
 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:

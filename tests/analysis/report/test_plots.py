@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msgspec import structs
 from numpy.typing import NDArray
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
@@ -17,13 +16,13 @@ from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
 from dxlrun_analysis.cycles.latency import Punctuality
 from dxlrun_analysis.page import curves as curves_module
-from dxlrun_analysis.page.canvas import Canvas, Plot, many_lines
-from dxlrun_analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve, windows
-from dxlrun_analysis.page.events import MOST_EVENTS, EventCollector, events_plot
+from dxlrun_analysis.page.canvas import Canvas, Plot
+from dxlrun_analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve
+from dxlrun_analysis.page.events import EventCollector, events_plot
 from dxlrun_analysis.page.joints import joint_plots
-from dxlrun_analysis.page.loop import latency_plots, steps_plot, typical_plot
+from dxlrun_analysis.page.loop import latency_plots
 from dxlrun_analysis.page.page import analyzed_page
-from dxlrun_analysis.page.replies import BYTES_OF_REPLIES, ReplyCollector, rows_of_replies
+from dxlrun_analysis.page.replies import ReplyCollector
 from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
@@ -152,36 +151,6 @@ def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(
     assert (run.cycles.high(name)[of[outside]] >= values[outside]).all()
 
 
-def test_equal_curves_are_one_line_with_all_names(logs: dict[int, Log]) -> None:
-    log = replace(logs[COUNT], cycles=logs[COUNT].cycles.copy())
-    named = [(joint_curve("temperature", joint), joint) for joint in log.joints]
-    log.cycles["temperature"] = 30.0
-    log.cycles["temperature"][0, 0] = np.nan  # not read yet
-    assert [line.name for line in many_lines(collected(log).cycles, named)] == [", ".join(log.joints)]
-    for fault in (31.0, np.nan):
-        log.cycles["temperature"][5:15, 1] = fault
-        assert [line.name for line in many_lines(collected(log).cycles, named)] == list(log.joints)
-
-
-@pytest.mark.parametrize("count", [COUNT, 200])
-def test_dots_of_many_samples_would_hide_the_curves_below(logs: dict[int, Log], count: int) -> None:
-    run = collected(filled(logs[COUNT], count))
-    plot = joint_plots(canvas_of(run), run.cycles, 0, analyze(logs[COUNT]).joints[0])[1]
-    assert bool(glyphs(plot, "Scatter")) == (count == COUNT)
-
-
-def test_windows_are_apart_and_hold_no_more_than_there_is_room_for() -> None:
-    second = 10**9
-    assert windows([], 100, 1) == []
-    assert windows([9 * second, 5 * second], 10**6, 10**6) == [
-        (4_500_000_000, 5_501_000_000),
-        (8_500_000_000, 9_501_000_000),
-    ]
-    assert len(windows([5 * second, 5 * second + 10**8], 10**6, 10**6)) == 1
-    ((begin, end),) = windows([5 * second], 100, 10**6)
-    assert (end - begin) // 10**6 == 101
-
-
 def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> None:
     log = logs[LONG]
     late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]) / 1e3
@@ -205,30 +174,6 @@ def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> N
     for delay, logit in zip(x, share, strict=True):  # half of the wake-up itself is counted
         up_to = 1 / (1 + np.exp(-logit))
         assert np.mean(floor < delay) < up_to < np.mean(floor <= delay)
-
-
-def test_the_steps_are_drawn_against_the_period(logs: dict[int, Log]) -> None:
-    log = logs[COUNT]
-    cycles = log.cycles.copy()
-    cycles["scheduled_ns"][30:] += np.arange(1, 11) * 20_000_000  # half the rate from there on
-    run = collected(replace(log, cycles=cycles))
-    drawn = lines(steps_plot(canvas_of(run), run.cycles))
-    for name, begin, end in (("read", "woken_ns", "read_ns"), ("cycle", "woken_ns", "written_ns")):
-        np.testing.assert_allclose(drawn[name][1], (cycles[end] - cycles[begin]) / 1e3, rtol=1e-6)
-    np.testing.assert_allclose(drawn["period"][1], np.where(np.arange(COUNT) < 29, 20e3, 40e3))
-
-
-def test_the_bars_of_the_budget_are_the_steps(logs: dict[int, Log]) -> None:
-    log = logs[COUNT]
-    steps = analyze(log).steps
-    plot = typical_plot(canvas_of(collected(log)), steps, 20_000.0)
-    bars = glyphs(plot, "HBar")
-    assert len(bars) == 3
-    for number, ((data, glyph), step) in enumerate(zip(bars, steps, strict=False)):
-        expected = np.array([step.median_us, step.p99_us, step.max_us]) / 1e3
-        left, right = np.asarray(data[glyph.left]), np.asarray(data[glyph.right])
-        np.testing.assert_allclose(right - left, expected)
-        assert (left == 0).all() == (number == 0)
 
 
 def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> None:
@@ -266,44 +211,6 @@ def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None
     plot = events_plot(Canvas(0, 0, 10**9), events, 3)
     drawn = [(dict(data)["text"], dict(data)["y"].tolist()) for data, _ in glyphs(plot, "Scatter")]
     assert drawn == [(["head: one"], [0.0]), (["head: two"], [0.0]), (["head: three"], [1.0])]
-
-
-def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make) -> None:
-    log = read_log(write([Cycle(0)], (), [Said(EventCode.SCHEDULER, Severity.INFO, "one")]))
-    (event,) = log.events
-    storm = [structs.replace(event, t_ns=number) for number in range(MOST_EVENTS + 100)]
-    error = structs.replace(event, t_ns=10**6, severity=int(Severity.ERROR))
-    collector = EventCollector()
-    collector.take(replace(log, events=tuple(storm)))
-    collector.take(replace(log, events=(error,)))
-    kept = collector.finish()
-    assert len(kept) == MOST_EVENTS + 1
-    assert kept[-1] is error
-
-
-@pytest.mark.parametrize("joints", [2, 40, 400])
-def test_many_curves_have_fewer_rows(write: Make, joints: int) -> None:
-    """What the curves of cycles and replies may have of a page, base64 and the rest left out."""
-    log = read_log(write([Cycle(0)]))
-    collector = CurveCollector()
-    names = tuple(f"joint_{number}" for number in range(joints))
-    collector.take(replace(log, header=structs.replace(log.header, joints=names), cycles=log.cycles[:0]))
-    assert collector._envelope is not None
-    bins, curves = collector._envelope._low.shape
-    rows = bins + collector._most
-    assert (joints == 2) == (rows > 5000)
-    assert curves > 12 * joints
-    assert 8 * curves * rows <= curves_module.BYTES_OF_CURVES
-    assert 8 * 2 * joints * rows_of_replies(joints) <= BYTES_OF_REPLIES
-    assert 4 / 3 * (curves_module.BYTES_OF_CURVES * 4 / 3 + BYTES_OF_REPLIES) < BUDGET_BYTES - 2_000_000
-
-
-def test_many_rates_and_gaps_draw_no_line_over_what_was_not_recorded(logs: dict[int, Log]) -> None:
-    cycles = logs[COUNT].cycles.copy()
-    cycles["scheduled_ns"][20:] += 10**10
-    run = collected(replace(logs[COUNT], cycles=cycles))
-    _, y = lines(steps_plot(canvas_of(run), run.cycles))["cycle"]
-    assert np.isnan(y).tolist() == [number == 20 for number in range(COUNT + 1)]
 
 
 def test_the_report_of_a_log_read_in_slices_is_that_of_the_whole(logs: dict[int, Log]) -> None:

@@ -16,10 +16,10 @@ from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun_analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import Canvas, Plot
 from dxlrun_analysis.page.curves import CurveCollector
-from dxlrun_analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
+from dxlrun_analysis.page.machine import MachineCollector, machine_plots
 from dxlrun_analysis.page.page import page
 from dxlrun_analysis.page.replies import ReplyCollector
-from dxlrun_analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
+from dxlrun_analysis.page.worst import worst_plots
 from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
@@ -97,14 +97,6 @@ def test_a_short_cycle_is_drawn_in_us_and_its_idle_step_is_left_out() -> None:
     assert plot.model.xaxis[0].axis_label.endswith(", us")
 
 
-def test_few_cycles_and_packets_are_drawn_and_the_rest_is_declared() -> None:
-    storm = replace(WORST, packets=(NOISE,) * (MOST_PACKETS + 3))
-    plots = worst_plots(Canvas(0, 0, 10**9), [storm] * (MOST_CYCLES + 1))
-    assert len(plots) == MOST_CYCLES
-    assert len(drawn(plots[0])["noise"]["y"]) == MOST_PACKETS
-    assert "3 more packets are not drawn" in plots[0].text
-
-
 class Samples:
     """A slice of a log of which only the samples of the machine are read."""
 
@@ -151,21 +143,6 @@ def test_the_machine_is_drawn_as_it_was_sampled() -> None:
     assert names == [f"machine-{kind}" for kind in ("waiting", "busy", "interrupts", "steal", "frequency")]
 
 
-def test_a_machine_of_many_cores_shows_the_loops_and_the_busiest() -> None:
-    user = np.zeros(64)
-    user[[40, 41]] = 0.9, 0.8
-    _, cores = collected(Samples(sample(1, 64, user=user, loop_core=63)))
-    assert cores[:3] == (63, 40, 41)
-    assert len(cores) == MOST_CORES
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_a_core_that_goes_offline_or_comes_later_changes_nothing_else(count: int) -> None:
-    curves, _ = collected(Samples(sample(1, 2), sample(2, count)))
-    np.testing.assert_allclose(curves.low("busy 0"), [33, 33], rtol=1e-6)
-    assert np.isnan(curves.low("busy 1")[1]) == (count == 1)
-
-
 def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
     empty = Samples()
     empty.topics = ()
@@ -186,19 +163,6 @@ def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     error = collector.finish().cycles.low("error left_elbow_joint")
     expected = [np.nan, *(0.1 * n - (n - 1) ** 2 if n != 5 else np.nan for n in range(1, 12))]
     np.testing.assert_allclose(error, expected, rtol=1e-5)
-
-
-def test_wide_bins_are_no_gaps(write: Make) -> None:
-    """Of a long run a bin is longer than what is a gap in a short one."""
-    log = read_log(write([Cycle(0)]))
-    cycles = np.resize(log.cycles, 8000).copy()
-    cycles["scheduled_ns"] = 10**9 + np.arange(8000) * 250_000_000
-    cycles["scheduled_ns"][5000:] += 10**12
-    collector = CurveCollector()
-    collector.take(replace(log, cycles=cycles))
-    curves = collector.finish().cycles
-    (gap,) = np.flatnonzero(np.isnan(curves.low("read")))
-    assert 100 < gap < len(curves.rows.t_ns) - 100
 
 
 def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,7 +186,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
         (("--where", "unreadable IS NOT NULL"), ["may/broken.mcap"]),
         (("--where", "cycles > 30", "--sort", "cycles DESC"), ["may/third.mcap", "may/second.mcap"]),
         (
-            ("--where", "list_contains(findings, 'rate_kept')"),
+            ("--where", "list_contains(findings, 'kept_rate')"),
             [name for name in NAMES if "broken" not in name],
         ),
         (("--where", "robot LIKE 'single%' -- and no more"), ["may/third.mcap"]),
@@ -272,11 +272,7 @@ def test_a_program_of_its_own_prints_nothing_at_its_end(known: Path) -> None:
     ],
 )
 def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
-    known: Path,
-    dxlrun: Dxlrun,
-    monkeypatch: pytest.MonkeyPatch,
-    words: tuple[str, ...],
-    sentence: str,
+    known: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], sentence: str
 ) -> None:
     monkeypatch.chdir(known)
     before = sorted(known.rglob("*"))

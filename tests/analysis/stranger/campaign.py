@@ -10,24 +10,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.analysis.stranger.cases import (
-    duties,
-    gears,
-    innocents,
-    line,
-    links,
-    movement,
-    programs,
-    servos,
-    wires,
-    workshop,
-)
+from tests.analysis.stranger.cases import innocents, line, movement
 from tests.analysis.stranger.cases import robot as robots
 from tests.analysis.stranger.expectation import Judged, judged
 
 from dxlrun.errors import DxlrunError
 
-FILES = (line, robots, movement, innocents, workshop, servos, wires, programs, gears, links, duties)
+FILES = (line, robots, movement, innocents)
 CASES = tuple(case for file in FILES for case in file.CASES)
 PAIRS = [(case, robot) for case in CASES for robot in case.robots]
 

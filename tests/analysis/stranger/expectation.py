@@ -38,22 +38,8 @@ VOLTS = r"volt|batter|suppl|power|brown|\bV\b"
 HEAT = r"\bhot\b|heat|warm|temperature|thermal|°\s?C|deg(rees)? ?C|cool"
 LOST = SILENT + r"|contact|answer|repl(y|ies)|gone|absent|vanish|drop"
 CABLE = r"cable|plug|contact|connect|wire|wiring|loose|chain|intermittent"
-GARBLED = (
-    r"nois|disturb|interfer|corrupt|garb|damaged|broken|checksum|CRC|unexpected|stray|spurious|rubbish|junk"
-    r"|bit error|flipp|incomplet|truncat|not (be )?(parsed|understood)|unreadable|distort|EMI|spoil|intact"
-)
 REBOOTS = r"re-?boot|re-?start|start(ed|s)? again|power|brown|reset|lost its (power|torque)|limp"
 WAKES = MACHINE + r"|wak|woke|\blate\b|sched|deadline|jitter|overrun|skipp|stall|oversle"
-WEAK = SOFT + r"|" + FOLLOWS + r"|" + LOAD + r"|slow|sluggish|stiffness|yield"
-OPPOSED = WEAK + r"|" + STUCK + r"|friction|stiff|drag|resist|spring|contact|outside|overload|rub|angle"
-SHAKES = (
-    r"oscillat|vibrat|shak|swing|overshoot|hunt|unstable|instab|resonan|jitter|trembl|\brings?\b|ringing"
-    r"|limit cycle|chatter|back and forth|Hz"
-)
-TURNS = (
-    r"switch|take[ -]?over|took over|activat|hand(ed|s|ing)?[ -]?(over|back)|flap|alternat|in turns?"
-    r"|back and forth|controllers?\b[^.]*\b(times|client)|client"
-)
 """Words with which a sentence may name such a cause."""
 
 
@@ -158,7 +144,10 @@ def judged(case: Case, robot: str, directory: Path) -> Judged:
 
 def compared(case: Case, robot: str, log: Path) -> Judged:
     """Compare the verdict on a log with what a case expects."""
-    verdict = judge(totals_of(log))
+    totals = totals_of(log)
+    for bus in totals.plan.buses:
+        bus.noted = False  # It is judged as the log of real servos, as which the kit names its ports
+    verdict = judge(totals)
     spec = ROBOTS[robot].spec
     blamed = [finding for finding in verdict.findings if finding.rank < max(type(finding.rank))]
     candidates = [*verdict.findings[:2], *blamed[: case.first]] if case.first else verdict.findings[:1]

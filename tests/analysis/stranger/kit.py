@@ -45,8 +45,6 @@ HEAD = ("head_yaw", "head_pitch")
 LEFT = ("left_shoulder", "left_elbow", "left_knee")
 RIGHT = ("right_shoulder", "right_elbow", "right_knee")
 JOINTS = (*HEAD, *LEFT, *RIGHT)
-ARMS = tuple(name for name in JOINTS if name.endswith(("shoulder", "elbow")))
-KNEES = ("left_knee", "right_knee")
 Spec = dict[str, Any]
 Broken = Any  # A controller that is made to fail
 
@@ -311,11 +309,6 @@ class Story:
         reference = math.radians(float(entry["reference"].split()[0]))
         return float(entry["direction"]) * (self.servo(joint).position - reference)
 
-    def bus_name(self, joint: str) -> str:
-        """Return the name of a joint's bus."""
-        name: str = self.joint(joint)["bus"]
-        return name
-
     # What another host sends
 
     def _wire(self) -> Any:
@@ -468,13 +461,6 @@ class Story:
             shaft.mechanics.strain.overloaded[shaft.index] = 0
 
         self.every(0.05, bear, joint)
-
-    def weaken(self, joint: str, factor: float) -> None:
-        """Let only a part of a motor's torque arrive at the output, from now on."""
-        servo = self.servo(joint)
-        servo.shaft.mechanics.law.stall[servo.shaft.index] *= factor
-        servo.shaft.mechanics._wake()
-        self.evidence["torque"] += 1
 
     def break_controller(self, name: str, at_s: float, act: Callable[[Any], None]) -> None:
         """Let a controller fail in its update from a time of the run on: `act` gets the controller."""

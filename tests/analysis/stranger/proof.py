@@ -54,20 +54,6 @@ def unread(story: Story, joint: str, least: int) -> None:
     story.checks.append(check)
 
 
-def load_changes(
-    story: Story, joint: str, kind: str, at_s: float, holds: Callable[[float, float], bool]
-) -> None:
-    """Prove that something holds for a joint's mean load in a second before a time, and in one behind it."""
-
-    def check(log: Log) -> None:
-        times, effort = log.cycles["scheduled_ns"] / S, np.abs(column(log, "effort", joint))
-        parts = ((at_s - 1.2, at_s - 0.1), (at_s + 0.4, at_s + 1.4))
-        before, after = (float(np.nanmean(effort[(times > low) & (times < high)])) for low, high in parts)
-        story.evidence[kind] += holds(before, after)
-
-    story.checks.append(check)
-
-
 def said(story: Story, words: str, least: int = 1) -> None:
     """Prove that so many events have some words."""
 
@@ -75,16 +61,6 @@ def said(story: Story, words: str, least: int = 1) -> None:
         story.evidence[words] += sum(words in event.text for event in log.events) >= least
 
     story.checks.append(check)
-
-
-def goals_move(story: Story, since_s: float) -> None:
-    """Prove that the goal of some joint changes after a time."""
-    story.checks.append(lambda log: story.evidence.update({"goals move": _travel(log, since_s) > 0.02}))
-
-
-def goals_stand(story: Story, since_s: float) -> None:
-    """Prove that no goal changes after a time."""
-    story.checks.append(lambda log: story.evidence.update({"goals stand": _travel(log, since_s) < 0.01}))
 
 
 def start_refused(story: Story) -> None:
@@ -101,11 +77,6 @@ def start_refused(story: Story) -> None:
 
     story.evidence["start refused"] += 0
     story.prepared.append(lambda: instead(story.virtual, "run", tries))
-
-
-def _travel(log: Log, since_s: float) -> float:
-    later = log.cycles[log.cycles["scheduled_ns"] > since_s * S]
-    return float(np.nanmax(np.ptp(later["goal_position"], axis=0)))
 
 
 def turns(values: Any) -> int:

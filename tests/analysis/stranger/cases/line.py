@@ -1,11 +1,28 @@
-"""Faults of the line, of adapters and of other hosts."""
+"""Lines, adapters, cables and other hosts that fail."""
 
 from __future__ import annotations
 
 from functools import partial
 
-from tests.analysis.stranger.expectation import BROKEN, HOST, LATE, SHARED, Case, collector
-from tests.analysis.stranger.kit import JOINTS, MS, Story
+import numpy as np
+from tests.analysis.stranger.expectation import (
+    BROKEN,
+    CABLE,
+    HARDWARE,
+    HOST,
+    LATE,
+    LOST,
+    SHARED,
+    VOLTS,
+    WAKES,
+    Case,
+    collector,
+    others,
+    together,
+)
+from tests.analysis.stranger.kit import JOINTS, MS, S, Story
+from tests.analysis.stranger.proof import seen, unread
+from tests.analysis.stranger.world import supply
 from tests.kit.line_faults import other_host
 
 from dxlrun.plan.simulation_plan import ServoConfig
@@ -33,26 +50,6 @@ def cut_tail(story: Story) -> None:
         return data[:-5]
 
     story.on_arrival("left_knee", cut)
-
-
-@case(
-    "line",
-    "x_fast ax_single x_sync",
-    subject=("bus:left_elbow",),
-    cause=r"noise|line|bus|bytes|adapter|cable",
-    good=False,
-)
-def single_bytes_dropped(story: Story) -> None:
-    """The adapter loses single bytes now and then, anywhere in what the servos of the line send."""
-
-    def drop(servo_id: int, data: bytes, t_s: float) -> bytes:
-        if t_s < 1 or story.random.random() > 0.03:
-            return data
-        story.evidence["byte dropped"] += 1
-        place = story.random.randrange(len(data))
-        return data[:place] + data[place + 1 :]
-
-    story.on_arrival("left_elbow", drop)
 
 
 @case("line", "ax_single x_sync", subject=("left_elbow",), cause=BROKEN, good=False)
@@ -113,53 +110,6 @@ def other_host_reads(story: Story) -> None:
     story.every(0.1, read, since_s=1.0)
 
 
-@case("line", "x_fast x_sync", subject=("head_pitch",), cause=HOST + r"|torque|limp", good=False, first=2)
-def other_host_takes_torque(story: Story) -> None:
-    """Another program switches the torque of one servo off, by the same line, in a motion."""
-
-    def write() -> None:
-        bus = story.bus("head_pitch")
-        other_host(bus, story.write(story.id("head_pitch"), "torque_enable", 0), bus.now_ns + 4 * MS)
-        story.evidence["torque taken"] += 0
-
-    def look() -> None:
-        story.evidence["torque taken"] += not story.servo("head_pitch").torque_on
-
-    story.at(3.0, write, "head_pitch")
-    story.at(3.5, look, "head_pitch")
-
-
-@case("line", "x_three x_sync", cause=HOST, innocents=JOINTS)
-def other_host_blinks(story: Story) -> None:
-    """Another program's demo lets the LEDs of the servos blink, by sync writes at 20 Hz."""
-
-    def blink(t_s: float) -> None:
-        bus = story.bus("left_knee")
-        joints = [joint for joint in JOINTS if story.bus_name(joint) == bus.name]
-        on = int(t_s * 10) % 2
-        packet = story.sync_write("led", {story.id(joint): on for joint in joints})
-        other_host(bus, packet, bus.now_ns + story.random.randrange(4 * MS))
-        story.evidence["blink"] += 1
-
-    story.every(0.05, blink, "left_knee", since_s=1.2)
-
-
-@case("line", "mx_two x_fast", subject=("bus:right_knee",), cause=r"nois|garbage|interfer|stray|bytes")
-def noise_under_load(story: Story) -> None:
-    """The line picks up noise only while the big motors work hard: it comes with the motion, not before."""
-    story.joint("right_knee")["simulation"]["inertia"] = "0.02 kg m^2"
-
-    def burst(t_s: float) -> None:
-        bus = story.bus("right_knee")
-        servo = story.servo("right_knee")
-        if abs(servo.shaft.duty) < 0.1:
-            return
-        bus.inject_noise(story.random.randbytes(2), bus.now_ns + story.random.randrange(5 * MS))
-        story.evidence["burst"] += 1
-
-    story.every(0.01, burst, "right_knee", since_s=0.8)
-
-
 @case(
     "line",
     "ax_single x_sync",
@@ -205,35 +155,6 @@ def instructions_spoilt(story: Story) -> None:
     story.on_request(0, spoil)
 
 
-@case("line", "ax_single x_sync", subject=("right_knee",), cause=LATE)
-def late_now_and_then(story: Story) -> None:
-    """One servo is busy with itself now and then: a tenth of its replies come some milliseconds late,
-    intact."""
-    story.alter(
-        "right_knee",
-        lambda t_s: (
-            (bytes, story.random.uniform(0.002, 0.006)) if t_s > 1 and story.random.random() < 0.1 else None
-        ),
-        "late",
-    )
-
-
-@case(
-    "line",
-    "x_fast mx_bulk",
-    subject=("left_shoulder",),
-    cause=r"cut|incomplete|truncat|missing|broken|lost|silent|not answer|repl",
-    good=False,
-)
-def cut_in_the_middle(story: Story) -> None:
-    """A servo in the middle of the chain breaks off its own block; those behind it then wait in vain."""
-    story.alter(
-        "left_shoulder",
-        lambda t_s: (lambda data: data[:4], 0.0) if t_s > 1.5 and story.random.random() < 0.12 else None,
-        "block broken off",
-    )
-
-
 @case(
     "line",
     "mx_bulk x_fast ax_single",
@@ -254,96 +175,6 @@ def shared_cable_flickers(story: Story) -> None:
         story.at(0.01, partial(story.interrupt, joint, partial(contact, joint)), joint)
 
 
-@case(
-    "line",
-    "x_sync mx_bulk",
-    subject=("right_shoulder", "right_elbow", "right_knee"),
-    cause=SHARED,
-    good=False,
-)
-def leg_cable_torn(story: Story) -> None:
-    """The cable to the right side is torn off in a motion: three servos are gone for good, at the same
-    moment."""
-    for joint in ("right_shoulder", "right_elbow", "right_knee"):
-        story.fault("silence servo={id} at=2700ms", joint)
-
-
-@case(
-    "line",
-    "mx_two x_three",
-    subject=("bus:left_knee",),
-    cause=LATE + r"|adapter|latency|held|hub",
-    good=False,
-)
-def late_adapter(story: Story) -> None:
-    """One adapter of several hands intact replies over some milliseconds late, in bursts."""
-    story.hand_over_late(
-        ["left_knee"], lambda t_s: 0.011 * (t_s > 1.5 and (t_s * 2.3) % 1 < 0.12), "bus late"
-    )
-
-
-@case("line", "ax_single x_fast", cause=HOST, innocents=JOINTS)
-def other_host_pings(story: Story) -> None:
-    """A second adapter on the line scans it: another program pings one ID after the other."""
-    count = iter(range(10**6))
-
-    def ping(t_s: float) -> None:
-        bus = story.bus(0)
-        other_host(bus, story.ping(next(count) % 60), bus.now_ns + story.random.randrange(9 * MS))
-        story.evidence["ping"] += 1
-
-    story.every(0.12, ping, since_s=1.0)
-
-
-@case(
-    "line",
-    "ax_single mx_bulk",
-    cause=HOST + r"|\bID\b.*chang|lost|not answer",
-    subject=("right_elbow",),
-    good=False,
-    first=2,
-)
-def other_host_changes_an_id(story: Story) -> None:
-    """A tool sets up a servo while the robot runs, and the new ID goes to the wrong one."""
-
-    def write() -> None:
-        bus = story.bus("right_elbow")
-        other_host(bus, story.write(story.id("right_elbow"), "torque_enable", 0), bus.now_ns + 2 * MS)
-        other_host(bus, story.write(story.id("right_elbow"), "id", 77), bus.now_ns + 6 * MS)
-        story.at_end(lambda: any(servo.servo_id == 77 for servo in bus.servos), "ID changed")
-
-    story.at(2.5, write, "right_elbow")
-
-
-@case("line", "mx_bulk x_fast", cause=HOST, innocents=JOINTS)
-def other_host_commands(story: Story) -> None:
-    """A second program was left running, and sends its own goal positions to all servos by sync writes."""
-
-    def goals(t_s: float) -> None:
-        bus = story.bus(0)
-        data = {story.id(joint): 2048 + story.random.randrange(-150, 150) for joint in JOINTS}
-        other_host(bus, story.sync_write("goal_position", data), bus.now_ns + story.random.randrange(9 * MS))
-        story.evidence["goals"] += 1
-
-    story.every(0.25, goals, since_s=1.5)
-
-
-@case(
-    "line",
-    "mx_bulk x_fast",
-    cause=r"echo|own (bytes|instructions|packets|data)|(it|host) sen[dt]",
-    innocents=JOINTS,
-)
-def adapter_begins_to_echo(story: Story) -> None:
-    """The direction switch of the adapter fails: from then on the host receives what it sends."""
-
-    def begin() -> None:
-        story.bus(0).echo = True
-        story.evidence["echo"] += 1
-
-    story.at(2.5, begin)
-
-
 @case("line", "ax_single x_three", subject=("bus:left_elbow",), cause=r"nois|garbage|interfer|stray|bytes")
 def noise_all_the_time(story: Story) -> None:
     """A motor cable without a ferrite lies along the bus: short bursts of random bytes, all the time."""
@@ -355,31 +186,6 @@ def noise_all_the_time(story: Story) -> None:
         story.evidence["burst"] += 1
 
     story.every(0.05, burst, "left_elbow", since_s=0.8)
-
-
-@case(
-    "line",
-    "mx_two x_three",
-    subject=("bus:left_knee",),
-    cause=r"adapter|port|unplug|gone|disconnect|USB",
-    good=False,
-)
-def adapter_unplugged(story: Story) -> None:
-    """A USB plug slips out for half a second in a motion, and is pushed in again."""
-    story.fault("unplug at=2500ms for=500ms", "left_knee")
-
-
-@case(
-    "line",
-    "mx_bulk x_three",
-    subject=("bus:right_knee",),
-    cause=r"adapter|whole bus|all (of )?(the |its )?servos|every servo|line|bus",
-    good=False,
-    innocents=JOINTS,
-)
-def adapter_hangs(story: Story) -> None:
-    """The adapter hangs for 400 ms: it takes bytes and gives none."""
-    story.fault("wedge at=3s for=400ms", "right_knee")
 
 
 @case(
@@ -398,3 +204,99 @@ def servo_babbles(story: Story) -> None:
 def return_delay_as_shipped(story: Story) -> None:
     """A servo was exchanged for one with another firmware, which takes 2 ms longer for each reply."""
     story.fault("slow servo={id} by=2ms at=1500ms", "left_shoulder")
+
+
+@case("cable", "ax_single x_three", subject=("left_knee",), cause=CABLE + "|" + LOST)
+def contact_fails_when_it_moves_fast(story: Story) -> None:
+    """A plug that shakes: a knee answers when it moves slowly, and often not when it is fast, at whatever
+    angle."""
+    story.motion = story.swing(left_knee="0.45 * sin(3.4 * t)")
+
+    def contact() -> bool:
+        shaken = abs(story.servo("left_knee").velocity) > 1.0 and story.random.random() < 0.35
+        story.evidence["shaken"] += shaken
+        return not shaken
+
+    story.prepared.append(lambda: story.interrupt("left_knee", contact))
+    unread(story, "left_knee", 5)
+
+
+@case(
+    "adapter",
+    "mx_two x_three",
+    cause=together(
+        ("hub", "USB", "adapter", "port", "bus"),
+        r"unplug|disconnect|gone|vanish|disappear|lost|closed|away|re-?open|anew|hub|together|same|at once"
+        r"|\ball\b|both",
+    ),
+    innocents=JOINTS,
+    good=False,
+)
+def hub_starts_anew(story: Story) -> None:
+    """A static discharge: the USB hub starts anew, all adapters vanish in one moment and come back."""
+    for number in story.buses:
+        story.fault("unplug at=2800ms for=350ms", number)
+
+
+@case("power", "ax_single x_fast", cause=VOLTS, innocents=JOINTS)
+def battery_runs_flat(story: Story) -> None:
+    """The battery runs flat within the run; nothing has failed yet."""
+    story.duration_s = 7.0
+    story.motion = story.swing()
+    first, last = (11.2, 9.1) if story.kind.protocol == 1.0 else (11.8, 9.7)
+    supply(story, 0, lambda t_s, servo: max(last, first - (t_s - 0.9) * (first - last) / 4.5), "flat")
+    seen(story, "voltage", "left_knee", lambda values: np.nanmin(values) < last + 0.5)
+
+
+@case("machine", "mx_two x_fast", cause=WAKES, innocents=HARDWARE)
+def job_each_second(story: Story) -> None:
+    """Each second a job of the system runs for some 160 ms on the loop's core: in that time the loop wakes by
+    half a period to two and a half too late; between the jobs it is in time."""
+    period_s = 1 / story.kind.rate
+
+    def by_s(number: int) -> float:
+        busy = story.virtual.clock.now_ns() / S % 1.0 < 0.16
+        return story.random.uniform(0.5, 2.5) * period_s if busy else 0.0
+
+    story.stall(by_s, 0.9)
+    story.at_end(lambda: story.evidence["stall"] > 20, "often late")
+
+
+@case(
+    "host",
+    "mx_bulk x_fast",
+    cause=HOST + r"|shares? the port|same (port|adapter)|unasked|unrequested|not asked|nobody asked"
+    r"|no one asked"
+    r"|did not ask|unexpected|stray|replies to|answers? to",
+    innocents=JOINTS,
+)
+def script_reads_by_our_adapter(story: Story) -> None:
+    """A script for logging temperatures has the same adapter open and reads all servos in turn, 25 times a
+    second: of that only the replies are seen here, which nothing here asked for."""
+    numbers = [0]
+
+    def read(t_s: float) -> None:
+        bus = story.bus(0)
+        joint = JOINTS[numbers[0] % len(JOINTS)]
+        numbers[0] += 1
+        packet = story.read(story.id(joint), "present_temperature")
+        other_host(bus, packet, bus.now_ns + story.random.randrange(9 * MS), received=False)
+        story.evidence["read"] += 1
+
+    story.every(0.04, read, 0, 1.3)
+
+
+@case(
+    "robot",
+    "mx_two x_fast",
+    cause=together(("left_elbow", "right_knee"), LOST),
+    innocents=others("left_elbow", "right_knee"),
+    good=False,
+)
+def two_lost_far_apart(story: Story) -> None:
+    """Two plugs slip out that have nothing to do with each other: that of an elbow for a second, and later
+    that of the other side's knee for good."""
+    story.fault("silence servo={id} at=1800ms for=1s", "left_elbow")
+    story.fault("silence servo={id} at=3700ms", "right_knee")
+    unread(story, "left_elbow", 10)
+    unread(story, "right_knee", 20)
