@@ -79,7 +79,6 @@ def test_a_pose_is_printed_and_as_json(dxlrun: Dxlrun, pair: Path) -> None:
         "base",
         "--at",
         "pan=90deg",
-        "--at",
         "jaw=5 mm",
     )
     printed = dxlrun(*words).out
@@ -103,7 +102,7 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
     [
         (["--at", "pan=1rad"], "--at and --relative-to are for one frame; name it by --of"),
         (["--of", "jam"], "there is no frame jam; did you mean jaw?"),
-        (["--of", "jaw", "--at", "pan"], "--at pan is no position; write a joint and its position, such as"),
+        (["--of", "jaw", "--at", "pan"], "'pan' is not key=value; write for example --at elbow=30deg"),
         (["--of", "jaw", "--at", "pan=1"], "--at pan=1: '1' has no unit; write an angle with its unit"),
         (
             ["--of", "jaw", "--at", "jaw=1deg"],

@@ -540,6 +540,19 @@ def test_another_program_reads_the_robot_by_the_page(torso: RemoteRobot) -> None
     assert json.loads(printed.stdout)["robot"] == torso.name
 
 
+def test_pose_that_is_printed_can_be_sent_and_looked_at(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("get", "left_arm")
+    assert (said.code, said.err) == (0, "")
+    pose = said.out.split()
+    names = [word.partition("=")[0] for word in pose]
+    assert names == controllers(torso)["left_arm"]["joints"]
+    assert dxlrun("send", "left_arm", "position", *pose, "--in", "200ms", "--wait").code == 0
+    assert dxlrun("frames", TORSO, "--of", "left_hand_link", "--at", *pose).code == 0
+    found = result_of(dxlrun("get", "all", "--json").out)["pose"]
+    assert [*found] == list(torso.states().joints)
+    assert found["left_elbow_joint"] == pytest.approx(torso.states().joint("left_elbow_joint")["position"])
+
+
 def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: RemoteRobot) -> None:
     lines = """list
         watch --once

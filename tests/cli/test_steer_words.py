@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from tests.kit.answers import result_of
 
 from dxlrun.cli.steering.steer import command, controllers, headline, state
 from dxlrun.cli.steering.written import Written
@@ -27,7 +28,8 @@ def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_list_of_no_robots_is_no_failure(dxlrun, no_robot: None) -> None:
     assert dxlrun("list") == (0, NO_ROBOT.removeprefix("dxlrun: ") + "\n", "")
-    assert dxlrun("list", "--json") == (0, "[]\n", "")
+    said = dxlrun("list", "--json")
+    assert (said.code, result_of(said.out), said.err) == (0, [], "")
 
 
 def test_a_wrong_file_is_refused_with_its_places(dxlrun, no_robot: None, tmp_path: Path) -> None:

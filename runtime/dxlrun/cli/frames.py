@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, DebugFlag, GraphFile, JsonFlag, RobotPath, compiled
+from dxlrun.cli.inputs import Assignment, DebugFlag, GraphFile, JsonFlag, RobotPath, compiled, parse_pair
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
 
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from dxlrun.description.frames.tree import Frame, FrameTree
     from dxlrun.plan.robot_plan import Plan
 
-_Positions = Annotated[tuple[str, ...], Parameter(name="--at", negative=(), show_default=False)]
+_Positions = Annotated[
+    tuple[str, ...], Parameter(name="--at", negative=(), show_default=False, consume_multiple=True)
+]
 _Branches = tuple[str, str, str, str, str]
 _LINES: _Branches = ("├── ", "├┄┄ ", "└── ", "└┄┄ ", "│   ")
 """To a frame that moves, one that does not, the same for the last below a frame; and past others."""
@@ -47,7 +49,8 @@ def frames(
     relative_to
         The frame in which it lies; without it the root of the tree.
     at
-        Position of a joint, for example elbow=30deg or jaw=5mm; may be given several times. The others rest.
+        A pose: joints or groups with their positions, such as elbow=30deg jaw=5mm, as `dxlrun get` prints it
+        and `dxlrun send` takes it. The others rest.
     graph
         Draw a graph here, or into a file, .svg or .dot: the tree, which is drawn without it, too.
     """
@@ -64,7 +67,7 @@ def frames(
     if of is None:
         _show_tree(result.plan, tree, as_json=as_json)
     else:
-        _show_pose(tree, of, relative_to, at, as_json=as_json)
+        _show_pose(tree, of, relative_to, _positions(result.plan, tree, at), as_json=as_json)
     for file in graph or ():
         _draw(result.plan, tree, file)
         if not as_json:
@@ -169,9 +172,11 @@ def _row(plan: Plan, tree: FrameTree, frame: Frame) -> dict[str, object]:
     return row
 
 
-def _show_pose(tree: FrameTree, of: str, relative_to: str, at: tuple[str, ...], *, as_json: bool) -> None:
+def _show_pose(
+    tree: FrameTree, of: str, relative_to: str, positions: Mapping[str, float], *, as_json: bool
+) -> None:
     try:
-        pose = tree.pose(of, relative_to, _positions(tree, at))
+        pose = tree.pose(of, relative_to, positions)
     except LookupError as error:
         raise InputError(str(error.args[0])) from None
     relative = relative_to or tree.frames[0].name
@@ -200,24 +205,21 @@ def _pose_lines(pose: Transform) -> Iterator[str]:
     yield f"  quaternion      {numbers(pose.rotation, 6)} (x y z w)"
 
 
-def _positions(tree: FrameTree, words: tuple[str, ...]) -> Mapping[str, float]:
-    """Return the positions of joints, rad or m, that were given as `elbow=30deg`. Raises InputError."""
+def _positions(plan: Plan, tree: FrameTree, words: tuple[str, ...]) -> Mapping[str, float]:
+    """Return the positions, rad or m, of a pose `elbow=30deg right_arm=0deg`. Raises InputError."""
     from dxlrun.description import units
 
     kinds = {frame.joint.name: frame.joint.type for frame in tree.frames if frame.joint is not None}
     found: dict[str, float] = {}
     for word in words:
-        name, sign, value = word.partition("=")
-        if not sign:
-            raise InputError(
-                f"--at {word} is no position; write a joint and its position, such as elbow=30deg"
-            )
-        if name in found:
-            raise InputError(f"--at {name} is given twice; give it once")
-        try:
-            found[name] = (units.length if kinds.get(name) == "prismatic" else units.angle)(value)
-        except ValueError as error:
-            raise InputError(f"--at {word}: {error}") from None
+        name, value = parse_pair(word, "--at elbow=30deg")
+        for joint in plan.groups.get(name, (name,)):
+            if joint in found:
+                raise InputError(f"--at {joint} is given twice; give it once")
+            try:
+                found[joint] = (units.length if kinds.get(joint) == "prismatic" else units.angle)(value)
+            except ValueError as error:
+                raise InputError(f"--at {word}: {error}") from None
     return found
 
 

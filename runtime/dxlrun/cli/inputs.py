@@ -140,6 +140,19 @@ def _assignment_for(word: str) -> str:
     return f"{match[1]}:={match[2] or 'VALUE'}" if match else "name:=value"
 
 
+def parse_pair(word: str, example: str) -> tuple[str, str]:
+    """Return key and value of a word `key=value`. Raises InputError with an example for another one."""
+    key, sign, value = (part.strip() for part in word.partition("="))
+    if not sign or not value or not all(part.isidentifier() for part in key.split(".")):
+        raise InputError(f"{word!r} is not key=value; write for example {example}")
+    return key, value
+
+
+def pose_text(positions: Mapping[str, str]) -> str:
+    """Return positions by joint as `send` and `frames --at` take them: `elbow=20.0deg jaw=5.00mm`."""
+    return " ".join(f"{name}={position.replace(' ', '')}" for name, position in positions.items())
+
+
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
     """Let SIGTERM do what Ctrl-C does: what was measured is kept and shown."""

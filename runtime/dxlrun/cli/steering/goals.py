@@ -39,10 +39,10 @@ def send(
     wait: WaitFlag = False,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
-    """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
+    """Send a controller of a running robot a command: `dxlrun send arm position elbow=20deg wrist=0deg`.
 
-    `dxlrun list` shows which commands a controller takes, and what is in them. Some joints by name, while the
-    others keep their goals: `dxlrun send arm position elbow=20deg`. Commands of a device:
+    A pose names joints or groups; the others keep their goals. Other commands of a controller have keys:
+    `dxlrun send base velocity 'linear=0.1 m/s'`; `dxlrun list` shows which it takes. Commands of a device:
     `dxlrun send board led=1`.
 
     Parameters

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag
+from dxlrun.cli.inputs import Flag, pose_text
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.remote.client import Executed
+    from dxlrun.remote.client import Executed, RemoteRobot
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
 """Names of joints, of controllers, or `all`."""
@@ -84,17 +84,21 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
 def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Print the state of a joint, or an item of its servo's control table: of a robot that runs.
 
-    Of a device or a sensor its states, or one of them: `dxlrun get imu/orientation.x`; of a device what is
-    commanded, too: `dxlrun get board/led`.
+    Of a group or a controller, or `all`, the pose, as `dxlrun send` takes it. Of a device or a sensor its
+    states, or one of them: `dxlrun get imu/orientation.x`; of a device what is commanded, too:
+    `dxlrun get board/led`.
 
     Parameters
     ----------
     joint
-        Name of the joint, device or sensor; for an item of one of its servos alone that, such as hip/1.
+        Name of the joint, group, controller, device or sensor; for an item of one of its servos alone that,
+        such as hip/1.
     item
         Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
     """
     with robot_of(chosen, "get") as robot:
+        if not item and (names := _meant(robot.info(), joint)):
+            return _show_pose(robot, names, chosen)
         found = robot.get(joint, item)
         if chosen.as_json:
             show_json({"robot": robot.name, **found})
@@ -105,6 +109,28 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
             show(f"{robot.name}: {joint}", Table.facts("", source_facts(found)))
         else:
             show(f"{robot.name}: {joint}", Table.facts("", facts(found)))
+    return 0
+
+
+def _meant(info: Mapping[str, Any], name: str) -> Sequence[str]:
+    """Return the joints of a group or controller, or of `all`; none for another name."""
+    controllers = {one["name"]: one["joints"] for one in info["controllers"]}
+    known = {**controllers, **info["groups"], "all": info["joints"]}
+    return () if name in info["joints"] else known.get(name, ())
+
+
+def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
+    """Print the positions of joints; one that was never read is not in the pose."""
+    states = robot.states()
+    ways = {
+        name: "mm" if unit == "m" else "deg" for name, unit in zip(states.joints, states.units, strict=True)
+    }
+    found = {name: states.joint(name)["position"] for name in names}
+    pose = {name: position for name, position in found.items() if position is not None}
+    if chosen.as_json:
+        show_json({"robot": robot.name, "pose": pose})
+    else:
+        show(pose_text({name: written(position, ways[name]) for name, position in pose.items()}))
     return 0
 
 

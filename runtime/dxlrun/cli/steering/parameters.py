@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from msgspec import to_builtins
 
+from dxlrun.cli.inputs import parse_pair
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
@@ -53,11 +54,9 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
 def _pair(word: str) -> tuple[str, bool | float | str]:
     from dxlrun.description.document import plain_value
 
-    name, sign, text = word.partition("=")
-    if not sign or not name or not text:
-        raise InputError(f"{word!r} changes nothing; write NAME=VALUE, such as gains.p=4.0")
-    value = plain_value(text.strip())
-    return name.strip(), value if isinstance(value, bool | int | float) else text.strip()
+    name, text = parse_pair(word, "gains.p=4.0")
+    value = plain_value(text)
+    return name, value if isinstance(value, bool | int | float) else text
 
 
 def _table(rows: Sequence[Parameter]) -> Table:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dxlrun.cli.inputs import parse_pair
 from dxlrun.description.document import Grown, grow, literal, parse, read_text
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
@@ -67,9 +68,9 @@ class Written:
 
 
 def _line(word: str) -> str:
-    key, sign, value = word.partition("=")
-    if not sign or not all(part.isidentifier() for part in key.split(".")) or "\n" in value:
-        raise InputError(f"{word!r} has no key; write key=value, such as 'positions=[30 deg, 0 deg]'")
+    key, value = parse_pair(word, "elbow=20deg, or 'positions=[30 deg, 0 deg]'")
+    if "\n" in value:
+        raise InputError(f"the value of {key} has a line break; write it on one line, or give a --file")
     return f"{key}: {value}"
 
 
