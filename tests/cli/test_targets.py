@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import pytest
 
+from dxlrun.cli.inputs import check_report, write_report
 from dxlrun.errors import InputError
+from dxlrun.output.html import document
 from dxlrun.output.target import check_target, open_empty, write_target
 
 Dxlrun = Callable[..., object]
@@ -93,6 +96,17 @@ def test_a_verb_replaces_what_it_wrote_before_and_an_empty_file(
         assert dxlrun(*words, name).code == 0
         assert len((here / name).read_bytes()) > 100
     assert [path.name for path in here.iterdir()] == [name]
+
+
+def test_a_report_is_replaced_by_a_report(here: Path) -> None:
+    page = document("a report", Element("header"), (), Element("footer"), {})
+    for text in (page, page.replace("a report", "another one")):
+        check_report(Path("report.html"), "json")
+        write_report(Path("report.html"), text)
+        assert (here / "report.html").read_text() == text
+    (here / "report.html").write_text("<p>by hand</p>")
+    with pytest.raises(InputError, match="is not from dxlrun"):
+        check_report(Path("report.html"), "json")
 
 
 def test_an_older_file_of_the_same_kind_is_replaced_where_a_link_leads(here: Path) -> None:

@@ -310,6 +310,8 @@ class Guardian:
         for opened in lines.returned():
             if opened.done:
                 self._safe_stop.report(opened.done, Severity.INFO)
+            if opened.remark:
+                self._safe_stop.report(opened.remark, Severity.WARNING)
             if opened.wrong:
                 self._safe_stop.report(opened.wrong, Severity.ERROR)
             for each in (channel, self._control):

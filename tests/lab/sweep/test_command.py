@@ -136,6 +136,17 @@ def test_the_score_is_drawn_as_a_map(sweep, no_workers, over):
     assert all(one.partition("=")[0] in drawn for one in over)
 
 
+def test_an_older_map_is_replaced_and_nothing_else(sweep, no_workers):
+    for name in ("drawn.svg", "drawn.png", "drawn.pdf"):
+        for _ in range(2):
+            said = sweep("--over", "gains.p=1,2", "--picture", name)
+            assert (said.code, said.errors) == (0, [])
+        Path(name).write_text("a letter")
+        said = sweep("--over", "gains.p=1,2", "--picture", name)
+        assert (said.code, Path(name).read_text()) == (2, "a letter")
+        assert f"{name} cannot be written (it exists, and is not from dxlrun)" in said.errors[0]
+
+
 def test_the_commands_of_the_page_are_understood(no_workers, here, dxlrun):
     for words in commands_of("experiments.md", "sweep"):
         said = dxlrun(*words)

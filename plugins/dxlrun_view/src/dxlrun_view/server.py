@@ -137,7 +137,7 @@ class Page:
                 self.listener.admit(request.client)
             try:
                 response = await handler(request)
-            except DxlrunError as error:
+            except (DxlrunError, OSError) as error:  # OSError: a mesh that cannot be read
                 response = _refused(409, str(error))
             response.headers.update(_SECURITY)
             return response
