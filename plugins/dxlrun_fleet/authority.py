@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dxlrun.errors import InputError
+from dxlrun.output.target import unwritable
 from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
 from dxlrun.remote.requests.table import Role
 
@@ -79,6 +80,10 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     over that is another name's or another authority's.
     """
     file = name if role is None else CLIENT
+    try:
+        to.mkdir(parents=True, exist_ok=True, mode=0o700)  # before the certificate counts as issued
+    except OSError as error:
+        raise unwritable(to, error) from error
     issuer, signer = _authority()
     kept = place() / "issued" / f"{name}.crt"
     there = to / f"{file}.crt"
@@ -104,7 +109,6 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     one = Issued(name, builder.sign(signer, hashes.SHA256()))
     signed = one.certificate.public_bytes(Encoding.PEM)
     _write(kept, (kept.read_bytes() if kept.exists() else b"") + signed)
-    to.mkdir(parents=True, exist_ok=True, mode=0o700)
     _write_key(to / f"{file}.key", key)
     _write(there, signed)
     _write(to / "ca.crt", root)

@@ -317,3 +317,14 @@ def test_a_key_that_others_can_read_and_certificates_that_do_not_fit_are_refused
         server_context("arm")
     with pytest.raises(InputError, match=r"leg\.crt is missing"):
         server_context("leg")
+
+
+def test_a_certificate_that_cannot_be_written_does_not_count_as_issued(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (tmp_path / "text").write_text("Dear servo")
+    for place in ("text", "text/below"):
+        with pytest.raises(InputError, match=f"{place} cannot be written"):
+            authority.issue("anna", Role.COMMAND, 30, tmp_path / place)
+    assert [*authority.issued()] == []
+    authority.issue("anna", Role.COMMAND, 30, tmp_path / "anna")
+    assert [one.name for one in authority.issued()] == ["anna"]

@@ -50,7 +50,7 @@ def server_context(name: str) -> ssl.SSLContext:
 
 def client_context() -> ssl.SSLContext:
     """Return TLS as a client has it; raises InputError."""
-    made = "`dxlrun keys client NAME --to DIRECTORY` on the robot's computer makes it, to be copied here"
+    made = "`dxlrun keys client NAME --output DIRECTORY` on the robot's computer makes it, to be copied here"
     return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT, made)
 
 
