@@ -86,7 +86,7 @@ def test_what_disturbs_an_adapter_is_found(
 ) -> None:
     one = look(ADAPTER | files)[what]
     assert one.state == "worse"
-    assert one.mend.startswith(fix)
+    assert one.fix.startswith(fix)
     (sentence,) = warnings_for("/dev/ttyUSB0", tmp_path)
     assert sentence.startswith(f"{what}: ")
     assert fix in sentence
@@ -118,7 +118,7 @@ def test_ports_of_the_board_are_listed_and_never_missing(look: Look, tmp_path: P
     assert found["/dev/ttyACM0"].state == "missing"
     for name in ports[2:]:
         assert found[f"/dev/{name}"].state == "worse"
-        assert found[f"/dev/{name}"].mend
+        assert found[f"/dev/{name}"].fix
     assert serial_devices(tmp_path) == ("/dev/ttyUSB0", *(f"/dev/{name}" for name in ports))
 
 
@@ -131,7 +131,7 @@ def test_rates_that_a_driver_does_not_have_are_named(look: Look) -> None:
         "worse",
         "its driver does not have all rates: 4000000 becomes 3000000 bit/s",
     )
-    assert one.mend == "choose a rate of: 57600, 1000000"
+    assert one.fix == "choose a rate of: 57600, 1000000"
     good = look(set_rates=lambda path: {1_000_000: 1_000_000})["baud rates of /dev/ttyUSB0"]
     assert good.state == "good"
 
@@ -146,7 +146,7 @@ def test_the_rates_of_a_pseudo_terminal_are_as_asked() -> None:
 def test_a_good_machine_has_nothing_to_fix(look: Look) -> None:
     found = look()
     assert {one.state for one in found.values()} == {"good"}
-    assert not any(one.mend for one in found.values())
+    assert not any(one.fix for one in found.values())
     assert list(found) == [
         "system",
         "exchange",
@@ -198,14 +198,14 @@ def test_the_preemption_of_the_kernel_is_found(
     one = found["preemption"]
     assert one.found == f"preempt={model}"
     assert one.state == ("good" if model in {"full", "lazy"} else "worse")
-    assert bool(one.mend) == (one.state == "worse")
+    assert bool(one.fix) == (one.state == "worse")
     assert found["kernel"].state == "worse"
 
 
 def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, tmp_path: Path) -> None:
     (tmp_path / "proc").mkdir()
     (tmp_path / "proc/config.gz").write_bytes(gzip.compress(NONE.encode()))
-    assert look(DYNAMIC)["preemption"].mend == (
+    assert look(DYNAMIC)["preemption"].fix == (
         "add preempt=full to the kernel's command line and start it again"
     )
     (tmp_path / "proc/config.gz").write_bytes(b"\x1f\x8b")
@@ -213,7 +213,7 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
 
 
 @pytest.mark.parametrize(
-    ("files", "rights", "what", "found", "mend"),
+    ("files", "rights", "what", "found", "fix"),
     [
         (
             {"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16"},
@@ -305,19 +305,19 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
     ],
 )
 def test_what_could_be_better_is_listed_with_the_command_that_fixes_it(
-    *, look: Look, files: dict[str, str], rights: dict[str, Any], what: str, found: str, mend: str
+    *, look: Look, files: dict[str, str], rights: dict[str, Any], what: str, found: str, fix: str
 ) -> None:
     by_name = look(files, **rights)
     assert [one.what for one in by_name.values() if one.state != "good"] == [what]
     one = by_name[what]
     assert one.state == "worse"
     assert found in one.found
-    assert mend in one.mend
+    assert fix in one.fix
     assert one.why
 
 
 @pytest.mark.parametrize(
-    ("group", "mode", "found", "mend"),
+    ("group", "mode", "found", "fix"),
     [
         (
             "dialout",
@@ -331,7 +331,7 @@ def test_what_could_be_better_is_listed_with_the_command_that_fixes_it(
     ],
 )
 def test_a_port_that_may_not_be_opened_is_missing(
-    *, look: Look, monkeypatch: pytest.MonkeyPatch, group: str, mode: int, found: str, mend: str
+    *, look: Look, monkeypatch: pytest.MonkeyPatch, group: str, mode: int, found: str, fix: str
 ) -> None:
     monkeypatch.setattr(Path, "group", lambda _: group)
     look()  # makes the files
@@ -342,8 +342,8 @@ def test_a_port_that_may_not_be_opened_is_missing(
 
     one = look(may_write=closed)["/dev/ttyUSB0"]
     assert (one.state, one.found) == ("missing", found)
-    assert mend in one.mend
-    assert f"-aG {group} " not in one.mend or group == "dialout"
+    assert fix in one.fix
+    assert f"-aG {group} " not in one.fix or group == "dialout"
 
 
 def test_without_an_adapter_nothing_is_wrong(look: Look) -> None:
@@ -395,7 +395,7 @@ def test_another_system_is_reported_in_one_sentence(look: Look, other: dict[str,
     (one,) = look(**other).values()
     assert (one.what, one.state) == ("system", "missing")
     assert found in one.found
-    assert one.mend
+    assert one.fix
 
 
 def test_trying_a_policy_leaves_none_behind() -> None:
@@ -415,8 +415,8 @@ def test_the_doctor_looks_at_this_machine(dxlrun: Callable[..., Any]) -> None:
     assert said.code == (1 if "missing" in states else 0)
     assert answer.ok == ("missing" not in states)
     assert states <= {"good", "worse", "missing"}
-    assert all(set(check) == {"what", "state", "found", "why", "mend"} for check in shown["checks"])
-    assert all(check["mend"] for check in shown["checks"] if check["state"] != "good")
+    assert all(set(check) == {"what", "state", "found", "why", "fix"} for check in shown["checks"])
+    assert all(check["fix"] for check in shown["checks"] if check["state"] != "good")
 
 
 def test_the_terminal_gets_a_table_the_commands_and_a_verdict(
@@ -445,7 +445,7 @@ def test_on_another_system_the_exit_code_is_one(
 def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
     found = look(compiled="its kernel is missing: install dxlrun again")["exchange"]
     assert found.state == "missing"
-    assert found.mend == "install dxlrun again"
+    assert found.fix == "install dxlrun again"
 
 
 @pytest.mark.parametrize("what", ["kernel", "gate", "shared_memory"])

@@ -27,7 +27,7 @@ def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     findings = diagnose(Machine.this())
     missing = sum(finding.state == "missing" for finding in findings)
     if as_json:
-        wrong = [f"{one.what}: {one.why}; {one.mend}" for one in findings if one.state == "missing"]
+        wrong = [f"{one.what}: {one.why}; {one.fix}" for one in findings if one.state == "missing"]
         show_json({"checks": findings}, code=1 if missing else 0, errors=wrong)
     else:
         show(*_findings(findings, missing))
@@ -42,9 +42,9 @@ def _findings(findings: Sequence[Finding], missing: int) -> Iterator[Part]:
     rows = ((one.what, Cell(one.state, _TONES[one.state]), one.found) for one in findings)
     yield Table.of("", columns, rows)
     for one in findings:
-        if one.mend:
+        if one.fix:
             yield Sentence(f"{one.what}: {one.why}", _TONES[one.state])
-            yield f"    {one.mend}"
+            yield f"    {one.fix}"
     worse = sum(one.state == "worse" for one in findings)
     verdict = "robots run here" if not missing else "no robot runs here like this"
     yield f"{verdict}: {missing} missing, {worse} could be better"

@@ -77,7 +77,7 @@ class Finding:
     """How it is here."""
     why: str
     """What it matters for."""
-    mend: str = ""
+    fix: str = ""
     """The command, or the step, that fixes it; empty where nothing is to be fixed."""
 
 
