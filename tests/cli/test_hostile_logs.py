@@ -43,7 +43,6 @@ READERS = (
     ["logs", "."],
     ["export", "bad.mcap", "rows.csv", "--format", "csv"],
     ["export", "bad.mcap", "tables", "--format", "parquet"],
-    ["export", "bad.mcap", "bag", "--format", "ros2bag"],
     ["convert", "bad.mcap", "motion.yaml"],
 )
 REPLAYS = (

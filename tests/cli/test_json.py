@@ -21,7 +21,7 @@ SUCCESSFUL = {
     "check": "check robots/single_joint.yaml",
     "convert": "convert run.mcap new.yaml --what states",
     "examples": "examples",
-    "export": "export run.mcap bag --format ros2bag",
+    "export": "export run.mcap cycles.csv --format csv",
     "frames": "frames robots/bioloid_torso.yaml",
     "latency": "latency --count 100 --no-record",
     "models": "models AX-12A",

@@ -14,8 +14,8 @@ from dxlrun.output.terminal import err, show, show_json
 if TYPE_CHECKING:
     from dxlrun.log.reader import LogReader
 
-Format = Literal["csv", "parquet", "ros2bag", "lerobot"]
-_OF = {"csv": "row", "parquet": "row", "ros2bag": "message", "lerobot": "frame"}
+Format = Literal["csv", "parquet", "lerobot"]
+_OF = {"csv": "row", "parquet": "row", "lerobot": "frame"}
 
 
 def export(
@@ -30,7 +30,8 @@ def export(
 ) -> int:
     """Write a log in another format, to a new file or directory; nothing is written over.
 
-    CSV, Parquet and LeRobot need pyarrow: `pip install 'dxlrun[logs]'`.
+    Needs pyarrow: `pip install 'dxlrun[logs]'`. Programs that read MCAP with ROS 2 messages, such as Foxglove
+    and rosbag readers, open the log itself.
 
     Parameters
     ----------
@@ -40,8 +41,8 @@ def export(
         A new file for csv, a new directory for the other formats.
     file_format
         csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
-        commands and each topic; topics without a file are listed with the reason. ros2bag: a directory that
-        `ros2 bag` opens. lerobot: a data set in the layout of LeRobotDataset v3.0.
+        commands and each topic; topics without a file are listed with the reason. lerobot: a data set in the
+        layout of LeRobotDataset v3.0.
     topic
         Topic for csv: /events, /commands, /bus/NAME or one of a controller, instead of /cycle.
     """
@@ -49,7 +50,7 @@ def export(
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     if topic is not None and file_format != "csv":
         raise InputError(f"--topic is for csv, and {file_format} has all topics; leave it out")
-    if file_format != "ros2bag" and (missing := missing_extra(file_format, "logs", "pyarrow")):
+    if missing := missing_extra(file_format, "logs", "pyarrow"):
         raise InputError(missing)
     from dxlrun.log.reader import open_log
     from dxlrun.output.target import new_target
@@ -81,12 +82,6 @@ def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str
 
 def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> int:
     """Write the format; return how many records it has."""
-    if to == "ros2bag":
-        from dxlrun.log.parts import log_files
-        from dxlrun_analysis.export.ros2_bag import write_bag
-
-        next(reader.slices(), None)  # a file that is no log is refused as by the others
-        return write_bag(log_files(reader.path).files, target)
     if to == "csv":
         from dxlrun_analysis.export.csv_file import write_csv
 

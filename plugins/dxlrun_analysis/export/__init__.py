@@ -1,1 +1,1 @@
-"""A log in other formats: CSV, Parquet, a bag directory of ROS 2, a data set of LeRobot."""
+"""A log in other formats: CSV, Parquet, a LeRobot data set."""

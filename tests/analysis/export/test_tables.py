@@ -160,7 +160,7 @@ def test_a_wrong_topic_is_one_sentence_and_leaves_nothing(
     assert sentence in errors[0]
 
 
-@pytest.mark.parametrize("to", ["csv", "parquet", "ros2bag", "lerobot"])
+@pytest.mark.parametrize("to", ["csv", "parquet", "lerobot"])
 def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
     run: Path, tmp_path: Path, export: Export, to: str
 ) -> None:
@@ -209,7 +209,7 @@ def test_logs_md_its_exports_are_made(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^    dxlrun export (.+)$", PAGE, re.MULTILINE)
-    assert len(lines) == 5
+    assert len(lines) == 4
     for line in lines:
         log, output, *options = line.split()
         assert log == "LOG"
@@ -226,4 +226,3 @@ def test_without_pyarrow_one_sentence_has_the_command(
     assert errors == [
         "dxlrun: parquet needs pyarrow, which is not installed; `pip install 'dxlrun[logs]'` installs it"
     ]
-    assert export(run, tmp_path / "bag", "--format", "ros2bag")[0] == 0
