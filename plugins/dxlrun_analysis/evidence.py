@@ -34,7 +34,9 @@ _WEAK = ("noise", "lossy_line")
 _SPOILT = frozenset(("power_lost", "noise", "broken_replies", "lossy_line", "bus_lost"))
 """Codes after which goals wait, and joints follow worse that are not at fault; another host does the same
 whose goals or replies are among those of this run."""
-_FAILED = frozenset(("servo_lost", "silent", "servo_rebooted", "torque_lost"))
+_UNANSWERED = frozenset(("servo_lost", "silent"))
+"""Codes of what failed by replies that did not come, which may be a busy machine's."""
+_FAILED = _UNANSWERED | {"servo_rebooted", "torque_lost"}
 _SHARED = "Check what these buses share: the USB hub, its driver, the supply."
 _MARGIN = 0.1
 """A busy machine makes no greater a share of the replies late than so much above its share of the run."""
@@ -111,7 +113,7 @@ def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
     busy = Needs.MACHINE not in there
     return tuple(
         replace(one, remedy="")
-        if one.code in _FAILED and (busy or _is_explained(totals, one, ranked))
+        if (busy and one.code in _UNANSWERED) or (one.code in _FAILED and _is_explained(totals, one, ranked))
         else replace(one, remedy=remedy(one, totals))
         for one in ranked
     )
@@ -132,7 +134,8 @@ def _one_accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, 
     """Leave one finding for what is wrong with the replies of a part, see the module."""
     found = tuple(found)
     named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
-    kept: list[Finding] = []
+    # servos of several buses that were lost at once stand for the late and missing replies of each
+    kept = [one for one in found if (one.code, one.subject) == ("servo_lost", "machine")]
     for one in named:
         bus = totals.bus_of(one.subject)
         same_bus = any(totals.bus_of(other.subject) == bus for other in kept)

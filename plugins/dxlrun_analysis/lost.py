@@ -86,12 +86,13 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
-    """Return whether several servos of a bus failed in the same way and at once, and not all that it has."""
+    """Return whether several servos of a bus failed in the same way, at once and as often as each other, and
+    not all that it has."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
     bus, *others = {bus_of.get(source, "") for source in failed}
     first = [min(groups, key=lambda group: group.t_ns) for groups in failed.values()]
     times = [group.t_ns for group in first]
-    same = {(group.code, group.count) for group in first} == {(first[0].code, 1)}
+    same = {(group.code, group.count) for group in first} == {(first[0].code, first[0].count)}
     same &= first[0].code != EventCode.SERVO_LIMP
     few = _FEWEST_OF_BUS <= len(failed) < list(bus_of.values()).count(bus)
     return same and few and not others and max(times) - min(times) <= _AT_ONCE_NS
