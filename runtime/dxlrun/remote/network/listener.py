@@ -93,7 +93,9 @@ class Place(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Place:
         """Return the place that `HOST:PORT`, `HOST` or `:PORT` means. Raises InputError."""
-        found = re.fullmatch(r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([0-9a-fA-F:]+)", text)
+        found = re.fullmatch(
+            r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([\da-fA-F]*:[\da-fA-F:]*:[\da-fA-F.]*)", text
+        )
         if not text or not found or int(found[2] or 0) > 65535:
             raise InputError(f"--listen {text}: write HOST:PORT, HOST or :PORT, such as :9000, up to :65535")
         host = (found[3] or found[1]).strip("[]")
