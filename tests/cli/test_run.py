@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 from msgspec import structs
+from msgspec.structs import replace
 from rich.console import Console
 from tests.kit.answers import result_of
 from tests.kit.commands import Said
@@ -169,15 +170,34 @@ def test_wait_for_simulated_servos_names_the_machine(dxlrun: Callable, runs: Run
     runs.answer = RunSummary(0, "ended", 100, 3, 2.0, (), simulation_wait=wait)
 
     assert dxlrun(torso).out.splitlines()[1] == (
-        "  The machine was too busy: the loop waited 3 times, 0.21 s in all, for the process of the "
+        "  The machine was too busy: the loop waited 3 times, 210 ms in all, for the process of the "
         "simulated servos, which did not run. End other programs, or use --virtual."
     )
 
 
 def test_busy_machine_comes_before_the_servos_that_refused_a_start(dxlrun: Callable, runs: Runs, torso: Path):
-    runs.answer = RunSummary(1, "start-up", 0, 0, 0.1, ("no servo answers",), start_up_load=BUSY)
+    summary = RunSummary(1, "start-up", 0, 0, 0.1, ("no servo answers",), start_up_load=BUSY, refused=True)
+    runs.answer = summary
 
     assert dxlrun(torso).errors[1:] == [f"bioloid_torso: {MACHINE}", "bioloid_torso: no servo answers"]
+
+    runs.answer = replace(summary, refused=False)  # a plug-in that cannot be imported
+
+    assert dxlrun(torso).errors[1:] == ["bioloid_torso: no servo answers"]
+
+
+@pytest.mark.parametrize(
+    ("code", "named"), [(EventCode.SERVO_LOST, True), (EventCode.CONTROLLER_FAULT, False)]
+)
+def test_busy_machine_is_named_before_errors_that_it_explains(
+    dxlrun: Callable, runs: Runs, torso: Path, code: EventCode, named: bool
+):
+    group = EventGroup(code, Severity.ERROR, "head", 1, 10**9, "no longer there")
+    runs.answer = RunSummary(
+        1, "stopped", 100, 0, 2.0, (), events=EventTotals((group,)), invalid=(0,) * 8, run_load=BUSY
+    )
+
+    assert (MACHINE in dxlrun(torso).out) is named
 
 
 def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(dxlrun: Callable, runs: Runs, torso: Path):

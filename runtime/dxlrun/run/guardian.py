@@ -25,16 +25,17 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime
+from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, SimulationProgress
 from dxlrun.channels.packets import PacketBatch, salvage
 from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
+from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts, SimulatedPort, StallCounter
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
@@ -116,6 +117,34 @@ _REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
 _LINES_LOST = Decoder(LineLost)
 
 
+def make_ports(
+    buses: Sequence[BusPlan],
+    names: Sequence[str],
+    descriptors: Sequence[int],
+    memory: RunMemory,
+    stalls: StallCounter,
+) -> list[SerialPort]:
+    """Return the ports of all buses; those of simulated servos wait for a process that has no core.
+
+    Args:
+        buses: The plan's buses.
+        names: Names of their ports, for messages.
+        descriptors: Descriptors of their ports.
+        memory: Memory of the run, which has the progress of the simulation.
+        stalls: Counts these waits.
+    """
+    ports: list[SerialPort] = []
+    simulated = 0
+    for bus, name, descriptor in zip(buses, names, descriptors, strict=True):
+        if bus.port == SIMULATED:
+            line = SimulationProgress(memory.simulation).line(simulated)
+            ports.append(SimulatedPort(descriptor, name, line, stalls))
+            simulated += 1
+        else:
+            ports.append(SerialPort(descriptor, name))
+    return ports
+
+
 class SafeStop:
     """Switches torque off instead of a loop that is gone, and reports the result to log and terminal."""
 
@@ -163,9 +192,7 @@ class SafeStop:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
         job, memory = self._job, self._job.memory
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
-        ports = SerialPorts(
-            [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
-        )
+        ports = SerialPorts(make_ports(job.buses, job.ports, descriptors, memory, StallCounter()))
         packets = PacketBatch(self._ring, cycle=cycle)
         return Lines(job.buses, ports, self._clock, packets, self._heartbeat.look), packets
 

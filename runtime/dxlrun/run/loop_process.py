@@ -23,7 +23,7 @@ from msgspec.json import Decoder
 from dxlrun.channels import process
 from dxlrun.channels.commands import CommandRing
 from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity, Waited
-from dxlrun.channels.heartbeat import Heartbeat, Phase, SimulationProgress
+from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.messages import MessageRing
@@ -37,24 +37,21 @@ from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.realtime import Pacing
-from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port.ports import (
     MOST_SHARE,
     ReplyPolling,
-    SerialPort,
     SerialPorts,
-    SimulatedPort,
     StallCounter,
 )
 from dxlrun.dynamixel.port.reopening import LinesAgain
-from dxlrun.errors import DxlrunError, PlugInError, counted
+from dxlrun.errors import DxlrunError, PlugInError, StartUpError, counted
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun.plan.machine_load import SimulationWait
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.guardian import LoopJob
+from dxlrun.run.guardian import LoopJob, make_ports
 from dxlrun.run.watch import Duty, LoopWatch
 
 
@@ -73,6 +70,8 @@ class LoopOutcome(msgspec.Struct, frozen=True):
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
     events: EventTotals = EventTotals()
+    refused: bool = False
+    """The start was refused for what servos replied, or did not reply."""
     simulation_wait: SimulationWait = SimulationWait()
 
 
@@ -203,26 +202,12 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
     return structs.replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
 
 
-def _make_ports(plan: Plan, job: LoopJob, stalls: StallCounter) -> list[SerialPort]:
-    """Return the ports of all buses; those of simulated servos wait for a process that has no core."""
-    ports: list[SerialPort] = []
-    simulated = 0
-    for descriptor, bus in zip(job.ports, plan.buses, strict=True):
-        if bus.port == SIMULATED:
-            line = SimulationProgress(job.memory.simulation).line(simulated)
-            ports.append(SimulatedPort(descriptor, bus.port, line, stalls))
-            simulated += 1
-        else:
-            ports.append(SerialPort(descriptor, bus.port))
-    return ports
-
-
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: StallCounter) -> LoopOutcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
-        _make_ports(plan, job, stalls),
+        make_ports(plan.buses, [bus.port for bus in plan.buses], job.ports, job.memory, stalls),
         LinesAgain(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
         _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )
@@ -313,7 +298,8 @@ def main() -> None:
         outcome = _run(plan, job, heartbeat, sinks, stalls)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
-        outcome = LoopOutcome("start-up", sentences=error.sentences)
+        refused = isinstance(error, StartUpError)
+        outcome = LoopOutcome("start-up", sentences=error.sentences, refused=refused)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
     except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"

@@ -42,6 +42,8 @@ _LOSSES = {
     EventCode.SERVO_LOST: "lost",
     EventCode.SERVO_REBOOTED: "rebooted",
 }
+_SLOW_REPLIES = frozenset((EventCode.SERVO_LOST, EventCode.DEVICE_LOST, EventCode.WATCHDOG))
+"""Errors that a machine that is too busy may have caused, besides invalid states and skipped periods."""
 _LINE_S = 5.0
 """Between two lines in a pipe or a file."""
 
@@ -84,6 +86,8 @@ class RunSummary(msgspec.Struct, frozen=True):
     events: EventTotals = EventTotals()
     virtual: bool = False
     """It was on virtual time."""
+    refused: bool = False
+    """The start was refused for what servos replied, or did not reply."""
     start_up_load: MachineLoad = MachineLoad()
     """Of the machine before the first cycle, as far as the recorder has sampled it."""
     run_load: MachineLoad = MachineLoad()
@@ -165,7 +169,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append("The states of all joints were valid in every cycle.")
     unreached = list(find_unreached_goals(loop, events.goals, ran_ns))
     sentences += [f"{'; '.join(filter(None, (one.sentence, one.remedy)))}." for one in unreached[:_MOST]]
-    if errors or often or run.skipped:
+    if often or run.skipped or any(one.code in _SLOW_REPLIES for one in errors):
         sentences[:0] = filter(None, (run.describe_machine(plan),))
     failed = errors or often or not kept or any(one.failed for one in unreached)
     exit_code = 1 if failed or (unreached and not run.exit_code) else run.exit_code
