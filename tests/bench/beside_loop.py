@@ -65,7 +65,7 @@ class Beside(Protocol):
 class View:
     """`dxlrun view` and a browser, which looks 25 times a second with four curves."""
 
-    command = (DXLRUN, "view", "--no-browser", "--port", "0")
+    command = (DXLRUN, "view", "--no-browser", "--listen", ":0")
 
     def look(self, address: str, seconds: float) -> None:
         connection, began = http.client.HTTPConnection(_host(address), timeout=10), time.monotonic()
@@ -98,7 +98,7 @@ class View:
 class Foxglove:
     """`dxlrun foxglove` and a viewer, which has subscribed to all channels."""
 
-    command = (DXLRUN, "foxglove", "--port", "0")
+    command = (DXLRUN, "foxglove", "--listen", ":0")
 
     def look(self, address: str, seconds: float) -> None:
         end = time.monotonic() + seconds

@@ -62,7 +62,7 @@ class Reader:
         command, *words = shlex.split(line.replace("LOG", str(self.log)))
         assert command == "dxlrun", line
         if words[0] == "view":
-            served = self._started(*words, "--no-browser", "--port", "0")
+            served = self._started(*words, "--no-browser", "--listen", ":0")
             assert served.stdout is not None
             assert "http://127.0.0.1" in served.stdout.readline()
             served.kill()
