@@ -226,16 +226,6 @@ class Maker:
         printed((*words.split(), "--report", "characterize.html"), self.place)
         self.figures("characterize", self.place / "characterize.html", "joint-steps", "joint-moves")
 
-    def gains(self) -> None:
-        """Sweep two gains of an arm."""
-        words = (
-            "sweep robots/effort_arm.yaml --play robots/motions/effort_arm_lift.yaml --over gains.p=2..10x5"
-        )
-        printed((*words.split(), "--over", "gains.d=0.05..0.25x5", "--picture", "gains.svg"), self.place)
-        text = (self.place / "gains.svg").read_text()
-        text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
-        (self.into / "gains.svg").write_text(text)
-
     def fall(self) -> None:
         """Tip a torso over."""
         words = ("robots/fall_reflex.yaml", "--virtual", "--play", "robots/motions/fall_reflex_tip.yaml")
@@ -323,9 +313,8 @@ MADE: dict[str, Callable[[Maker], None]] = {
     "watch": Maker.watch,
     "doctor": Maker.doctor,
     "latency": Maker.latency,
-    "gains": Maker.gains,
 }
-SLOW = ("watch", "doctor", "latency", "gains", "characterize")
+SLOW = ("watch", "doctor", "latency", "characterize")
 """Left out with `--virtual`: real time, this machine, or minutes."""
 
 

@@ -25,6 +25,5 @@ def dxlrun_commands() -> Sequence[Command]:
         Command("latency", f"{_PLACE}.latency:latency", group="Experiments"),
         Command("characterize", f"{_PLACE}.characterize:characterize", group="Servos"),
         Command("experiment", f"{_PLACE}.tracking:experiment", group="Experiments"),
-        Command("sweep", f"{_PLACE}.sweep:sweep", group="Experiments"),
         Command("identify", f"{_PLACE}.identify:identify", group="Servos"),
     )

@@ -67,7 +67,6 @@ TESTS = {
     "experiments.md": (
         "tests/cli/test_latency.py",
         "tests/lab/characterize/test_command.py",
-        "tests/lab/sweep/test_command.py",
         "tests/lab/tracking/test_command.py",
     ),
     "by-hand.md": ("tests/hand/test_terminal.py",),

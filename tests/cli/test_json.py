@@ -42,7 +42,6 @@ ELSEWHERE = {
     "scan": "cli/test_scan.py",
     "servo": "cli/test_servo.py",
     "sim": "cli/test_sim.py",
-    "sweep": "lab/sweep/test_command.py",
     "upload": "analysis/season/test_store.py",
     **dict.fromkeys(RUNNING, "cli/test_steer.py"),
 }

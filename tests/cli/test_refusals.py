@@ -18,7 +18,7 @@ import pytest
 from tests.kit.answers import read_answer
 
 ROOT = Path(__file__).parents[2]
-NEEDED = {"identify": "identify", "sweep": "sweep"}
+NEEDED = {"identify": "identify"}
 """Commands that are refused for want of their extra before anything else."""
 WITHOUT_JSON = (
     "robots/",

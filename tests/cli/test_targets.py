@@ -63,7 +63,6 @@ KINDS = ("pipe", "directory", "device", "link to a text", "dangling link", "text
         (("identify", ROBOT, "left_wheel_joint", "--virtual", "--output"), "joint.motor.yaml"),
         (("latency", "--log"), "latency.mcap"),
         (("convert", "none.mcap"), "motion.yaml"),
-        (("sweep", ROBOT, "--play", "none.yaml", "--over", "gains.p=1,2", "--picture"), "map.png"),
     ],
 )
 def test_every_verb_refuses_to_replace_what_is_not_its_own(

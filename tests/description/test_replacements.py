@@ -1,4 +1,4 @@
-"""Values that stand in for those of a robot file: a sweep reads it so, once for each of its points."""
+"""Values that replace those of a robot file: `dxlrun calibrate` checks its result so before it is written."""
 
 from __future__ import annotations
 

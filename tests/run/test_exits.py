@@ -383,7 +383,7 @@ def test_simulated_servos_that_are_gone_end_the_run(start, wait_for):
 def test_a_run_listens_on_one_socket_that_only_its_user_may_open(start, listening, wait_for):
     """With the widest umask; nothing is on the network, and no socket is abstract, which has no mode.
 
-    Other commands listen nowhere: a sweep is judged in `test_sweep.py`, and simulated servos here.
+    Simulated servos listen nowhere.
     """
     open_to_all = ("/bin/sh", "-c", 'umask 0; exec "$@"', "sh")
     run = start(gateway=True, before=open_to_all)

@@ -174,28 +174,20 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) 
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """A time in which a joint was to rest."""
+class _Rest:
+    """An interval in which a joint should rest."""
 
-    begin: int
-    end: int  # Its cycles, the last one included
     settling_s: float | None
-    """From its begin until the joint stayed near where it rests; None where nothing moved before"""
-    error_rad: float  # With which it rests
-
-
-def rests(times: Floats, way: Floats, error: Floats, tick: float) -> Iterator[Rest]:
-    """Yield each time in which a desired position does not change, for 0.3 s or more.
-
-    `times` s, `way` the desired positions, rad, and `error` what is read minus that, NaN where either is not
-    known; shape (cycles,). `tick`: of the servo's position, rad.
-    """
-    yield from _OpenRest().take(times, way, error, tick, final=True)
+    """From the start until the joint stayed near its rest position; None: it did not move before"""
+    error_rad: float  # Measured minus desired position at rest
 
 
 @dataclass(slots=True)
 class _OpenRest:
-    """Finds rests in cycles that come piece by piece; keeps those of a rest that may go on, 20 s at most."""
+    """Finds rests in slices of cycles; keeps the cycles of a rest that is not over, 20 s at most.
+
+    A rest is an interval of 0.3 s or more in which the desired position does not change.
+    """
 
     times: Floats = field(default_factory=lambda: np.zeros(0))
     way: Floats = field(default_factory=lambda: np.zeros(0))
@@ -203,8 +195,16 @@ class _OpenRest:
     lowest: float = math.inf
     highest: float = -math.inf  # Of the desired positions since the last rest, before those that are kept
 
-    def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[Rest]:
-        """Yield the rests that have ended; with `final` the last one too."""
+    def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[_Rest]:
+        """Yield the rests that have ended; with `final` the last one too.
+
+        Args:
+            times: s, shape (cycles,).
+            way: Desired positions, rad.
+            error: Measured minus desired position, rad; NaN where either is unknown.
+            tick: Resolution of the servo's position, rad.
+            final: No more cycles follow.
+        """
         times, way, error = (
             np.concatenate(pair) for pair in ((self.times, times), (self.way, way), (self.error, error))
         )
@@ -233,7 +233,7 @@ class _OpenRest:
             outside = known[np.abs(left[known] - rest_rad) > near]
             settled = begin if not len(outside) else min(begin + int(outside[-1]) + 1, end)
             settling_s = float(times[settled] - times[begin]) if moved >= near else None
-            yield Rest(begin, end, settling_s, rest_rad)
+            yield _Rest(settling_s, rest_rad)
         self._saw(way[moved_from:keep])
         self.times, self.way, self.error = times[keep:], way[keep:], error[keep:]
 

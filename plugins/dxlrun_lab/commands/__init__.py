@@ -1,1 +1,1 @@
-"""Commands that measure (bench, latency, experiment, characterize, identify, sweep) or play a log again."""
+"""Commands that measure (bench, latency, experiment, characterize, identify) or play a log again."""

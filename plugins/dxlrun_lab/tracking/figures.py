@@ -54,12 +54,12 @@ class _Axes(msgspec.Struct, frozen=True):
             max(float(one.woken_s[-1]) for one in curves),
             _span(
                 [
-                    np.array(motion.path.positions),
+                    np.array(motion.positions),
                     *(one.sent for one in curves),
                     *(one.read for one in curves),
                 ]
             ),
-            _span([np.array(motion.path.velocities), *(one.velocity for one in curves)]),
+            _span([np.array(motion.velocities), *(one.velocity for one in curves)]),
             max(2 * LATE_NS / 1e3, 2 * max(float(one.late_us.max()) for one in curves)),
         )
 
@@ -94,7 +94,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             tracked.setup,
             f"{tracked.title[0].upper()}{tracked.title[1:]}",
             "Position in rad (desired, sent, read), velocity in rad/s and lateness of "
-            f"{self.motion.path.joint} over the time since the motion began, s: {late}.",
+            f"{self.motion.joint} over the time since the motion began, s: {late}.",
             f"{late}. Red: from when a late cycle was due to when it began. Desired is where the joint "
             "should be by the clock; sent is the goal that was written last. The thesis has "
             f"{tracked.thesis} of it.",

@@ -125,7 +125,7 @@ def measure(
     by_bus = np.zeros(len(late_ns), np.int64) if ledger is None else _by_bus(log, late_ns, ledger)
     late_ns, by_bus = late_ns[span.first : span.stop], by_bus[span.first : span.stop]
     own_us = (late_ns - by_bus) / 1e3
-    row = log.joints.index(desired.path.joint)
+    row = log.joints.index(desired.joint)
     seconds = {name: (cycles[name] - span.begin_ns) / 1e9 for name in ("woken_ns", "read_ns", "written_ns")}
     valid = cycles["valid"][:, row]
     curves = Curves(

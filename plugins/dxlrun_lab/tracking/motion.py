@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.compile.motions import LEAD_NS, TRAJECTORY, samples_of
@@ -15,28 +16,37 @@ from dxlrun.compile.samples import Sample
 from dxlrun.description.motion import read_motion
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan
-from dxlrun_lab.desired import DesiredPath
+from dxlrun_controllers.laws.spline import CUBIC, solve
 
 
 class DesiredMotion(msgspec.Struct, frozen=True):
-    """One joint's motion; its times count from the first sample."""
+    """Motion of one joint: cubic between its samples, as `joint_trajectory_controller` plays it."""
 
-    path: DesiredPath
+    joint: str
     file: str
+    times_s: tuple[float, ...]  # since the first sample
+    positions: tuple[float, ...]  # rad
+    velocities: tuple[float, ...]  # rad/s
     lead_ns: int
     """From the moment at which a controller takes the motion's first command to the first sample."""
 
     @property
     def duration_ns(self) -> int:
         """From the first sample to the last."""
-        return round(self.path.end_s * 1e9)
+        return round(self.times_s[-1] * 1e9)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return position, rad, and velocity, rad/s, at any times; before and behind the motion it rests."""
-        times = np.clip(times_s, 0.0, self.path.end_s)
-        velocity = self.path.at(times, 1)
+        """Return position, rad, and velocity, rad/s; before and after the motion the joint rests."""
+        times, samples = np.clip(times_s, 0.0, self.times_s[-1]), np.array(self.times_s)
+        states = np.array([self.positions, self.velocities])
+        index = np.clip(np.searchsorted(samples, times, side="right") - 1, 0, len(samples) - 2)
+        pieces = np.empty((CUBIC, len(times)))
+        solve(CUBIC, np.diff(samples)[index], states[:, index], states[:, index + 1], pieces)
+        elapsed = times - samples[index]
+        position: Floats = polyval(elapsed, pieces, tensor=False)
+        velocity: Floats = polyval(elapsed, polyder(pieces), tensor=False)
         velocity[times_s != times] = 0.0
-        return self.path.at(times), velocity
+        return position, velocity
 
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
@@ -67,6 +77,6 @@ def _desired(joint: str, path: Path, samples: Sequence[Sample], *, lead: bool) -
     given = np.array([np.nan if target.velocity is None else target.velocity for target in targets])
     # where the file gives no velocity, the slope between the neighbours
     velocities = np.where(np.isfinite(given), given, np.gradient(positions, times))
+    lead_ns = (LEAD_NS if first_ns == 0 else first_ns) if lead else 0
     at, position, velocity = (tuple(one.tolist()) for one in (times, positions, velocities))
-    desired = DesiredPath(joint, False, at, position, velocity, end_s=at[-1])
-    return DesiredMotion(desired, str(path), (LEAD_NS if first_ns == 0 else first_ns) if lead else 0)
+    return DesiredMotion(joint, str(path), at, position, velocity, lead_ns)

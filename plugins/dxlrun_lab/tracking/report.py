@@ -31,7 +31,7 @@ def result(experiment: Experiment) -> dict[str, object]:
     return {
         "robot": experiment.robot,
         "motion": motion.file,
-        "joint": motion.path.joint,
+        "joint": motion.joint,
         "motion_ns": motion.duration_ns,
         "period_ns": experiment.period_ns,
         "machine": machine(),

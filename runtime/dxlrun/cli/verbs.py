@@ -63,10 +63,7 @@ _PACKAGES = {
     "dxlrun_fleet": ("fleet", "keys"),
     "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),
-    "dxlrun_lab": (
-        *("replay", "convert", "bench", "latency", "characterize", "experiment"),
-        *("sweep", "identify"),
-    ),
+    "dxlrun_lab": ("replay", "convert", "bench", "latency", "characterize", "experiment", "identify"),
     "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),
 }

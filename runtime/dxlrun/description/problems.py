@@ -90,7 +90,7 @@ def _remedies_at(
     for path in marks.keys:
         if len(path) <= 2:
             sections.setdefault(str(path[0]), []).extend(map(str, path[1:]))
-    known, refused = keys_at(first.model, first.location[:-1])
+    known, refused = _keys_at(first.model, first.location[:-1])
     known = (*known, *first.beside) if len(first.location) == 1 else known
     values = {key: error.input for key, error in unknown.items() if key not in refused}
     present = [str(path[-1]) for path in marks.keys if path[:-1] == parent]
@@ -453,7 +453,7 @@ def _sentence_missing(error: _Error) -> tuple[str, str]:
 
 def _sentence_unknown(error: _Error) -> tuple[str, str]:
     key, parent = str(error.path[-1]), path_text(error.path[:-1])
-    known, refused = ((), {}) if error.model is None else keys_at(error.model, error.location[:-1])
+    known, refused = ((), {}) if error.model is None else _keys_at(error.model, error.location[:-1])
     if len(error.location) == 1:
         known = (*known, *error.beside)
     if key in refused:
@@ -516,7 +516,7 @@ def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str 
     return str(info.examples[0]) if info is not None and info.examples else None
 
 
-def keys_at(
+def _keys_at(
     model: type[BaseModel], location: tuple[str | int, ...]
 ) -> tuple[tuple[str, ...], Mapping[str, str]]:
     """Return the keys that the model at a location takes, and the refused ones with a sentence each.

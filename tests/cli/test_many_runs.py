@@ -1,0 +1,75 @@
+"""The programs of docs/how-to/many-runs.md."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from tests.kit.pages import page_text
+
+from dxlrun.testing import read_log, simulated_robot
+
+ROOT = Path(__file__).parents[2]
+ROBOT, MOTION = ROOT / "robots/effort_arm.yaml", ROOT / "robots/motions/effort_arm_lift.yaml"
+PROGRAM, ON_SEVERAL_COMPUTERS = re.findall(r"```python\n(.*?)```", page_text("many-runs.md"), re.DOTALL)
+SMALL = 'GRID = {"p": (2, 10, "high"), "d": (0.05,)}'
+
+
+def test_program_ranks_the_runs_by_tracking_error(tmp_path: Path) -> None:
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
+    small, count = re.subn(r"^GRID = .*$", SMALL, PROGRAM, flags=re.MULTILINE)
+    assert count == 1
+    (tmp_path / "gains.py").write_text(small)
+    ran = subprocess.run(
+        [sys.executable, "gains.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    refused = [line for line in ran.stdout.splitlines() if line.startswith("{")]
+    assert "'p': 'high'" in refused[0]
+    assert "gains.p" in ran.stdout
+    heading, *rows, best = ran.stdout.splitlines()[-5:]
+    assert heading.split("\t") == ["p", "d", "error (deg)"]
+    assert [row.split("\t")[:2] for row in rows] == [["10", "0.05"], ["2", "0.05"], ["high", "0.05"]]
+    assert float(rows[0].split("\t")[2]) == pytest.approx(shoulder_error_deg(tmp_path, "10"), rel=0.01)
+    assert rows[2].endswith("\tinf")
+    assert best == "best: p:=10 d:=0.05"
+
+
+def shoulder_error_deg(tmp_path: Path, p: str) -> float:
+    """Return the RMS tracking error from the references and positions of the cycles."""
+    log = tmp_path / "judge.mcap"
+    simulated_robot(ROBOT, arguments={"p": p, "d": "0.05"}, play=[MOTION], log=log).run()
+    cycles = read_log(log).cycles
+    reference, position = cycles["reference"][:, 0], cycles["position"][:, 0]
+    known = np.isfinite(reference)
+    return float(np.degrees(np.sqrt(np.mean((reference - position)[known] ** 2))))
+
+
+def test_program_is_short() -> None:
+    assert len(PROGRAM.splitlines()) <= 45
+
+
+def test_lines_for_several_computers_map_the_score_over_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Client:
+        def __init__(self, address: str) -> None:
+            assert address == "tcp://lab1:8786"
+
+        def map(self, function: Callable[[int], int], values: Iterable[int]) -> list[int]:
+            return list(map(function, values))
+
+        def gather(self, futures: list[int]) -> list[int]:
+            return futures
+
+    module = ModuleType("dask.distributed")
+    monkeypatch.setattr(module, "Client", Client, raising=False)
+    monkeypatch.setitem(sys.modules, "dask", ModuleType("dask"))
+    monkeypatch.setitem(sys.modules, "dask.distributed", module)
+    names = {"score": lambda value: value * 2, "grid": [1, 2, 3]}
+    exec(ON_SEVERAL_COMPUTERS, names)  # noqa: S102  (it is our page)
+    assert names["scores"] == [2, 4, 6]
