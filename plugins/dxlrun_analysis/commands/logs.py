@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.prompt import Confirm
@@ -17,7 +17,6 @@ from dxlrun.output.table import Cell, Column, Table, Value, flagged, microsecond
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun_analysis.season.query import Answer
     from dxlrun_analysis.season.runs import Folder
     from dxlrun_analysis.season.store import Store
 
@@ -33,7 +32,6 @@ def logs(
     *,
     where: Text = None,
     sort: Text = None,
-    sql: Text = None,
     prune: Flag = False,
     keep: Text = None,
     as_json: JsonFlag = False,
@@ -53,23 +51,19 @@ def logs(
         "list_contains(findings, 'late_replies')". A wrong name is answered with all names.
     sort
         Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
-    sql
-        Instead of both: a whole SELECT over the table logs.
     prune
         Show the oldest logs of runs in the directory beyond --keep, and delete them if the answer is yes.
     keep
         How much of the newest logs --prune leaves, such as 10GB.
     """
     if prune or keep is not None:
-        if not prune or keep is None or (where, sort, sql) != (None, None, None):
+        if not prune or keep is None or (where, sort) != (None, None):
             raise InputError("--prune and --keep belong together, without others: --prune --keep 10GB")
         return _prune(Path(directory), keep, as_json=as_json)
-    _check(directory, where, sort, sql)
+    _check(directory)
     from dxlrun_analysis.season import query, runs
 
     folder = _found(directory)
-    statement = query.where(where or "", sort or "") if sql is None else sql
-    option = "--sql" if sql is not None else "--where" if sort is None else "--where or --sort"
     try:
         with progress_bar(hidden=as_json) as draw:
             table, read = (
@@ -80,14 +74,13 @@ def logs(
             f"the table cannot be kept in {runs.cache_directory()} ({error.strerror or error}); "
             "XDG_CACHE_HOME names another place"
         ) from error
-    answer = query.ask(table, statement, option)
+    rows = query.select_runs(table, where, sort)
     if as_json:
-        rows = [dict(zip(answer.columns, row, strict=True)) for row in answer.rows]
         show_json({"rows": rows, "other_files": folder.others, "converted": read})
         return 0
     if folder.others:
         print_warning(_others(folder))
-    _show(answer, folder, whole=sql is not None)
+    _show_rows(rows, folder)
     return 0
 
 
@@ -108,7 +101,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     """
     if missing := missing_extra("`dxlrun upload`", "store", "fsspec", "duckdb", "pyarrow"):
         raise InputError(missing)
-    _check(str(directory), None, None, None)
+    _check(str(directory))
     from dxlrun_analysis.season import runs
     from dxlrun_analysis.season import store as stores
 
@@ -189,7 +182,7 @@ def _found(place: str) -> Folder | Store:
     return store
 
 
-def _check(place: str, where: str | None, sort: str | None, sql: str | None) -> None:
+def _check(place: str) -> None:
     """Raise InputError with all that is wrong with the command line."""
     wrong: list[str] = []
     needed = ("logs", "duckdb", "pyarrow")
@@ -199,8 +192,6 @@ def _check(place: str, where: str | None, sort: str | None, sql: str | None) -> 
     elif not directory.is_dir():
         fix = "`dxlrun analyze` takes single logs" if directory.exists() else "runs leave their logs in logs"
         wrong.append(f"there is no directory {directory}; {fix}")
-    if sql is not None and (where is not None or sort is not None):
-        wrong.append("--sql is a whole statement; write WHERE and ORDER BY in it, or leave it out")
     if missing := missing_extra("logs", *needed):
         wrong.append(missing)
     if wrong:
@@ -215,18 +206,12 @@ def _others(folder: Folder | Store) -> str:
     return f"{files} in {folder.directory}: {named}{rest}"
 
 
-def _show(answer: Answer, folder: Folder | Store, *, whole: bool) -> None:
-    shown = answer.rows[:_MOST_SHOWN]
-    if whole:
-        columns = [Column(name, _kind(shown, index)) for index, name in enumerate(answer.columns)]
-        show(Table.of("", columns, ([_plain(value) for value in row] for row in shown)))
+def _show_rows(rows: Sequence[Row], folder: Folder | Store) -> None:
+    show(Table.listing("", _COLUMNS, rows[:_MOST_SHOWN]))
+    if len(rows) > _MOST_SHOWN:
+        show(f"\nthe first {_MOST_SHOWN} of {len(rows)} rows; --json prints all")
     else:
-        rows = (dict(zip(answer.columns, row, strict=True)) for row in shown)
-        show(Table.listing("", _COLUMNS, rows))
-    if len(answer.rows) > len(shown):
-        show(f"\nthe first {len(shown)} of {len(answer.rows)} rows; --json prints all")
-    elif not whole:
-        show(f"\n{len(shown)} of {counted(len(folder.logs), 'log', 'logs')}")
+        show(f"\n{len(rows)} of {counted(len(folder.logs), 'log', 'logs')}")
 
 
 def _count(value: object) -> Value:
@@ -242,8 +227,6 @@ def _plain(value: object) -> Value:
         return None
     if isinstance(value, datetime):
         return f"{value:%Y-%m-%d %H:%M:%S}"
-    if isinstance(value, float):
-        return f"{value:.6g}"
     return str(value)
 
 
@@ -280,10 +263,3 @@ _COLUMNS: Sequence[tuple[Column, Callable[[Row], Value]]] = (
         lambda row: _number(row["hottest_deg_c"]),
     ),
 )
-
-
-def _kind(rows: Sequence[Sequence[object]], column: int) -> Literal["name", "number", "text"]:
-    values = [row[column] for row in rows if row[column] is not None]
-    if values and all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        return "number"
-    return "text" if any(" " in str(value) for value in values) else "name"

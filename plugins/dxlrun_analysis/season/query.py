@@ -1,6 +1,6 @@
-"""Questions to a table of runs in SQL, by DuckDB.
+"""Filter and sort a table of runs by SQL expressions, with DuckDB.
 
-A statement only reads: one SELECT, no file but the table, no extension, no setting.
+Expressions can only read the table: no file, no extension, no setting.
 """
 
 from __future__ import annotations
@@ -8,78 +8,49 @@ from __future__ import annotations
 import atexit
 import gc
 import re
-from collections.abc import Sequence
-from decimal import Decimal
-from typing import NamedTuple
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import duckdb
 import pyarrow as pa
 
 from dxlrun.errors import InputError
 
-atexit.register(gc.unfreeze)  # at its end DuckDB prints what of it is not collected, and the cli freezes all
+atexit.register(gc.unfreeze)  # DuckDB prints its uncollected objects at exit, and the cli freezes all objects
 TABLE = "logs"
-Value = object
+_READ_ONLY: dict[str, str | bool | int | float | list[str]] = {
+    "autoinstall_known_extensions": False,
+    "autoload_known_extensions": False,
+    "python_enable_replacements": False,
+    "enable_external_access": False,
+    "lock_configuration": True,
+}
 
 
-class Answer(NamedTuple):
-    """Rows with the names of their columns."""
+def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dict[str, object]]:
+    """Return the rows that meet the condition `where`, ordered by `sort`, by default by name.
 
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Value, ...], ...]
-
-
-def ask(runs: pa.Table, statement: str, option: str) -> Answer:
-    """Return the answer to a SELECT over the table `logs`.
-
-    Raises InputError with one sentence about a wrong statement, which `option` of the command line has given.
+    Raises:
+        InputError: an expression is wrong; the message names its option of the command line.
     """
+    with duckdb.connect(":memory:", config=_READ_ONLY) as database:
+        database.register(TABLE, runs)
+        found = database.view(TABLE)
+        if where:
+            with _input_errors("--where", runs):
+                found = found.filter(where)
+        with _input_errors("--sort", runs):
+            found = found.order(sort or "log")
+        with _input_errors("--where or --sort", runs):
+            return [dict(zip(found.columns, row, strict=True)) for row in found.fetchall()]
+
+
+@contextmanager
+def _input_errors(option: str, runs: pa.Table) -> Iterator[None]:
+    """Raise an error of DuckDB as one sentence, without the kind of error, candidates and the place."""
     try:
-        kinds = [one.type for one in duckdb.extract_statements(statement)]
-        if kinds != [duckdb.StatementType.SELECT]:
-            raise InputError(f"{option}: it may only read, in one statement; write a single SELECT")
-        with duckdb.connect(":memory:") as database:
-            database.register(TABLE, runs)
-            for setting in (
-                "autoinstall_known_extensions",
-                "autoload_known_extensions",
-                "python_enable_replacements",
-                "enable_external_access",
-            ):
-                database.execute(f"SET {setting} = false")
-            database.execute("SET lock_configuration = true")
-            found = database.execute(statement)
-            columns = _distinct([column[0] for column in found.description or ()])
-            return Answer(columns, tuple(tuple(map(_plain, row)) for row in found.fetchall()))
+        yield
     except duckdb.Error as error:
-        raise InputError(f"{option}: {_reason(error)}; {TABLE} has {', '.join(runs.column_names)}") from error
-
-
-def where(condition: str, sort: str) -> str:
-    """Return the statement for the logs that meet a condition, in an order; without both all by name."""
-    chosen = f" WHERE ({condition}\n)" if condition else ""
-    return f"SELECT * FROM {TABLE}{chosen} ORDER BY {sort or 'log'}"  # noqa: S608  # `ask` lets it only read
-
-
-def _distinct(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of columns of which no two are the same: `lost` and `lost_2`."""
-    found: list[str] = []
-    for name in names:
-        number = 1
-        distinct = name
-        while distinct in found:
-            number += 1
-            distinct = f"{name}_{number}"
-        found.append(distinct)
-    return tuple(found)
-
-
-def _plain(value: Value) -> Value:
-    """Return a value as JSON has it too: a decimal number, as of `sum(lost) * 1.5`, is a number."""
-    return float(value) if isinstance(value, Decimal) else value
-
-
-def _reason(error: duckdb.Error) -> str:
-    """Return what is wrong in a line, without the kind of error, candidates and the place."""
-    first = str(error).strip().splitlines()[0]
-    return re.sub(r"^\w+( \w+)* Error: ", "", first).rstrip("!. ")
+        first = str(error).strip().splitlines()[0]
+        reason = re.sub(r"^\w+( \w+)* Error: ", "", first).rstrip("!. ")
+        raise InputError(f"{option}: {reason}; {TABLE} has {', '.join(runs.column_names)}") from error

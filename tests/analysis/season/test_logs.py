@@ -191,24 +191,13 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
         ),
         (("--where", "robot LIKE 'single%' -- and no more"), ["may/third.mcap"]),
         (("--sort", "log DESC"), NAMES[::-1]),
+        (("--where", "cycles = (SELECT max(cycles) FROM logs)"), ["may/second.mcap"]),
     ],
 )
 def test_conditions_choose_logs(
     known: Path, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str]
 ) -> None:
     assert list(rows(dxlrun("logs", known, "--json", *words))) == expected
-
-
-def test_a_whole_statement_groups_and_gives_every_column_its_name(known: Path, dxlrun: Dxlrun) -> None:
-    statement = "SELECT robot, count(*) AS runs FROM logs WHERE cycles > 0 GROUP BY robot ORDER BY robot"
-    assert result_of(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"] == [
-        {"robot": "bioloid_torso", "runs": 3},
-        {"robot": "single_joint", "runs": 1},
-    ]
-    assert "bioloid_torso" in dxlrun("logs", known, "--sql", statement).out
-    statement = "SELECT lost, asked AS lost, 1.5 AS half FROM logs WHERE log = 'may/third.mcap'"
-    (row,) = result_of(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"]
-    assert (list(row), row["half"]) == (["lost", "lost_2", "half"], 1.5)
 
 
 def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here, dxlrun: Dxlrun) -> None:
@@ -226,7 +215,7 @@ def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here
 def test_logs_md_its_questions_are_answered(known: Path, dxlrun: Dxlrun) -> None:
     page = page_text("logs.md")
     lines = re.findall(r"^    dxlrun logs (?!.*--prune)(.+)$", page, re.MULTILINE)
-    assert len(lines) == 5
+    assert len(lines) == 4
     for line in lines:
         place, *words = shlex.split(line)
         assert place in ("logs", "s3://lab/torso")
@@ -257,18 +246,15 @@ def test_a_program_of_its_own_prints_nothing_at_its_end(known: Path) -> None:
         (("--where", "lost >"), "--where: syntax error"),
         (("--where", "lost > 1; DROP TABLE logs"), "--where: "),
         (("--where", "true) TO '/tmp/x'; --"), "--where: "),
-        (("--sql", "COPY logs TO 'stolen.csv'"), "--sql: it may only read, in one statement"),
-        (("--sql", "SELECT 1; SELECT 2"), "--sql: it may only read, in one statement"),
-        (("--sql", "SET lock_configuration = false"), "--sql: it may only read"),
-        (("--sql", "DROP VIEW logs"), "--sql: it may only read"),
-        (("--sql", ""), "--sql: it may only read"),
-        (("--sql", "SELECT * FROM read_csv('notes.txt')"), "disabled by configuration"),
-        (("--sql", "SELECT * FROM 'notes.txt'"), "--sql: "),
-        (("--sql", "SELECT * FROM read_text('/etc/hostname')"), "disabled by configuration"),
-        (("--sql", "SELECT * FROM glob('/etc/*')"), "disabled by configuration"),
-        (("--sql", "SELECT * FROM runs"), "--sql: "),
-        (("--sort", "lost SIDEWAYS"), "--where or --sort: syntax error"),
-        (("--sql", "SELECT 1", "--where", "true"), "--sql is a whole statement"),
+        (("--where", "lost = 1, true"), "--where: "),
+        (("--where", "true; SET lock_configuration = false"), "--where: "),
+        (("--where", "log IN (SELECT content FROM read_text('/etc/hostname'))"), "disabled by configuration"),
+        (("--where", "log IN (SELECT file FROM glob('/etc/*'))"), "disabled by configuration"),
+        (("--where", "log IN (SELECT * FROM 'notes.txt')"), "--where: "),
+        (("--where", "log IN (SELECT log FROM runs)"), "--where: "),
+        (("--where", "robot::int > 3"), "--where or --sort: "),
+        (("--sort", "lost; DROP TABLE logs"), "--sort: "),
+        (("--sort", "lost SIDEWAYS"), "--sort: syntax error"),
     ],
 )
 def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
