@@ -178,7 +178,7 @@ def commands(random: Random, joints: list[str], controllers: list[str]) -> Itera
 
 
 def topics(log: Path) -> dict[str, str]:
-    """Return a hash of all messages of each topic; of packets as format 7 had them, a message a cycle."""
+    """Return a hash of all messages of each topic; of packets with one message for each cycle."""
     from mcap.reader import make_reader
 
     found: dict[str, Any] = defaultdict(hashlib.sha256)

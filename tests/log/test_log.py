@@ -191,14 +191,15 @@ def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-OTHER_FORMAT = "and this version reads format 7 and 8; use the version that made it"
+OTHER_FORMAT = "and this version reads format 8 only; use the version of dxlrun that recorded it"
 
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"format": "6"}, f"it has format 6, {OTHER_FORMAT}"),
-        ({"format": "99"}, f"it has format 99, {OTHER_FORMAT}"),
+        ({"format": "7"}, f"it has log format 7, {OTHER_FORMAT}"),
+        ({"format": "99"}, f"it has log format 99, {OTHER_FORMAT}"),
+        ({"format": None}, f"it has log format none, {OTHER_FORMAT}"),
         ({"joints": "{"}, "cannot read: the metadata .* is missing or wrong"),
         ({"joints": "[1]"}, "cannot read: the metadata .* is missing or wrong"),
         ({"joints": None}, "cannot read: the metadata 'joints' is missing or wrong"),

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.typesys.store import Typestore
 from tests.kit.decoded import decode_packets
 
@@ -22,9 +21,8 @@ from dxlrun.log.columns import PacketColumns
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.bus_messages import pack_packets, read_packets
 from dxlrun.log.reader import read_log
-from dxlrun.log.schemas import LogHeader, to_metadata
+from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
-from dxlrun.messages.definition import MessageType
 
 PACKETS = [
     (0, PacketKind.INSTRUCTION, 254, 1, 2, b"\xff\xff\xfe\x02\x01\xfe"),
@@ -112,8 +110,7 @@ def test_what_contradicts_itself_is_left_out(at: int, value: int, all_of_them: b
     assert shown(found) == ([] if all_of_them else [packet[2:] for packet in packets])
 
 
-@pytest.mark.parametrize("form", ["as it is", "of format 7"])
-def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path, form: str) -> None:
+def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
     batch = PacketBatch(Handover(log.take))
     batch.packet(*PACKETS[0])
@@ -134,8 +131,6 @@ def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path, form:
             for _, channel, message in make_reader(stream).iter_messages(log_time_order=False)
         ]
     assert written == [("/bus/main", 4), ("/bus/arm", 2), ("/bus/main", 2), ("/bus/arm", 2)]
-    if form == "of format 7":
-        path = in_format_7(path)
     packets = read_log(path).packets
     main = packets.take(packets.bus == 0)
     assert list(zip(main.cycle.tolist(), main.servo_id.tolist(), strict=True)) == [
@@ -162,36 +157,6 @@ def test_a_chunk_has_the_packets_of_its_cycles(tmp_path: Path, monkeypatch: pyte
     assert 80 < len(read.cycles) < 100
     assert not read.complete
     assert read.packets.cycle.tolist() == read.cycles["cycle"].tolist()
-
-
-def in_format_7(path: Path) -> Path:
-    """Write a log again as version 7 did: the packets of a cycle in a message of their own."""
-    text = "int64 cycle\nint64[] first_ns\n" + schemas.BUS_PACKETS.text.partition("first_ns_delta\n")[2]
-    codec, older = Codec(MessageType(schemas.BUS_PACKETS.name, text)), path.with_name("older.mcap")
-    log = read_log(path)
-    with older.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(schemas.PROFILE)
-        writer.add_metadata(schemas.METADATA_NAME, to_metadata(log.header) | {"format": "7"})
-        schema = writer.register_schema(schemas.BUS_PACKETS.name, schemas.SCHEMA_ENCODING, text.encode())
-        for bus, name in enumerate(log.buses):
-            channel = writer.register_channel(schemas.bus_topic(name), schemas.ENCODING, schema)
-            for cycle in np.unique(log.packets.cycle[log.packets.bus == bus]):
-                some = list(log.packets.take((log.packets.bus == bus) & (log.packets.cycle == cycle)))
-                first = np.array([one.first_ns for one in some], np.int64)
-                took = np.array([one.last_ns for one in some], np.int64) - first
-                data = codec.pack(
-                    int(cycle),
-                    first,
-                    took,
-                    bytes(one.kind for one in some),
-                    bytes(one.servo_id for one in some),
-                    np.array([len(one.data) for one in some], np.uint16),
-                    b"".join(one.data for one in some),
-                )
-                writer.add_message(channel, 0, data, 0)
-        writer.finish()
-    return older
 
 
 def test_a_kind_that_is_none_is_refused(tmp_path: Path) -> None:

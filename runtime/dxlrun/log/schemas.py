@@ -58,8 +58,6 @@ KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
 FORMAT = "8"
 """Grows when a reader of the version before would misread a log."""
-READ_FORMATS = ("7", FORMAT)
-"""In 7, a message of /bus/NAME has the packets of one cycle, and no attachment is compressed."""
 
 
 def bus_topic(bus: str) -> str:
@@ -407,10 +405,10 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
 
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
-    if text.get("format") not in READ_FORMATS:
+    if text.get("format") != FORMAT:
         raise ValueError(
-            f"it has format {text.get('format', 'none')}, and this version reads format "
-            f"{' and '.join(READ_FORMATS)}; use the version that made it"
+            f"it has log format {text.get('format', 'none')}, and this version reads format {FORMAT} only; "
+            "use the version of dxlrun that recorded it"
         )
     try:
         values = {

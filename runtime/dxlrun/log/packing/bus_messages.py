@@ -12,23 +12,8 @@ from dxlrun.log.columns import PacketColumns
 from dxlrun.log.schemas import BUS_PACKETS
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import Column, ColumnReader
-from dxlrun.messages.definition import MessageType
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
-_OF_ONE_CYCLE = ColumnReader(
-    MessageType(
-        BUS_PACKETS.name,
-        """int64 cycle
-int64[] first_ns
-int64[] duration_ns
-uint8[] kind
-uint8[] servo_id
-uint16[] length
-uint8[] data
-""",
-    )
-)
-"""Messages of format 7."""
 _FIELDS = ("cycle_delta", "first_ns_delta", "duration_ns", "kind", "servo_id", "length", "data")
 """Sequences; but for the last one with an element a packet."""
 
@@ -49,33 +34,23 @@ def read_packets(
     bus: NDArray[np.uint8],
     start: NDArray[np.int64],
     size: NDArray[np.int64],
-    *,
-    of_one_cycle: bool = False,
 ) -> tuple[PacketColumns, int]:
-    """Return the packets of messages that lie in `data`, and how many are not what their definition says.
+    """Return the packets of the messages in `data`, and the number of messages that contradict themselves.
 
-    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes;
-    `of_one_cycle`: they are those of format 7.
+    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes.
     """
     try:
-        whole, tree = (_OF_ONE_CYCLE if of_one_cycle else _READER).read(data, start, size)
+        whole, tree = _READER.read(data, start, size)
     except ValueError:  # none of them is a message
         return PacketColumns.of(()), len(start)
-    if of_one_cycle:
-        counts = tree.leaf("kind").flat[0]
-        cycle = np.repeat(tree.leaf("cycle").array(), counts)
-        tree.fields["cycle_delta"] = Column(counts=counts, elements=Column(values=cycle))
-        tree.fields["first_ns_delta"] = tree.leaf("first_ns")
     good = _consistent(tree)
     if not good.all():
         whole, tree = whole[good], tree.take(np.flatnonzero(good))
     cycle, first, took_ns, kind, servo_id, length, bodies = (tree.leaf(name).flat[1] for name in _FIELDS)
     count, size = tree.leaf("kind").flat[0], length.astype(np.int64)
-    if not of_one_cycle:
-        cycle, first = _summed_up(count, cycle), _summed_up(count, first)
-    first_ns = first.astype(np.int64, copy=False)
+    first_ns = _summed_up(count, first)
     packets = PacketColumns(
-        cycle=cycle.astype(np.int64, copy=False),
+        cycle=_summed_up(count, cycle),
         bus=np.repeat(bus[whole], count),
         kind=kind.astype(np.uint8, copy=False),
         servo_id=servo_id.astype(np.uint8, copy=False),

@@ -255,10 +255,7 @@ class Slicer:
         bus = [np.full(len(own), at, np.uint8) for at, own in zip(buses.values(), rows, strict=True)]
         all_rows = np.concatenate(rows)
         start, size = messages.start[all_rows], messages.size[all_rows]
-        definition = self._file.channels[next(iter(buses))].text
-        packets, wrong = read_packets(
-            messages.data, np.concatenate(bus), start, size, of_one_cycle="int64 cycle\n" in definition
-        )
+        packets, wrong = read_packets(messages.data, np.concatenate(bus), start, size)
         self.wrong += wrong
         return packets
 
