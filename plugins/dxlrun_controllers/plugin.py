@@ -35,7 +35,6 @@ def dxlrun_controllers() -> Mapping[str, str]:
         "joint_group_posvel_controller": "dxlrun_controllers.group:JointGroupPosVelController",
         "joint_group_pwm_controller": "dxlrun_controllers.group:JointGroupPwmController",
         "joint_group_velocity_controller": "dxlrun_controllers.group:JointGroupVelocityController",
-        "joint_limiter": "dxlrun_controllers.joint_limiter:JointLimiter",
         "joint_position_controller": "dxlrun_controllers.pid_controller:PidController",
         "joint_state_broadcaster": "dxlrun_controllers.joint_state_broadcaster:JointStateBroadcaster",
         "joint_trajectory_controller": f"{_MOTIONS}.joint_trajectory_controller:JointTrajectoryController",

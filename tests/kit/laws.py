@@ -67,13 +67,10 @@ def cases(joints: tuple[str, ...] = ("a", "b", "c")) -> Iterator[Case]:
     high = [0.9 - 0.02 * number for number in range(len(joints))]
     yield from _motions(own, joints, high)
     positions, velocities = ("positions", {"positions": high}), ("velocities", {"velocities": high})
-    law, lower = own | GAINS | {"output_limit": 1.5}, {"into": ("lower",)}
+    law = own | GAINS | {"output_limit": 1.5}
     changed = {"changes": [{"gains": {"p": 1.0}}]}
     yield from ways("effort velocity pwm position", "pid_controller", law, positions, **changed)
     yield Case("joint_position_controller", law | {"reference": "velocity"}, [velocities])
-    slow = own | {"limits": {"velocity": "1 rad/s"}}
-    yield from ways("position posvel", "joint_limiter", slow, positions)
-    yield from ways("position posvel", "joint_limiter", slow, positions, **lower)
     yield Case("joint_group_position_controller", own, [positions])
     yield Case("joint_group_velocity_controller", own, [velocities])
     yield Case("joint_group_effort_controller", own, [("efforts", {"efforts": high})])

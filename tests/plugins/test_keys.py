@@ -15,7 +15,7 @@ from dxlrun_controllers.plugin import dxlrun_controllers
 Keys = dict[str, Any]
 TWO: Keys = {"joints": ["a", "b"]}
 GAINS: Keys = {"gains": {"p": 2.0}}
-PID, LIMITER, GRIPPER = TWO | GAINS, TWO | {"limits": {"acceleration": "8 rad/s^2"}}, {"joint": "gripper"}
+PID, GRIPPER = TWO | GAINS, {"joint": "gripper"}
 VELOCITY, POSVEL = {"reference": "velocity"}, {"command_interface": "posvel"}
 OF_POSITION, OF_EFFORT = {"command_interface": "position"}, {"command_interface": "effort"}
 WIDTHS = [{"angle": "-1.26 rad", "width": "78 mm"}, {"angle": "0.66 rad", "width": "20 mm"}]
@@ -72,8 +72,6 @@ def claims(name: str, keys: Keys) -> Interfaces:
         ("joint_trajectory_controller", TWO | POSVEL, "a b", "position velocity", ""),
         ("joint_trajectory_controller", PID | {"command_interface": "velocity"}, "a b", "velocity", ""),
         ("joint_trajectory_controller", PID | OF_EFFORT, "a b", "effort", ""),
-        ("joint_limiter", LIMITER, "a b", "position", "position velocity"),
-        ("joint_limiter", LIMITER | POSVEL, "a b", "position velocity", "position velocity"),
         ("pid_controller", PID, "a b", "effort", "position velocity effort"),
         ("pid_controller", PID | {"command_interface": "velocity"}, "a b", "velocity", "position velocity"),
         ("pid_controller", PID | OF_POSITION, "a b", "position", "position velocity"),
@@ -186,10 +184,6 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"joints": []}, "at least 1 item"),
         ({"surplus": 1}, "Extra inputs are not permitted"),
     ]),
-    "joint_limiter": (LIMITER, [
-        ({"limits": {"acceleration": "0 rad/s^2"}}, "greater than 0"),
-        ({"limits": {"acceleration": "8 rad/s^2", "lower": {"c": "0 rad"}}}, "c is not one of its joints"),
-    ]),
     "joint_trajectory_controller": (TWO, [
         (OF_EFFORT, "effort needs gains"),
         ({"gains": {"p": 1.0}}, "gains count only for velocity and effort"),
@@ -282,7 +276,6 @@ def points(*positions: float, time: float | str = 1.0) -> list[Keys]:
                 ({"pwm": [1]}, "1 pwm for 2 joints"),
                 ({"pwm": [0.2, 20]}, "less than or equal to 1"),  # it was meant in percent
             ]),
-            ("joint_limiter", LIMITER, "positions", [({"positions": [1]}, "1 positions for 2 joints")]),
             ("pid_controller", PID, "velocities", [
                 ({"velocities": [1, 2]}, "its reference is the position, so it takes positions"),
             ]),

@@ -92,7 +92,6 @@ ENTRIES: dict[str, Entry | list[Entry]] = {
     ),
     "joint_group_pwm_controller": Entry(OWN, "pwm", lambda _: {"pwm": [0.1, 0.1]}),
     "joint_group_velocity_controller": Entry(OWN, "velocities", SPEEDS),
-    "joint_limiter": Entry(OWN | {"limits": {"acceleration": "5 rad/s^2"}}, "positions"),
     "joint_position_controller": PID,
     "joint_state_broadcaster": Entry({}),
     "joint_trajectory_controller": [

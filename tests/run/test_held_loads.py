@@ -91,13 +91,6 @@ CHAINS = {
     "trajectory into pid without integral": Chain(
         (f"{ARM}, into: [pid]}}", f"{PID}, gains: {{p: 6.0, d: 0.15}}}}")
     ),
-    "trajectory into limiter into pid": Chain(
-        (
-            f"{ARM}, into: [limiter]}}",
-            f"limiter: {{type: joint_limiter, {OWN}, limits: {{acceleration: 10 rad/s^2}}, into: [pid]}}",
-            LAW,
-        )
-    ),
     "trajectory into pid into pid": Chain(
         (
             f"{ARM}, into: [pid]}}",

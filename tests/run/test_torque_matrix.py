@@ -96,8 +96,6 @@ def steered(each: int = 1) -> tuple[Steered, ...]:
 def _steered(index: int, case: Case, joints: tuple[str, ...]) -> Steered:
     name, asks = f"c{index}", tuple(case.asks[-1:])
     controllers = {name: {"type": case.type, **json.loads(json.dumps(case.keys))}}
-    if case.type == "joint_limiter":
-        controllers[name]["limits"]["acceleration"] = "20 rad/s^2"
     if case.type == "keyframe_player":
         for motion in controllers[name]["motions"].values():
             for step in motion["steps"]:

@@ -1,7 +1,7 @@
 """Campaign: storms of faults on a robot with a chain of controllers, steered meanwhile, on virtual time.
 
-A trajectory commands a limiter, which commands two of the three joints of a PID on efforts; another
-controller commands the third. Clients send goals, cancel, switch, and request torque and reboots, and
+A trajectory commands a PID on positions, which commands two of the three joints of a PID on efforts;
+another controller commands the third. Clients send goals, cancel, switch, and request torque and reboots, and
 controllers fail.
 Judged by the simulated bus' ledger beside the log, see tests/kit/storms.py. CI runs 3 storms:
 
@@ -54,8 +54,8 @@ CONTROLLERS = """\
 controllers:
   pid: {type: pid_controller, joints: [shoulder, elbow, wrist], command_interface: effort,
         gains: {p: 2.0, i: 0.5, d: 0.1}, fallback: standby}
-  smooth: {type: joint_limiter, joints: [shoulder, elbow], into: pid,
-           limits: {velocity: 2 rad/s, acceleration: 8 rad/s^2}}
+  smooth: {type: pid_controller, joints: [shoulder, elbow], command_interface: position, gains: {p: 0.2},
+           into: pid}
   arm: {type: joint_trajectory_controller, joints: [shoulder, elbow], into: smooth}
   turn: {type: joint_group_position_controller, joints: [wrist], into: [pid]}
   grip: {type: joint_group_position_controller, joints: [hand], fallback: relax}

@@ -37,6 +37,10 @@ _OFFERED = (
     "install the package that offers it into this environment (`pip install PACKAGE`); "
     "`dxlrun plugins` lists the types that there are"
 )
+_REMOVED = {
+    "joint_limiter": "take it out: the gate keeps all goals within `limits` of their joints",
+}
+"""Types of earlier versions, and what to do instead."""
 Kind = Literal["controller", "sensor"]
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
@@ -286,6 +290,8 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
     """
     if type_name in broken:  # two plug-ins offer it
         return broken[type_name]
+    if type_name in _REMOVED:
+        return _REMOVED[type_name]
     close = suggestion(type_name, known, _OFFERED)
     if not broken:
         return close
