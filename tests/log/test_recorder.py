@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from dxlrun.channels import ring
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
-from dxlrun.channels.process import LateMetadata, MessageChannel
+from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.clock import VirtualClock
 from dxlrun.log.reader import read_log
@@ -179,6 +180,33 @@ def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle
     assert event.code == EventCode.RECORDER_GAP
     assert "90 records of loop/cycles" in event.text
     assert recording.process.wait(60) == 1
+
+
+def test_recorder_measures_the_machine_from_the_loop_s_begin_to_its_end(
+    tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle
+) -> None:
+    memory = ring.create("cycles", 100 * record_size(layout.size), layout.size)
+    writer = RingWriter(memory)
+    ours, theirs = socket.socketpair()
+    turns: list[int] = []
+
+    def asked_to_stop() -> bool:
+        """Let the loop begin with cycles that are due long ago, and end after two samples."""
+        turns.append(len(turns))
+        if len(turns) == 2:
+            writer.append(RecordKind.CYCLE, cycle(0))
+        time.sleep(0.15)
+        return len(turns) == 5
+
+    with ours, theirs:
+        MessageChannel(ours, REQUESTS).send(LoopRuns(os.getpid()))
+        job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
+        closed = Recorder(job, MessageChannel(theirs, REQUESTS)).run(asked_to_stop)
+    os.close(memory)
+    assert MACHINE_TOPIC in read_log(tmp_path / "run.mcap").topics
+    # the sample at the end covers half a second or more; the first cycle was due before it began
+    assert closed.run_load.seconds > 0.4
+    assert closed.start_up_load.seconds == 0
 
 
 @pytest.mark.parametrize("overwritten", [0, 7])

@@ -11,13 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 from msgspec.json import Decoder
 from rich.console import Console
 
 from dxlrun.channels import heartbeat, process
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import EventRing
+from dxlrun.channels.events import Event, EventCode, EventRing, Severity, Waited
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
 from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.process import Cut, LineLost, Stop
@@ -645,3 +646,32 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
     assert run.sentences == ["the guardian did not look after the loop any more and was killed"]
     guardian.channel.close()
     guardian.theirs.close()
+
+
+def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
+    reported: list[Event] = []
+    clock = VirtualClock(10**10)
+
+    class Sink:
+        def emit(
+            self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b""
+        ) -> None:
+            reported.append(Event(clock.now_ns(), code, severity, source, text, data))
+
+    stalls = StallCounter()
+    report = StallReport(stalls, Sink())
+    for _ in range(3000):  # a wait of 1 ms in every period of 30 ms
+        now_ns = clock.now_ns()
+        stalls.count(now_ns, now_ns + MS)
+        for _look in range(3):
+            clock.wait_until(clock.now_ns() + 10 * MS)
+            report.look(clock.now_ns())
+    report.emit()
+    report.emit()  # nothing is left to report
+    waited = [msgspec.json.decode(one.data, type=Waited) for one in reported]
+    assert 89 <= len(reported) <= 92  # in 90 s
+    assert {(one.code, one.severity) for one in reported} == {
+        (EventCode.SIMULATION_STALLED, Severity.WARNING)
+    }
+    assert sum(one.times for one in waited) == 3000
+    assert sum(one.waited_ns for one in waited) == 3000 * MS == report.total.waited_ns

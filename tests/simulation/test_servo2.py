@@ -218,6 +218,17 @@ def test_the_watchdog_s_stop_is_at_its_time(line2):
     assert line2.servo().position == pytest.approx(stopped, abs=1e-3)
 
 
+def test_watchdog_does_not_count_the_time_in_which_its_process_stood_still(line2):
+    line2.put(operating_mode=1, torque_enable=1, goal_velocity=100)
+    line2.set("bus_watchdog", 5)  # 100 ms
+    line2.wait(0.05)
+    line2.bus.excuse(50_000_000)
+    line2.wait(0.09)
+    assert line2.servo().velocity > 0.3
+    line2.wait(0.1)
+    assert line2.servo().velocity == pytest.approx(0.0, abs=1e-3)
+
+
 def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2):
     line2.set("torque_enable", 1)
     for units, seconds, expired in ((127, 0.5, False), (5, 0.2, True)):
