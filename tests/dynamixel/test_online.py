@@ -121,7 +121,7 @@ def test_its_packets_are_a_log_when_one_is_named(check, tmp_path, capsys):
     before = log.read_bytes()
     code, _, err, sent = check("position_p_gain: 800", "--log", str(log), robot_text=two)
     assert (code, sent, log.read_bytes()) == (2, [], before)
-    assert "nothing is written over" in err
+    assert "cannot be written (it exists)" in err
 
 
 def test_a_servo_that_is_missing_is_in_the_log_too(check, tmp_path):

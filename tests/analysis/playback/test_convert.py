@@ -60,10 +60,7 @@ def test_the_file_says_where_it_comes_from_and_is_never_written_over(
     )
     again = dxlrun("convert", swing, "2nd-try.yaml")
     assert (again.code, (place / "2nd-try.yaml").read_text()) == (2, text)
-    assert (
-        again.err
-        == "dxlrun: 2nd-try.yaml exists, and nothing is written over; give another name, or remove it\n"
-    )
+    assert again.err == "dxlrun: 2nd-try.yaml cannot be written (it exists); choose another name\n"
     assert [each.name for each in place.iterdir() if "2nd" in each.name] == ["2nd-try.yaml"]
 
 
