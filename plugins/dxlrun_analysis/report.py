@@ -37,8 +37,8 @@ from dxlrun_analysis.cycles.latency import (
     Periods,
     on_virtual_time,
 )
+from dxlrun_analysis.joints.health import Extremes
 from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
@@ -81,7 +81,7 @@ class Report(msgspec.Struct, frozen=True):
     servos: tuple[ServoTraffic, ...]
     buses: tuple[BusTraffic, ...]
     joints: tuple[JointTracking, ...]
-    trends: tuple[Trend, ...]  # Temperature, voltage and load of each joint over the run
+    extremes: tuple[Extremes, ...]  # Highest temperature and lowest voltage of each joint
     events: tuple[EventCount, ...]
     steering: tuple[Act, ...]  # Commands from outside, a stream as one
     pauses: tuple[Pause, ...]
@@ -129,7 +129,7 @@ def analyze(
         servos=totals.servos,
         buses=totals.buses,
         joints=totals.tracking,
-        trends=totals.trends,
+        extremes=totals.extremes,
         events=_events(totals.events),
         steering=totals.acts,
         pauses=totals.pauses,

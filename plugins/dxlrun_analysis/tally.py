@@ -24,8 +24,8 @@ from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
+from dxlrun_analysis.joints.health import Extremes, ServoHealth
 from dxlrun_analysis.joints.tracking import JointTracking, Tracking
-from dxlrun_analysis.joints.trends import Trend, Trends
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
@@ -69,7 +69,7 @@ class RunTotals:
     gaps: int = 0  # Records that the recorder did not get
     damage: tuple[str, ...] = ()
     tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
-    trends: tuple[Trend, ...] = ()
+    extremes: tuple[Extremes, ...] = ()
     conduct: Conduct = NO_CONDUCT
     findings: tuple[Finding, ...] = ()  # What the accumulators of each room found by rules of their own
 
@@ -105,7 +105,7 @@ class Tally:
     def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
         """`watch` is called with all exchanges, too."""
         self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
-        self._trends, self._tracking = Trends(), Tracking()
+        self._health, self._tracking = ServoHealth(), Tracking()
         self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
@@ -115,7 +115,7 @@ class Tally:
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
         for take in (
-            *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
+            *(self._punctuality.take, self._causes.take, self._traffic.take, self._health.take),
             *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
         ):
             take(log)
@@ -164,11 +164,11 @@ class Tally:
             findings=(
                 *self._traffic.findings,
                 *movement,
-                *self._trends.findings(movement),
+                *self._health.findings(movement),
                 *self._sensors.findings(),
             ),
             tracking=tracking,
-            trends=self._trends.finish(self._tracking.movement.bins),
+            extremes=self._health.extremes(),
             conduct=conduct,
         )
 

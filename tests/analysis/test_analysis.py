@@ -264,8 +264,7 @@ def test_json_carries_the_whole_report(write: Make) -> None:
         "begin_ns": 1_000_000_000,
     }
     assert read["joints"][0]["name"] == "left_elbow_joint"
-    (trend,) = [trend for trend in read["trends"] if trend["joint"] == "left_elbow_joint"]
-    assert set(trend) == {"joint", "begin_s", "bin_s", "temperature", "voltage", "effort", "error"}
+    assert set(read["extremes"][0]) == {"joint", "hottest_c", "lowest_volts"}
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +13,7 @@ from tests.kit.stories import send, tell
 from dxlrun.channels.cycle import Torque
 from dxlrun.log.reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.joints.bins import Series
-from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.joints.trends import Trend
-from dxlrun_analysis.page.canvas import Canvas
-from dxlrun_analysis.page.findings import finding_plots
+from dxlrun_analysis.finding import Rank
 from dxlrun_analysis.report import analyze
 
 WHEEL = """\
@@ -202,33 +196,6 @@ def test_thresholds_of_a_linear_joint_are_those_of_its_servo() -> None:
     ):
         joint = Joint(way=SWING * scale, position=position * scale, planned=linear)
         assert [one.code for one in findings(joint)] == code
-
-
-def test_the_report_draws_the_error_of_the_joint_and_that_of_the_others() -> None:
-    def series(least: float | None, most: float | None) -> Series:
-        return Series((least, None), (0.0, None), (most, None))
-
-    nothing = series(None, None)
-    errors = {"j0": (-0.5, 0.1), "j1": (-0.1, 0.0), "j2": (0.0, 0.3), "slide": (0.0, 9.0)}
-    volts = {"j0": 9.0, "j1": 12.0, "j2": 11.0, "slide": 10.0}
-    trends = [
-        Trend(name, 2.0, 0.1, nothing, series(volts[name], 12.5), nothing, series(*ends))
-        for name, ends in errors.items()
-    ]
-    joints = [
-        JointTracking(name, 0, 0.0, 0, None, None, None, None, None, unit="m" if name == "slide" else "rad")
-        for name in errors
-    ]
-    said = [Finding(code, "j0", "It did.") for code in ("follows_worse", "servo_error", "supply")]
-    moved, supplied = finding_plots(
-        Canvas(10**9, 10**9, 3 * 10**9),
-        SimpleNamespace(verdict=SimpleNamespace(findings=said), trends=trends, joints=joints, servos=()),  # type: ignore[arg-type]
-    )
-    for plot, own, others in ((moved, math.degrees(0.5), math.degrees(0.2)), (supplied, 9.0, 11.0)):
-        drawn = [dict(one.data_source.data) for one in plot.model.renderers]
-        assert [data["y"][0] for data in drawn] == pytest.approx([others, own])
-        assert [data["x"][0] for data in drawn] == pytest.approx([1.05, 1.05])
-        assert plot.text == "It did."
 
 
 QUICK = {"logged": JointPlan("j0", -9.0, 9.0, None, top_speed=5.0)}

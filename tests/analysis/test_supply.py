@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun_analysis.joints.trends import Trends
+from dxlrun_analysis.joints.health import ServoHealth
 
 Floats = npt.NDArray[np.float64]
 COUNT = 4
@@ -47,7 +47,7 @@ def findings(
     cycles["temperature"], cycles["voltage"], cycles["effort"] = 30.0, read(volts), LOADS
     cycles["temperature"][500:, 1] = heat
     cycles["hardware_error"][500:] = errors if isinstance(errors, list) else [0, errors, 0, 0]
-    trends = Trends()
+    health = ServoHealth()
     names = tuple(f"j{joint}" for joint in range(COUNT))
     for begin in range(0, len(TIME), 300):
         part: Any = SimpleNamespace(
@@ -56,8 +56,8 @@ def findings(
             joints=names,
             attachments={"plan.json": json.dumps(PLAN).replace("XM430-W350", model).encode()},
         )
-        trends.take(part)
-    return [(one.code, one.subject, one.sentence) for one in trends.findings([])]
+        health.take(part)
+    return [(one.code, one.subject, one.sentence) for one in health.findings([])]
 
 
 def volts(joint: int | None = None, fall: Floats | float = 0.0) -> Floats:

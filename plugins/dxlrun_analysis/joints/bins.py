@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,15 +9,6 @@ from dxlrun.channels.cycle import Floats
 
 _BINS = 512
 _FIRST_BIN_NS = 100_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Series:
-    """One quantity of one joint over the run: of each bin least, mean and most; None: not known."""
-
-    least: tuple[float | None, ...]
-    mean: tuple[float | None, ...]
-    most: tuple[float | None, ...]
 
 
 _JOINS = ((np.minimum, np.inf), (np.maximum, -np.inf), (np.add, 0.0), (np.add, 0.0))
@@ -75,9 +63,3 @@ class Bins:
             mean = total / count
         least[count == 0] = most[count == 0] = np.nan
         return length_s, least, mean, most
-
-    def series(self, quantity: int, joint: int) -> Series:
-        """Return one quantity of one joint, to six digits: sums depend on the slices in the last ones."""
-        _, *values = self.joined(0.0)
-        columns = (each[quantity, :, joint].tolist() for each in values)
-        return Series(*(tuple(None if math.isnan(x) else round(x, 6) for x in each) for each in columns))

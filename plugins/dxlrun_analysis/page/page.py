@@ -15,7 +15,6 @@ from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.page.canvas import Canvas
 from dxlrun_analysis.page.curves import CurveCollector, Curves, CurvesOfRun
 from dxlrun_analysis.page.events import EventCollector, events_plot
-from dxlrun_analysis.page.findings import finding_plots, plot_of
 from dxlrun_analysis.page.joints import joint_plots, state_plots
 from dxlrun_analysis.page.loop import controllers_plot, latency_plots, steps_plot, typical_plot
 from dxlrun_analysis.page.machine import MachineCollector, machine_plots
@@ -34,6 +33,16 @@ from dxlrun_analysis.report import (
 _MOST_EVENTS = 100
 _MARKED = ("switch", "rate", "load", "unload", "policy")
 _FEW_CHANGES = 60  # More lines would bury the curves
+_PLOTS = {
+    "machine-busy": "busy_machine",
+    "lateness": "kept_rate",
+    "steps": "skipped own_work",
+    "replies": "late_replies slow_servo replies",
+    "lost": "lossy_servo lossy_line broken_replies invalid_states noise",
+    "all-voltage": "supply power_lost",
+    "events-timeline": "servo_error errors_logged another_host",
+}
+"""Plots of the page, and the codes of the findings that each shows."""
 
 
 def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> tuple[Report, str]:
@@ -98,8 +107,8 @@ def _header(report: Report, when: str, plots: Collection[str]) -> Element:
     first, *others = report.verdict.findings
     rows = {joint.name: f"joint-{row}" for row, joint in enumerate(report.joints)}
     sentences = []
-    for number, one in enumerate(others, start=1):
-        wanted = f"finding-{number}", plot_of(one.code), rows.get(one.subject, "")
+    for one in others:
+        wanted = _plot_of(one.code), rows.get(one.subject, "")
         sentences.append((one.sentence, one.remedy, next((name for name in wanted if name in plots), "")))
     return header(
         first.sentence,
@@ -109,6 +118,11 @@ def _header(report: Report, when: str, plots: Collection[str]) -> Element:
         report.verdict.good,
         _key_numbers(report),
     )
+
+
+def _plot_of(code: str) -> str:
+    """Return the name of the plot that shows findings of a code, or an empty text."""
+    return next((plot for plot, codes in _PLOTS.items() if code in codes.split()), "")
 
 
 def _key_numbers(report: Report) -> list[tuple[str, str]]:
@@ -137,7 +151,6 @@ def _sections(run: _Run, report: Report) -> list[Element]:
         return [table_element(found[name]) for name in names if name in found]
 
     return [
-        section("findings", "What the verdict names", canvas.elements(finding_plots(canvas, report))),
         section("joints", "Joints", [*shown("joints"), *_joints(run, report)]),
         section("steering", "Steered from outside", [*shown("steering"), *_marks(canvas)]),
         section("events", "Events", _events(run, report, shown("events"))),

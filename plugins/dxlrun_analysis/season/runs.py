@@ -25,7 +25,6 @@ from dxlrun.log.reader import Log, open_log
 from dxlrun.log.stored import is_being_written
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.finding import ROBOT
-from dxlrun_analysis.joints.bins import Series
 from dxlrun_analysis.report import Report, analyze
 from dxlrun_analysis.season.pools import processes
 
@@ -57,14 +56,13 @@ def _most(values: Iterable[float]) -> float | None:
 
 
 def _hottest(report: Report) -> tuple[float | None, str | None]:
-    known = [
-        (value, one.joint) for one in report.trends for value in one.temperature.most if value is not None
-    ]
+    known = [(one.hottest_c, one.joint) for one in report.extremes if one.hottest_c is not None]
     return max(known, default=(None, None))
 
 
-def _lowest(series: Iterable[Series]) -> float | None:
-    return min((value for one in series for value in one.least if value is not None), default=None)
+def _lowest_voltage(report: Report) -> float | None:
+    known = [one.lowest_volts for one in report.extremes if one.lowest_volts is not None]
+    return min(known, default=None)
 
 
 def _farthest(report: Report) -> tuple[float | None, str | None]:
@@ -95,7 +93,7 @@ COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "slowest_reply_us": (_NUMBER, lambda report, _: _most(one.reply_max_us for one in report.servos)),
     "hottest_joint": (_TEXT, lambda report, _: _hottest(report)[1]),
     "hottest_deg_c": (_NUMBER, lambda report, _: _hottest(report)[0]),
-    "lowest_voltage_v": (_NUMBER, lambda report, _: _lowest(trend.voltage for trend in report.trends)),
+    "lowest_voltage_v": (_NUMBER, lambda report, _: _lowest_voltage(report)),
     "worst_joint": (_TEXT, lambda report, _: _farthest(report)[1]),
     "worst_error_rad": (_NUMBER, lambda report, _: _farthest(report)[0]),
     "records_lost": (_WHOLE, lambda report, _: report.gaps),

@@ -1,9 +1,8 @@
-"""Temperature, voltage and load of each joint over the run, in bins that double when the run outgrows them.
+"""Hot and overloaded servos, and supplies that are too high, too low or sag under load.
 
-What they show: a joint that gets hot or is overloaded, and a supply that is too high, too low or sags under
-load: that of the bus, where the voltages of most servos fall together, or of one servo, where the others
-stay. Limits are those of the models' control tables as shipped, or of the robot file's `registers`; a control
-table also has the meaning of hardware errors.
+The voltages of most servos on a bus fall together when the supply of the bus sags. The voltage of one servo
+falls alone when its own supply does. Limits are those of the models' control tables as shipped, or of the
+robot file's `registers`. A control table also has the meaning of hardware errors.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from dxlrun.channels.cycle import Floats
 from dxlrun.dynamixel.control_table import Fault
 from dxlrun.log.reader import Log
 from dxlrun_analysis.finding import Finding, cause
-from dxlrun_analysis.joints.bins import Bins, Series
+from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 
 Numbers = NDArray[np.int64]
 
-_QUANTITIES = ("temperature", "voltage", "effort")
+_QUANTITIES = ("temperature", "voltage")
 
 _NONSENSE_C = 120.0
 _NEAR_LIMIT_C = 10.0  # The run warns at this distance from Temperature Limit, too
@@ -40,16 +39,12 @@ _MOST_SAMPLES = 100_000  # Voltages kept
 
 
 @dataclass(frozen=True, slots=True)
-class Trend:
-    """One joint over the run."""
+class Extremes:
+    """Highest temperature and lowest voltage of a joint in the run; None: never read."""
 
     joint: str
-    begin_s: float  # Of the first bin, on the run's clock
-    bin_s: float
-    temperature: Series  # deg C
-    voltage: Series  # V
-    effort: Series  # Magnitude, in the unit of the joint's effort
-    error: Series  # Position minus the reachable trajectory, rad or m; only with torque
+    hottest_c: float | None
+    lowest_volts: float | None
 
 
 class _Sample(NamedTuple):
@@ -60,8 +55,8 @@ class _Sample(NamedTuple):
     bus_load: float
 
 
-class Trends:
-    """Collects the trends of all joints, in memory that does not grow with the log."""
+class ServoHealth:
+    """Collects temperatures, voltages and hardware errors, in memory that does not grow with the log."""
 
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
@@ -80,8 +75,7 @@ class Trends:
             self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
             self._faults = [set() for _ in log.joints]
             self._volts = np.full(len(log.joints), np.nan)
-        values = [np.abs(cycles[name]) if name == "effort" else cycles[name] for name in _QUANTITIES]
-        self._bins.take(cycles["read_ns"], np.array(values))
+        self._bins.take(cycles["read_ns"], np.array([cycles[name] for name in _QUANTITIES]))
         for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
             for value in np.unique(values).tolist():
                 faults.update(joint.faults(value))
@@ -104,20 +98,16 @@ class Trends:
 
     # Results
 
-    def finish(self, errors: Bins) -> tuple[Trend, ...]:
-        """Return the trends in the order of the joints; `errors`: bins with their error as first quantity."""
-        bins, begin_s, bin_s = self._bins, self._bins.begin_ns / 1e9, self._bins.bin_ns / 1e9
+    def extremes(self) -> tuple[Extremes, ...]:
+        """Return the extremes of each joint, in the order of the joints."""
+        if not self._joints:
+            return ()
+        _, least, _, most = self._bins.joined(0.0)
+        hottest = np.fmax.reduce(most[0], initial=math.nan)
+        lowest = np.fmin.reduce(least[1], initial=math.nan)
         return tuple(
-            Trend(
-                joint.name,
-                begin_s,
-                bin_s,
-                temperature=bins.series(0, at),
-                voltage=bins.series(1, at),
-                effort=bins.series(2, at),
-                error=errors.series(0, at),
-            )
-            for at, joint in enumerate(self._joints)
+            Extremes(joint.name, *(None if math.isnan(x) else round(float(x), 6) for x in pair))
+            for joint, *pair in zip(self._joints, hottest, lowest, strict=True)
         )
 
     def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
