@@ -49,11 +49,12 @@ _PART = 5  # Of the excess of long cycles: what has less than a fifth is not wor
 def busy_machine(totals: RunTotals) -> list[str]:
     """Return what shows that the machine was too busy, in words; nothing: it was not.
 
-    Its samples, wake-ups that were late, and what woke the loop late where that has most of what long cycles
-    took. The wake-ups of a sequential loop wait for nothing.
+    Its samples, waits for simulated servos, wake-ups that were late, and what woke the loop late where that
+    has most of what long cycles took. The wake-ups of a sequential loop wait for nothing.
     """
     load, causes = totals.causes.load, totals.causes.causes
     parts = [load.text] if load.share else []
+    parts += [totals.wait.text] if totals.wait.times >= _LEAST_CYCLES else []
     if totals.plan.loop.schedule == "sequential":
         return parts
     late = totals.latency.share_over_1_ms if totals.latency else 0.0

@@ -14,9 +14,11 @@ from dxlrun.channels.events import (
     EventGroup,
     Granted,
     LostRecords,
+    Waited,
 )
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun.plan.machine_load import NO_WAIT, SimulationWait
 from dxlrun.plan.played_goals import UnreachedGoal, find_unreached_goals
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
@@ -66,6 +68,7 @@ class RunTotals:
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
     failures: tuple[str, ...] = ()  # What failed outside of the loop, one sentence each
+    wait: SimulationWait = NO_WAIT  # Of the loop, for simulated servos whose process did not run
     gaps: int = 0  # Records that the recorder did not get
     damage: tuple[str, ...] = ()
     tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
@@ -111,6 +114,7 @@ class Tally:
         self._returns: dict[str, list[str]] = {}
         self._granted = False
         self._unread = 0
+        self._wait = NO_WAIT
 
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
@@ -130,6 +134,9 @@ class Tally:
                     self._returns.setdefault(event.source, []).append(f"answers {why}")
                 elif event.code == EventCode.RECORDER_GAP:
                     self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
+                elif event.code == EventCode.SIMULATION_STALLED:
+                    data, wait = msgspec.json.decode(event.data, type=Waited), self._wait
+                    self._wait = SimulationWait(wait.waited_ns + data.waited_ns, wait.times + data.times)
 
     def totals(self, log: Log) -> RunTotals:
         """Return the totals of all slices; `log`: the metadata of the file, which come last."""
@@ -159,6 +166,7 @@ class Tally:
             acts=acts,
             pauses=pauses,
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
+            wait=self._wait,
             gaps=gaps,
             damage=log.damage,
             findings=(

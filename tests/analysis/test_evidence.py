@@ -11,7 +11,7 @@ from tests.analysis.judged import BUSY, REAL, SIMULATED, accusing, lost, on_bus,
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.port.remedies import INJECTED
-from dxlrun.plan.machine_load import MachineLoad
+from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.latency import Latency, Periods
 from dxlrun_analysis.evidence import accused
@@ -25,6 +25,8 @@ LACKING: dict[str, tuple[Needs, dict[str, Any]]] = {
     "nothing": (Needs.NOTHING, {}),
     "a busy machine": (Needs.MACHINE, {"causes": BUSY}),
     "late wake-ups": (Needs.MACHINE, {"latency": Latency(9e3, 500.0, 90.0, 9, 0.05, 0.02, 0.0)}),
+    "one stall of the simulation": (Needs.NOTHING, {"wait": SimulationWait(9_000_000, 1)}),
+    "stalls of the simulation": (Needs.MACHINE, {"wait": SimulationWait(9_000_000, 3)}),
     "skipped periods": (Needs.LOOP, {"periods": Periods(1000, 800, 200, 0, True, 50.0, 20.0, (50.0,))}),
     "a loop that never ran": (Needs.LOOP, {"periods": Periods(0, 0, 0, 0, True, 50.0, 0.0, ())}),
     "lost records": (Needs.LOG, {"gaps": 3}),
