@@ -28,7 +28,7 @@ from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_analysis.counts import median, quantile
-from dxlrun_analysis.cycles.late_servos import overruns_by_servos
+from dxlrun_lab.late_servos import overruns_by_servos
 
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8

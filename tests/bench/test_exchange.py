@@ -17,7 +17,7 @@ import pytest
 
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import ProcessFault
-from dxlrun_analysis.cycles.late_servos import LedgerTransaction
+from dxlrun_lab.late_servos import LedgerTransaction
 from exchange.bus import Settings, bench_bus, chosen_hosts, to_json
 from exchange.canned import CannedResponder
 from exchange.case import Case, Registers

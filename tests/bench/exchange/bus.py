@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
-from dxlrun_analysis.cycles.late_servos import Sent, transactions
+from dxlrun_lab.late_servos import Sent, transactions
 from exchange.canned import CannedResponder
 from exchange.case import Case
 from exchange.figures import CaseFigures, WireFigures, host_figures, wire_figures

@@ -31,7 +31,7 @@ from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun_analysis.cycles.late_servos import Sent
+from dxlrun_lab.late_servos import Sent
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk
 

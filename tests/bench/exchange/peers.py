@@ -10,7 +10,7 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 from __future__ import annotations
 
 from dxlrun.errors import InputError
-from dxlrun_analysis.cycles.late_servos import Sent
+from dxlrun_lab.late_servos import Sent
 from exchange.case import Case, Registers
 
 TIMEOUT_S = 1.0

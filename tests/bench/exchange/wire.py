@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun_analysis.cycles.late_servos import LedgerTransaction
+from dxlrun_lab.late_servos import LedgerTransaction
 
 
 @dataclass(frozen=True, slots=True)

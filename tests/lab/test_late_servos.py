@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.kit.made_logs import Cycle, Wire
+from tests.kit.made_logs import Cycle, Wire, made_log
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.simulation.bus.ledger import LedgerEntry
-from dxlrun_analysis.cycles.late_servos import overruns_by_servos, transactions, waits_for_servos
+from dxlrun_lab.late_servos import overruns_by_servos, transactions, waits_for_servos
 
 PERIOD_US = 20_000
 ASKED = b"\xff\xff\x05\x04\x02\x24\x02\xcc"
@@ -41,7 +41,7 @@ Waits = Callable[..., tuple[int, float, float]]
 
 
 @pytest.fixture
-def waits(write: Callable[..., Path]) -> Waits:
+def waits(tmp_path: Path) -> Waits:
     """Return overruns by servos, and how long the cycle that took more waited: read, idle, us."""
 
     def waits(entries: list[LedgerEntry], **more: int) -> tuple[int, float, float]:
@@ -49,7 +49,7 @@ def waits(write: Callable[..., Path]) -> Waits:
         cycles.append(Cycle(LATE + 1 + GONE, skipped=GONE))
         woke = more.get("late", 0)
         asked = [Wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(LATE + 1)]
-        log = read_log(write(cycles, asked))
+        log = read_log(made_log(tmp_path, cycles, asked))
         in_read, in_idle = waits_for_servos(log, entries)
         assert not in_read[:LATE].any()
         return overruns_by_servos(log, entries), in_read[LATE] / 1e3, in_idle[LATE] / 1e3
