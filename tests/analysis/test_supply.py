@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun_analysis.joints.health import ServoHealth
+from dxlrun_analysis.joints.health import Extremes, ServoHealth
 
 Floats = npt.NDArray[np.float64]
 COUNT = 4
@@ -38,9 +38,9 @@ def read(volts: Floats) -> Floats:
     return held
 
 
-def findings(
+def health_of(
     volts: Floats, errors: int | list[int] = 0, heat: float = 30.0, model: str = "XM430-W350"
-) -> list[tuple[str, str, str]]:
+) -> ServoHealth:
     kinds = [(name, np.float64, COUNT) for name in ("temperature", "voltage", "effort")]
     cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds, ("hardware_error", np.uint8, COUNT)])
     cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
@@ -57,7 +57,14 @@ def findings(
             attachments={"plan.json": json.dumps(PLAN).replace("XM430-W350", model).encode()},
         )
         health.take(part)
-    return [(one.code, one.subject, one.sentence) for one in health.findings([])]
+    return health
+
+
+def findings(
+    volts: Floats, errors: int | list[int] = 0, heat: float = 30.0, model: str = "XM430-W350"
+) -> list[tuple[str, str, str]]:
+    found = health_of(volts, errors, heat, model).findings([])
+    return [(one.code, one.subject, one.sentence) for one in found]
 
 
 def volts(joint: int | None = None, fall: Floats | float = 0.0) -> Floats:
@@ -162,3 +169,18 @@ def test_a_hardware_error_is_what_the_model_means_by_it(model: str) -> None:
         assert [one[1] for one in told] == ["j1"] * (words is not None), value
         assert all(one[0] == ("supply" if "voltage" in words else "servo_error") for one in told if words)
         assert all(words in one[2] for one in told if words)
+
+
+def test_extremes_are_the_highest_temperature_and_the_lowest_voltage_of_each_joint() -> None:
+    never_read = volts(1, DIP)
+    never_read[:, 3] = np.nan
+    assert health_of(never_read, heat=55.0).extremes() == (
+        Extremes("j0", 30.0, 12.0),
+        Extremes("j1", 55.0, 7.0),
+        Extremes("j2", 30.0, 12.0),
+        Extremes("j3", 30.0, None),
+    )
+
+
+def test_log_without_cycles_has_no_extremes() -> None:
+    assert ServoHealth().extremes() == ()

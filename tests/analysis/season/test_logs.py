@@ -191,7 +191,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
         ),
         (("--where", "robot LIKE 'single%' -- and no more"), ["may/third.mcap"]),
         (("--sort", "log DESC"), NAMES[::-1]),
-        (("--where", "cycles = (SELECT max(cycles) FROM logs)"), ["may/second.mcap"]),
+        (("--where", "cycles = (SELECT max(cycles) FROM logs)"), ["may/third.mcap"]),
     ],
 )
 def test_conditions_choose_logs(
