@@ -284,10 +284,10 @@ def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[
         start_new_session=True,
     )
     try:
-        with process:
-            yield process, ours
+        yield process, ours
     finally:
         process.kill()
+        process.wait()
         os.close(theirs)
         os.close(ours)
 
