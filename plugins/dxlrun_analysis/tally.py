@@ -98,8 +98,11 @@ class RunTotals:
         return bool(self.periods.records) and self.periods.skipped <= self.tolerated_skips
 
     def bus_of(self, subject: str) -> str:
-        """Return the bus of a servo that a finding accuses; of another subject itself."""
-        return next((servo.bus for servo in self.servos if servo.subject == subject), subject)
+        """Return the bus of a servo or joint that a finding accuses; of another subject itself."""
+        movers = (
+            mover.bus.name for mover in self.plan.movers.get(subject, ())
+        )  # of a joint of several servos
+        return next((servo.bus for servo in self.servos if servo.subject == subject), next(movers, subject))
 
 
 class Tally:

@@ -16,7 +16,7 @@ from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.latency import Latency, Periods
 from dxlrun_analysis.evidence import accused
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.plan import LoggedPlan
+from dxlrun_analysis.plan import LoggedPlan, LoggedServo
 from dxlrun_analysis.rules import RULES, Needs
 from dxlrun_analysis.tally import RealTime
 from dxlrun_analysis.verdict import judge
@@ -65,6 +65,15 @@ def test_joint_is_not_accused_where_the_replies_of_its_bus_are_spoilt(code: str)
             run, [accusing(code, share=9.0), accusing(joint_rule, "elbow"), accusing(joint_rule, "hip")]
         )
         assert [one.subject for one in found] == ["bus0", "hip"]
+
+
+def test_joint_of_two_servos_is_not_accused_beside_the_noise_of_their_bus() -> None:
+    two = plan(REAL)
+    two.buses[0].servos = [LoggedServo("hip", number, name=f"hip_{number}") for number in (1, 2)]
+    run = totals(servos=on_bus("hip_1", "hip_2"), plan=two)
+    assert [one.code for one in accused(run, [accusing("noise"), accusing("follows_worse", "hip")])] == [
+        "noise"
+    ]
 
 
 def test_another_host_that_only_reads_moves_no_joint() -> None:
