@@ -41,6 +41,11 @@ class _Loop:
     def newest(self) -> Any:
         return self._robot.record
 
+    @property
+    def began_ns(self) -> int:
+        record = self.newest()
+        return int(record.woken_ns) - record.cycle * self.plan.loop.period_ns
+
     def set_point(self, loaded: Loaded, *rest: Any) -> None:
         self.number += 1
         self._inbox.waiting.append(Command(self.number, loaded.plan.name, *rest))
