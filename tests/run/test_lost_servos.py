@@ -224,7 +224,7 @@ def test_all_joints_of_a_group_lose_their_torque_with_one_of_its_servos(built, t
     assert robot.run().reason == "ended"
     assert had == [True, True, False, True]
     (told,) = [event.text for event in read_log(tmp_path / "run.mcap").events if "group" in event.text]
-    assert told == "group neck lost a servo: it gets no torque until a client requests it"
+    assert told == "group neck lost a servo: it is limp until a client requests torque"
 
 
 def test_the_first_reason_to_end_a_run_decides_by_which_policy(built):
