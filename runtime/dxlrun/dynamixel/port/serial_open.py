@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import struct
-import termios
 import time
 from collections.abc import Iterable
 from contextlib import suppress
@@ -17,6 +15,12 @@ from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.dynamixel.port.rights import command_for_access
 from dxlrun.errors import PortError
 from dxlrun.process_table import robot_of
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows, where a sensor's parameters are checked and no line is opened
+    fcntl = termios = None  # type: ignore[assignment]  # modules, or none
 
 _RATE_TOLERANCE = 0.02
 """Of 8N1: a receiver samples the tenth bit within half a bit up to 5 %, for both ends together [i]."""
