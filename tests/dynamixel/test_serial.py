@@ -251,8 +251,13 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
 def test_a_process_that_has_a_plan_open_is_known_by_its_robot():
     torso = Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml"
     descriptor = memory_file("dxlrun-plan", to_json(compile_files(torso, {}, []).plan))
-    assert robot_of(Path("/proc/self")) == "bioloid_torso"
-    os.close(descriptor)
+    try:  # a process of its own: this one may have others open
+        with subprocess.Popen(["/bin/cat"], stdin=subprocess.PIPE, pass_fds=[descriptor]) as run:
+            assert robot_of(Path(f"/proc/{run.pid}")) == "bioloid_torso"
+    finally:
+        os.close(descriptor)
+    with subprocess.Popen(["/bin/cat"], stdin=subprocess.PIPE) as other:
+        assert robot_of(Path(f"/proc/{other.pid}")) is None
 
 
 def test_the_line_is_locked_against_every_program(opened):

@@ -22,6 +22,8 @@ from dxlrun.run import supervisor
 from dxlrun.run.run_processes import create_memory
 from dxlrun.run.run_summary import RunOptions
 
+pytestmark = pytest.mark.usefixtures("no_memory_left")
+
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 

@@ -36,6 +36,8 @@ from dxlrun.run import sensor_process, supervisor
 from dxlrun.run.run_processes import create_memory, start_sensor
 from dxlrun.testing import plan_of
 
+pytestmark = pytest.mark.usefixtures("no_memory_left")
+
 PERIOD_S = 0.01
 ROBOT = """\
 name: one
