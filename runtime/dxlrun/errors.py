@@ -125,7 +125,14 @@ class GoalTimeout(DxlrunError, TimeoutError):
 
 
 class StartUpError(DxlrunError, RuntimeError):
-    """A servo differs from the robot file; torque stayed off, or was switched off again."""
+    """A servo differs from the robot file; torque stayed off, or was switched off again.
+
+    `for_replies`: replies came late or not at all, which a machine that was too busy may have caused.
+    """
+
+    def __init__(self, sentences: str, *, for_replies: bool = False) -> None:
+        super().__init__(sentences)
+        self.for_replies = for_replies
 
 
 class ServoFault(DxlrunError, RuntimeError):

@@ -176,12 +176,14 @@ def test_wait_for_simulated_servos_names_the_machine(dxlrun: Callable, runs: Run
 
 
 def test_busy_machine_comes_before_the_servos_that_refused_a_start(dxlrun: Callable, runs: Runs, torso: Path):
-    summary = RunSummary(1, "start-up", 0, 0, 0.1, ("no servo answers",), start_up_load=BUSY, refused=True)
+    summary = RunSummary(
+        1, "start-up", 0, 0, 0.1, ("no servo answers",), start_up_load=BUSY, refused_for_replies=True
+    )
     runs.answer = summary
 
     assert dxlrun(torso).errors[1:] == [f"bioloid_torso: {MACHINE}", "bioloid_torso: no servo answers"]
 
-    runs.answer = replace(summary, refused=False)  # a plug-in that cannot be imported
+    runs.answer = replace(summary, refused_for_replies=False)  # a plug-in that cannot be imported
 
     assert dxlrun(torso).errors[1:] == ["bioloid_torso: no servo answers"]
 

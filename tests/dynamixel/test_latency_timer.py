@@ -120,6 +120,7 @@ def test_replies_later_than_planned_are_reported_before_any_servo_has_torque(tmp
     robot = with_a_timer(tmp_path, 1, "/dev/ttyUSB0")
     with pytest.raises(StartUpError) as refusal:
         robot.run()
+    assert refusal.value.for_replies
     (sentence,) = refusal.value.sentences
     start = r"the loop would miss most replies: (\d+) of \1 replies on bus main came up to 1[56] ms later"
     assert re.match(start, sentence), sentence

@@ -7,7 +7,7 @@ from tests.kit.rigs import Rig, make_plan, make_x, start_rig
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
 from dxlrun.dynamixel.plan.line import MOST_SPARE
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
+from dxlrun.dynamixel.plan.retry import ReplyTimes, extend_timeouts, retry
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.plan.transaction import Program, Reply, Transaction
@@ -122,14 +122,15 @@ def test_slow_reply_widens_the_window_for_a_minute():
 def test_lost_reply_is_not_lateness_of_the_next_one(register):
     """Neither the repetition of the lost read nor a read of another register of as many bytes is late."""
     rig = start_rig(PLAN)
-    late_ns: list[int] = []
+    times = ReplyTimes()
 
     def program() -> Program[Reply]:
         yield ONE.reading(64, 1)
         return (yield from retry(ONE.reading(register, 1)))
 
     truncate_next(rig.buses[0], 11, 0)
-    (reply,) = rig.lines.run([extend_timeouts(program(), extra_ns=late_ns)])
+    (reply,) = rig.lines.run([extend_timeouts(program(), times=times)])
     assert reply is not None
     assert reply.answered
-    assert all(each < MILLISECOND_NS for each in late_ns)
+    assert all(each < MILLISECOND_NS for each in times.late_ns)
+    assert times.missing == 1

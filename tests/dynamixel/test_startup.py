@@ -42,6 +42,18 @@ def test_a_servo_that_is_not_there_is_named_with_all_the_others():
     assert problem.startswith("main_3_joint (ID 3 on bus main) does not answer: check its ID, and that")
 
 
+@pytest.mark.parametrize(
+    ("lacks", "for_replies"),
+    [(lambda servo: servo.silence(), True), (lambda servo: servo.poke("model_number", 29), False)],
+)
+def test_refusal_is_for_replies_only_when_one_is_missing(lacks, for_replies):
+    rig = make_rig()
+    lacks(rig.servo(6))
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert caught.value.for_replies is for_replies
+
+
 def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torque():
     rig, seen = make_rig(), []
     rig.hardware.start(lambda: seen.append((rig.torque(), len(rig.into_bus()))))
@@ -239,8 +251,9 @@ def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_t
     outside = (plan.servos[1].upper_tick + 30) * plan.servos[1].rad_per_tick
     gets_torque = b"\x01\x04\x03\x18\x01"  # the first one
     rig.when(lambda data: data[2:7] == gets_torque, lambda: turn_by_hand(rig.servo(2), outside))
-    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* is at 65.8 deg, outside its"):
+    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* is at 65.8 deg, outside its") as caught:
         rig.hardware.start()
+    assert not caught.value.for_replies
     assert [packet for packet in rig.into_bus() if packet[2:5] == b"\x02\x07\x03"] == []
     assert rig.torque() == [False, False]
 

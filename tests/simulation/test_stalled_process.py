@@ -19,7 +19,7 @@ from dxlrun.channels.packets import PacketSink
 from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import extend_timeouts
+from dxlrun.dynamixel.plan.retry import ReplyTimes, extend_timeouts
 from dxlrun.dynamixel.port.ports import SerialPorts, SimulatedPort, StallCounter
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
@@ -108,12 +108,12 @@ def test_servo_that_is_silent_or_late_on_purpose_is_lost(fault: str) -> None:
 
 def test_lateness_of_the_process_is_told_apart_from_that_of_the_servo() -> None:
     with simulated("slow servo=1 by=30ms") as host:
-        late_ns: list[int] = []
+        times = ReplyTimes()
 
         def ping() -> Program[Reply]:
             return (yield plan_line(PLAN).ping(1))
 
         with host.stopped(0.1):
-            host.lines.run([extend_timeouts(ping(), extra_ns=late_ns)])
-        (late,) = late_ns
+            host.lines.run([extend_timeouts(ping(), times=times)])
+        (late,) = times.late_ns
         assert 29_000_000 < late < 60_000_000  # of more than 100 ms

@@ -151,7 +151,7 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
         print_warning(f"{robot}: {remark}")
     from dxlrun.run.run_summary import run_verdict
 
-    machine = summary.describe_machine(plan) if summary.refused else ""
+    machine = summary.describe_machine(plan) if summary.refused_for_replies else ""
     for sentence in filter(None, (machine, *summary.sentences)):
         print_error(f"{robot}: {sentence}")
     verdict = run_verdict(summary, plan)

@@ -472,4 +472,4 @@ class DynamixelHardware:
             if servos.silent
         ]
         if problems:
-            raise StartUpError("\n".join(problems))
+            raise StartUpError("\n".join(problems), for_replies=True)

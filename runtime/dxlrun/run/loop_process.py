@@ -70,8 +70,8 @@ class LoopOutcome(msgspec.Struct, frozen=True):
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
     events: EventTotals = EventTotals()
-    refused: bool = False
-    """The start was refused for what servos replied, or did not reply."""
+    refused_for_replies: bool = False
+    """The start was refused for replies that came late or not at all."""
     simulation_wait: SimulationWait = SimulationWait()
 
 
@@ -298,8 +298,8 @@ def main() -> None:
         outcome = _run(plan, job, heartbeat, sinks, stalls)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
-        refused = isinstance(error, StartUpError)
-        outcome = LoopOutcome("start-up", sentences=error.sentences, refused=refused)
+        for_replies = isinstance(error, StartUpError) and error.for_replies
+        outcome = LoopOutcome("start-up", sentences=error.sentences, refused_for_replies=for_replies)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
     except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"

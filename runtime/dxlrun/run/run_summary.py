@@ -86,8 +86,8 @@ class RunSummary(msgspec.Struct, frozen=True):
     events: EventTotals = EventTotals()
     virtual: bool = False
     """It was on virtual time."""
-    refused: bool = False
-    """The start was refused for what servos replied, or did not reply."""
+    refused_for_replies: bool = False
+    """The start was refused for replies that came late or not at all."""
     start_up_load: MachineLoad = MachineLoad()
     """Of the machine before the first cycle, as far as the recorder has sampled it."""
     run_load: MachineLoad = MachineLoad()

@@ -490,7 +490,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         messages=run.messages,
         invalid=outcome.invalid,
         events=outcome.events,
-        refused=outcome.refused,
+        refused_for_replies=outcome.refused_for_replies,
         start_up_load=run.closed.start_up_load if run.closed else MachineLoad(),
         run_load=run.closed.run_load if run.closed else MachineLoad(),
         simulation_wait=outcome.simulation_wait,

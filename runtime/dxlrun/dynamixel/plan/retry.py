@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
@@ -14,6 +15,16 @@ LONGER_NS = 240_000_000
 """Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
 MOST_SILENCE_NS = 960_000_000
 """Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
+
+
+class ReplyTimes(msgspec.Struct):
+    """Lateness of the replies on one bus, as `extend_timeouts` observes it."""
+
+    late_ns: list[int] = []
+    """Time after the one due by the wire, without that in which simulated servos had no processor; of each
+    reply that can answer one request only."""
+    missing: int = 0
+    """Requests without a reply before their extended timeout."""
 
 
 def setup_line(plan: BusPlan) -> Line:
@@ -60,13 +71,12 @@ def limit_patience(
 
 
 def extend_timeouts(
-    program: Program[Result], most_ns: int = LONGER_NS, extra_ns: list[int] | None = None
+    program: Program[Result], most_ns: int = LONGER_NS, times: ReplyTimes | None = None
 ) -> Program[Result]:
     """Run a program of one bus with longer timeouts, as long as few replies are lost.
 
     A servo that answers late costs what it takes; a bus without any servo is reported within about two
-    seconds. `extra_ns` collects how much later than due by the wire each reply came that can answer
-    one request only, without the time in which simulated servos had no processor.
+    seconds. `times` collects how late replies came.
     """
     left_ns = MOST_SILENCE_NS
     try:
@@ -77,8 +87,10 @@ def extend_timeouts(
                 yield replace(request, timeout_ns=request.timeout_ns + longer_ns) if longer_ns else request
             )
             certain = reply.answered and reply.asked_ns == reply.sent_ns
-            if extra_ns is not None and request.awaited and certain:
-                extra_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)
+            if times is not None and request.awaited and certain:
+                times.late_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)
+            if times is not None and reply.outcome == Outcome.TIMEOUT:
+                times.missing += 1
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns
             request = program.send(reply)

@@ -23,7 +23,14 @@ from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, limit_patience, retry, setup_line
+from dxlrun.dynamixel.plan.retry import (
+    LONGER_NS,
+    ReplyTimes,
+    extend_timeouts,
+    limit_patience,
+    retry,
+    setup_line,
+)
 from dxlrun.dynamixel.port.remedies import choose_remedy, describe_late_start
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, first_reach, reach
@@ -65,8 +72,8 @@ class StartUp:
         self._lines = lines
         self._servos = servos
         self._events = events
-        self._late_ns: list[list[int]] = [[] for _ in lines.plans]
-        """How much later than by the wire the replies on each bus came."""
+        self._times = [ReplyTimes() for _ in lines.plans]
+        """Lateness of the replies on each bus."""
 
     def look(self, take_over: bool) -> None:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
@@ -74,7 +81,7 @@ class StartUp:
         self._run(lambda plan, found: survey(plan, take_over, found), found)
         self._run(survey_devices, found)
         self._judge(found)
-        _refuse(self._late_replies())
+        _refuse(self._late_replies(), for_replies=True)
         self.stage(settle_bus)
         settled = self.stage(modes.settle_modes)
         for servos, limits in zip(self._servos, settled, strict=True):
@@ -141,6 +148,8 @@ class StartUp:
         `most_ns`: how much longer than usual a reply is awaited on each line.
         """
         found = [Findings() for _ in self._plans]
+        for times in self._times:
+            times.missing = 0
         results = self._run(stage, found, most_ns)
         self._judge(found)
         return results
@@ -151,8 +160,8 @@ class StartUp:
         """Run one program a bus with longer timeouts, as nothing else waits."""
         most_ns = most_ns or [LONGER_NS] * len(found)
         slow = [
-            extend_timeouts(stage(plan, one), most, late_ns)
-            for plan, one, most, late_ns in zip(self._plans, found, most_ns, self._late_ns, strict=True)
+            extend_timeouts(stage(plan, one), most, times)
+            for plan, one, most, times in zip(self._plans, found, most_ns, self._times, strict=True)
         ]
         results = self._lines.run(slow)
         self.raise_failures()
@@ -161,11 +170,13 @@ class StartUp:
     def _judge(self, found: Iterable[Findings]) -> None:
         for one in found:
             one.log(self._events)
-        _refuse(problem for one in found for problem in one.problems)
+        missing = any(times.missing for times in self._times)
+        _refuse((problem for one in found for problem in one.problems), for_replies=missing)
 
     def _late_replies(self) -> Iterable[str]:
         """Name the buses whose replies usually come when the cyclic reads have given them up."""
-        for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
+        for plan, times in zip(self._plans, self._times, strict=True):
+            late_ns = times.late_ns
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
                 observed = describe_late_start(plan.name, plan.port, late_ns, plan.latency_ns)
@@ -274,9 +285,9 @@ def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
     return extra_ns
 
 
-def _refuse(problems: Iterable[str]) -> None:
+def _refuse(problems: Iterable[str], *, for_replies: bool) -> None:
     if found := "\n".join(problems):
-        raise StartUpError(found)
+        raise StartUpError(found, for_replies=for_replies)
 
 
 def _first_goals(goals: Commands, servo: ServoPlan, raw: int | None) -> None:
