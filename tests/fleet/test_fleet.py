@@ -42,7 +42,7 @@ from dxlrun_fleet.fleet_view import SILENT_S, RobotView, Seen, fleet_table
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
-Closing = TypeVar("Closing", RobotView, socket.socket)
+Closing = TypeVar("Closing", RobotView, NetworkLink, socket.socket)
 INFO = RobotInfo("joint", 50.0, False, None, 0, 0, (), {}, {}, {}, {}, {}, (), (), "x.yaml", None)
 ADDRESS = Address("lab3", "127.0.0.1", 1)
 TERMINAL = {"TERM": "xterm", "COLUMNS": "120", "LINES": "30"}
@@ -125,12 +125,15 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
         lambda: (seen := views["joint"].seen()).reason.startswith("joint no longer answers: ") and seen
     )
     assert (row.state, row.voltage, row.temperature, row.hottest) == ("unreachable", None, None, "")
-    until(lambda: "log: " in (lab.parent / "joint.out").read_text(), "the run's last line")
+    link = closed(NetworkLink(fleet.agents["lab3"].address, "test"))
+    until(lambda: link.exchange("GET", f"{START}joint", None)[0] == 410, "the end of the run's processes")
+    assert "log: " in (lab.parent / "joint.out").read_text()
     said = dxlrun("fleet", lab, "--stop", "joint")
     assert (said.code, len(said.errors)) == (1, 1)
     assert "Connection refused" in said.errors[0]
 
-    assert dxlrun("fleet", lab, "--start", "joint").code == 0
+    said = dxlrun("fleet", lab, "--start", "joint")
+    assert (said.code, said.out) == (0, "joint runs\n"), said.err
     until(lambda: views["joint"].seen().state == "running", "it runs again")
     said = dxlrun("fleet", lab, "--stop", "joint", "--json")
     assert result_of(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
