@@ -102,7 +102,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "torque_lost": Rule(
         "servo",
-        "Torque Enable is 0, and nobody asked for it",
+        "Torque Enable is 0 without a request",
         "once",
         "Look for overload, heat, low voltage: `dxlrun servo {port} {servo_id} get` has its errors.",
     ),

@@ -129,8 +129,8 @@ def test_without_a_log_in_the_directory_one_sentence_names_the_directory(
 
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: there is no log in {tmp_path}/logs; give the path of one, or change to the directory where "
-        "the robot was run"
+        f"dxlrun: there is no log in {tmp_path}/logs; give the path of a log, or change to the directory "
+        "where the robot was run"
     ]
 
 

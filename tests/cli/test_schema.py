@@ -9,12 +9,16 @@ from typing import Any, Literal, get_args
 
 import pytest
 from jsonschema import Draft202012Validator
+from msgspec import structs
 from pydantic import BaseModel
 
 from dxlrun.cli.app import run_tokens
 from dxlrun.cli.examples import schema_text
+from dxlrun.control.controllers import plugins
+from dxlrun.control.controllers.plugins import Offer, Offers
 from dxlrun.description.document import grow, literal, parse
 from dxlrun.description.json_schema import robot_schema
+from dxlrun.errors import PlugInError
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT = """\
@@ -57,6 +61,18 @@ def wrong(kind: Kind, text: str) -> list[str]:
 @functools.cache
 def validator_of(kind: Kind) -> Draft202012Validator:
     return Draft202012Validator(json.loads(schema_text(kind)))
+
+
+def test_a_type_that_cannot_be_imported_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails() -> Offer:
+        raise PlugInError("cannot be imported: no module named nothing")
+
+    found = plugins.load_plugins()
+    makes = {name: functools.partial(found.controllers.__getitem__, name) for name in found.controllers}
+    broken = structs.replace(found, controllers=Offers({"nothing": fails, **makes}, {}))
+    usual = schema_text("robot")
+    monkeypatch.setattr(plugins, "load_plugins", lambda: broken)
+    assert schema_text("robot") == usual
 
 
 @pytest.mark.parametrize("kind", get_args(Kind))

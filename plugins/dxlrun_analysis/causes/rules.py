@@ -1,4 +1,4 @@
-"""What made cycles too long: rules of the verdict about the loop.
+"""Rules of the verdict about the loop: what made cycles too long.
 
 A cause is a finding when it has at least half of what long cycles took beyond their planned exchanges, and a
 part of three cycles at least: one stall of a machine accuses nothing. Late and missing replies are left to

@@ -160,8 +160,8 @@ def newest_log() -> Path:
     if logs:
         raise InputError(f"{logs[0]} is being written; end the run, or give this path to analyze it so far")
     raise InputError(
-        f"there is no log in {directory.absolute()}; give the path of one, or change to the directory where "
-        "the robot was run"
+        f"there is no log in {directory.absolute()}; give the path of a log, or change to the directory "
+        "where the robot was run"
     )
 
 

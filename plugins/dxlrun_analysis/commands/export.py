@@ -70,7 +70,7 @@ def export(
 
 
 def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str] | None:
-    """Return the topics that the format cannot have, with reasons; None of a format that is no table."""
+    """Return the topics that have no table, with reasons; None where the format has no tables."""
     if to not in ("csv", "parquet"):
         return None
     from dxlrun_analysis.export.parquet import has_file

@@ -2,7 +2,6 @@
 
 `SimulationProgress` is the same for the process of simulated servos: how far it has served each line.
 
-
 Each field has one writer: the supervisor for `supervisor_looks` and `steering`, the guardian for `looks`,
 and the loop's process for the others. Each field is one aligned 64-bit store through a cast memoryview,
 which 64-bit processors make whole. (`struct.pack_into` would not do: it clears its target first, and a

@@ -216,16 +216,16 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
     else:
         from dxlrun.control.controllers.plugins import load_plugins
 
-        found = load_plugins()
+        found = load_plugins()  # one whose class cannot be imported has no parameters to show
         controllers = {
             name: offer.controller.Parameters
-            for name, offer in found.controllers.items()
-            if offer.distribution.startswith(only)
+            for name in found.controllers
+            if (offer := found.controllers.get(name)) and offer.distribution.startswith(only)
         }
         sensors = {
-            name: offer.sensor.Parameters
-            for name, offer in found.sensors.items()
-            if offer.distribution.startswith(only)
+            name: sensor.sensor.Parameters
+            for name in found.sensors
+            if (sensor := found.sensors.get(name)) and sensor.distribution.startswith(only)
         }
         of_kind = robot_schema if kind == "robot" else fragment_schema
         made = of_kind(controllers, sensors)
