@@ -1,89 +1,288 @@
-"""Size of the house: lines, files, functions, classes and data classes, and rooms that import each other.
+"""House: the reach of features, the imports of packages from inside the core, and the size of each room.
 
-    python tests/bench/house.py [COMMIT]
+    python tests/bench/house.py [COMMIT] [--names]
 
-of the working tree, or of a commit. Lines are all lines of Python and C, docstrings and comments included.
+Measures a commit, or the working tree without one (its feature commits are those of HEAD). Every commit is
+measured by the same rules, so that two of them can be compared. `--names` also lists what was counted: the
+feature commits, the imported names, the files and the functions.
+
+- **Product** is Python and C in `runtime/` and `plugins/`, docstrings and comments included, without folders
+  `tests/`. **Tests** are `tests/` and the folders `tests/` of packages.
+- **A room** is `dxlwire`, `dxlsim`, a package or a module of `dxlrun`, one feature of `dxlrun/features`, or a
+  package in `plugins/`.
+- **A feature commit** adds at least 40 product lines and removes at most a third of what it adds. Renamed
+  files do not count. The last 40 of them are shown.
+- **A name from inside** is imported by a package from a module of dxlrun, dxlwire or dxlsim that is not a
+  face. The faces are `dxlrun` and `dxlrun.tooling`, and `dxlwire` and `dxlsim` themselves. A name is
+  counted once a package (`in each file`: once a file), also inside functions and for type checking.
+- **A mention** is a match of a feature's pattern (`MENTIONS`) in code: not in a docstring, a comment or a
+  text with blanks, such as a message. A feature's own folder is not counted, nor are tests.
+- **A function without an object** is a public function or method whose name is one of `BARE_VERBS`.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
+import io
+import re
+import statistics
 import subprocess
-import sys
-from collections import Counter, defaultdict
-from collections.abc import Iterator
+import tarfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-PARTS = {
-    "product": ("runtime/", "plugins/"),
-    "core": ("runtime/dxlrun/",),
-    "tests": ("tests/",),
+CODE = (".py", ".pyi", ".c", ".h")
+LAST = 40
+LIBRARIES = ("dxlrun", "dxlwire", "dxlsim")
+FACES = ("dxlrun", "dxlrun.tooling", "dxlwire", "dxlsim")
+
+
+class Mention(NamedTuple):
+    """A feature: the pattern of its identifiers and keys, and its folder below `runtime/dxlrun/features/`."""
+
+    pattern: str
+    folder: str = ""
+    elsewhere: str = r"$^"
+    """Pattern of paths in which these words have another meaning."""
+
+
+MENTIONS = {
+    "device command": Mention(r"(?i)device_?commands?", "devices"),
+    "transmission, coupling": Mention(
+        r"(?i)transmission|coupling",
+        "mechanics",
+        r"(dxlsim|simulation)/bus/",  # bytes on a line
+    ),
+    "sensor source": Mention(
+        r"SourcePlan|SourceStates|SensorSource|sensor_source"
+        r"|source_(states?|valid|age|slice|values|names)|\b(layout|record|loop|plan|header|states)\.sources\b",
+        "sensors",
+    ),
+    "register declaration": Mention(
+        r"\b(servo|joint|described|desired|own)\.registers\b(?! import)|registers: dict\[ItemName|'registers'"
+        r"|compile_registers|declared_registers|declarable|steered_value|RegisterDifference",
+        "registers",
+        r"(dxlsim|simulation)/",  # the memory of a simulated servo
+    ),
 }
-DATA = ("dataclass", "Struct", "BaseModel", "NamedTuple", "Form")
-"""Words by which a class is one that carries data: its decorator or one of its bases."""
+LINEAR = Mention(r"\.linear\b(?!\.)|\blinear: bool|\blinear: tuple\[bool|\blinear=")
+"""Asks whether a joint is linear. The linear part of a twist (`twist.linear.x`) does not."""
+BARE_VERBS = frozenset(
+    word
+    for line in (
+        "accept act adopt advance answer apply ask begin check clear collect commit compare decide",
+        "describe draw drop emit end engage enter execute expire fail feed fill find finish follow forget",
+        "get give hand hear hold inspect judge known learn leave listen look make measure mend merge move",
+        "note of perform place play poll post prepare protect put reach read receive recount refuse",
+        "release renew repeat require rest resume say see serve set settle show shown step take tell",
+        "touch turn unload wait watch write written",
+    )
+    for word in line.split()
+)
+"""Verbs, and words in place of one, that say nothing without an object.
+
+Not in the list: words with one meaning for every reader (`append`, `close`, `flush`, `main`, `open`, `parse`,
+`run`, `scan`, `send`, `start`, `stop`, `update`), and nouns, such as `rows`.
+"""
 
 
-def sources(commit: str) -> Iterator[tuple[str, str]]:
-    """Yield path and text of each source file."""
-
-    def git(*words: str) -> str:
-        command = ["git", *words]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-
-    tracked = git("ls-tree", "-r", "--name-only", commit) if commit else git("ls-files")
-    for path in tracked.splitlines():
-        if path.endswith((".py", ".pyi", ".c")) and path.startswith(("runtime/", "plugins/", "tests/")):
-            yield path, git("show", f"{commit}:{path}") if commit else (ROOT / path).read_text()
+def git(*words: str) -> bytes:
+    """Return the output of a git command in this repository."""
+    command = ["git", *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
 
 
-def is_data(node: ast.ClassDef) -> bool:
-    """Return whether a class carries data."""
-    made_of = (*node.decorator_list, *node.bases)
-    return any(word in ast.unparse(one) for one in made_of for word in DATA)
+def read_sources(commit: str) -> dict[str, str]:
+    """Return the text of each source file of a commit, or of the working tree, by its path."""
+    folders = ("runtime", "plugins", "tests")
+    if not commit:
+        tracked = git("ls-files", *folders).decode().splitlines()
+        return {path: (ROOT / path).read_text() for path in tracked if path.endswith(CODE)}
+    with tarfile.open(fileobj=io.BytesIO(git("archive", commit, *folders))) as tar:
+        files = {member.name: tar.extractfile(member) for member in tar if member.name.endswith(CODE)}
+        return {path: file.read().decode() for path, file in files.items() if file is not None}
 
 
-def circle(imports: dict[str, set[str]]) -> set[str]:
-    """Return the rooms that can be reached from themselves."""
-
-    def reached(room: str) -> set[str]:
-        found: set[str] = set()
-        left = [*imports[room]]
-        while left:
-            one = left.pop()
-            if one not in found:
-                found.add(one)
-                left += imports[one]
-        return found
-
-    return {room for room in [*imports] if room in reached(room)}
+def is_product(path: str) -> bool:
+    """Return whether a source file is part of the product."""
+    return path.startswith(("runtime/", "plugins/")) and path.endswith(CODE) and "/tests/" not in path
 
 
-def main(commit: str = "") -> None:
-    """Print a row for each part of the house, and the rooms that import each other."""
-    counts: dict[str, Counter[str]] = {part: Counter() for part in PARTS}
-    imports: dict[str, set[str]] = defaultdict(set)
-    for path, text in sources(commit):
-        found = Counter(lines=text.count("\n"), files=1)
-        nodes = list(ast.walk(ast.parse(text))) if path.endswith(".py") else []
-        classes = [node for node in nodes if isinstance(node, ast.ClassDef)]
-        found["functions"] = sum(isinstance(node, ast.FunctionDef) for node in nodes)
-        found["classes"], found["data classes"] = len(classes), sum(map(is_data, classes))
-        for part, folders in PARTS.items():
-            if path.startswith(folders):
-                counts[part] += found
-        room = path.removeprefix("runtime/dxlrun/").split("/")[0]
-        if path.startswith("runtime/dxlrun/"):
-            named = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-            of = {name.split(".")[1] for name in named if name.startswith("dxlrun.")}
-            imports[room.removesuffix(".py")] |= of - {room.removesuffix(".py")}
-    columns = ("lines", "files", "functions", "classes", "data classes")
-    print(f"{'':8}" + "".join(f"{name:>14}" for name in columns))
-    for part, count in counts.items():
-        print(f"{part:8}" + "".join(f"{count[name]:14,}" for name in columns))
-    around = sorted(circle(imports))
-    print(f"rooms that import each other: {len(around)} of {len(imports)}: {', '.join(around) or '-'}")
+def room_of(path: str) -> str:
+    """Return the room of a product file."""
+    base, *parts = path.split("/")
+    if base == "plugins" or parts[0] != "dxlrun":
+        return parts[0]
+    depth = 3 if parts[1] == "features" else 2
+    return "/".join(parts[:depth] if len(parts) > depth else parts).removesuffix(".py")
+
+
+class FeatureCommit(NamedTuple):
+    """One commit that adds a feature."""
+
+    subject: str
+    added: int
+    removed: int
+    files: frozenset[str]
+
+    @property
+    def rooms(self) -> set[str]:
+        """Rooms of its files."""
+        return {room_of(path) for path in self.files}
+
+    @property
+    def folders(self) -> set[str]:
+        """Folders of its files."""
+        return {path.rpartition("/")[0] for path in self.files}
+
+
+def feature_commits(commit: str) -> Iterator[FeatureCommit]:
+    """Yield the feature commits up to a commit, newest first."""
+    log = git("log", "--no-merges", "-M", "--numstat", "--format=@%h %s", commit or "HEAD").decode()
+    for entry in re.split(r"^@", log, flags=re.MULTILINE)[1:]:
+        subject, *lines = entry.splitlines()
+        changes = [line.split("\t", 2) for line in lines if line.strip()]
+        counted = [each for each in changes if is_product(each[2]) and "=>" not in each[2] and each[0] != "-"]
+        added, removed = (sum(int(each[column]) for each in counted) for column in (0, 1))
+        if added >= 40 and added >= 3 * removed:
+            yield FeatureCommit(subject, added, removed, frozenset(each[2] for each in counted))
+
+
+def imported_names(texts: dict[str, str]) -> Iterator[tuple[str, str, bool]]:
+    """Yield path, name and whether it is from a face, of each name that a package imports from a library."""
+    modules = {re.sub(r"(/__init__)?\.pyi?$", "", path.removeprefix("runtime/")) for path in texts}
+    for path, text in texts.items():
+        if not path.startswith("plugins/") or not path.endswith(".py"):
+            continue
+        names: set[tuple[str, str]] = set()  # module and name
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import):
+                names |= {(alias.name, "") for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                names |= {(str(node.module), alias.name) for alias in node.names}
+        for module, name in names:
+            whole = f"{module}.{name}".rstrip(".")
+            of_face = module in FACES and whole.replace(".", "/") not in modules
+            if module.split(".")[0] in LIBRARIES:
+                yield path, whole, of_face or whole in FACES
+
+
+class _Code(ast.NodeTransformer):
+    """Empties docstrings and all other texts with blanks."""
+
+    def visit_Constant(self, node: ast.Constant) -> ast.Constant:
+        prose = isinstance(node.value, str) and re.search(r"\s", node.value)
+        return ast.copy_location(ast.Constant(""), node) if prose else node
+
+
+def code_of(path: str, text: str) -> str:
+    """Return a file's code without comments, docstrings and texts with blanks."""
+    if path.endswith((".py", ".pyi")):
+        return ast.unparse(_Code().visit(ast.parse(text)))
+    return re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
+
+
+def mentioning(codes: dict[str, str], mention: Mention) -> list[str]:
+    """Return the files outside a feature's folder whose code mentions it."""
+    own = f"runtime/dxlrun/features/{mention.folder}/" if mention.folder else "\n"
+    found = (path for path, code in codes.items() if re.search(mention.pattern, code))
+    return [path for path in found if not path.startswith(own) and not re.search(mention.elsewhere, path)]
+
+
+def bare_functions(texts: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield path and name of each public function or method whose name is a bare verb."""
+    for path, text in texts.items():
+        for holder in ast.walk(ast.parse(text if path.endswith(".py") else "")):
+            for node in holder.body if isinstance(holder, ast.Module | ast.ClassDef) else ():
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name in BARE_VERBS:
+                    yield path, node.name
+
+
+def print_rows(title: str, heads: Iterable[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print a table: a title, the heads of its columns of numbers, and its rows."""
+    print(f"\n{title:40}" + "".join(f"{head:>14}" for head in heads))
+    for name, *values in rows:
+        numbers = (f"{each:14,}" if isinstance(each, int) else f"{each:>14}" for each in values)
+        print(f"{name:40}" + "".join(numbers))
+
+
+def print_reach(features: list[FeatureCommit], *, names: bool) -> None:
+    """Print files, rooms and folders of feature commits."""
+    if names:
+        for one in features:
+            counts = f"{len(one.files):3} files {len(one.rooms):2} rooms {len(one.folders):2} folders"
+            print(f"{counts}  +{one.added} -{one.removed}  {one.subject[:80]}")
+    spans = {
+        "files": [len(one.files) for one in features],
+        "rooms": [len(one.rooms) for one in features],
+        "folders": [len(one.folders) for one in features],
+    }
+    print_rows(
+        f"Reach of the last {len(features)} feature commits",
+        ("median", "mean", "most", "share of one"),
+        [
+            (
+                name,
+                f"{statistics.median(counts):g}",
+                f"{statistics.mean(counts):.1f}",
+                max(counts),
+                f"{100 * counts.count(1) / len(counts):.0f} %",
+            )
+            for name, counts in spans.items()
+        ],
+    )
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("commit", nargs="?", default="", metavar="COMMIT")
+    parser.add_argument("--names", action="store_true", help="also list what was counted")
+    options = parser.parse_args()
+    texts = read_sources(options.commit)
+    product = {path: text for path, text in texts.items() if is_product(path)}
+    codes = {path: code_of(path, text) for path, text in product.items()}
+
+    def listed(words: Iterable[str]) -> None:
+        if options.names:
+            print(*(f"    {word}" for word in sorted(words)), sep="\n")
+
+    print_reach([*feature_commits(options.commit)][:LAST], names=options.names)
+
+    imports = [*imported_names(product)]
+    inside = [(path.split("/")[1], name) for path, name, of_face in imports if not of_face]
+    faces = [(path.split("/")[1], name) for path, name, of_face in imports if of_face]
+    counts = [Counter(package for package, _ in each) for each in (set(inside), inside, set(faces))]
+    packages = sorted({path.split("/")[1] for path in product if path.startswith("plugins/")})
+    rows: list[Sequence[object]] = [(package, *(count[package] for count in counts)) for package in packages]
+    totals = ("in all", *(count.total() for count in counts))
+    print_rows("Names that packages import", ("from inside", "in each file", "from faces"), [*rows, totals])
+    listed(f"{package}: {name}" for package, name in set(inside))
+
+    print_rows("Files that mention", ("files", "rooms"), [])
+    for name, mention in {**MENTIONS, "whether a joint is linear": LINEAR}.items():
+        files = mentioning(codes, mention)
+        print(f"{name:40}{len(files):14}{len({room_of(path) for path in files}):14}")
+        listed(files)
+
+    bare = [*bare_functions(product)]
+    often = Counter(name for _, name in bare).most_common(10)
+    print_rows("Public functions without an object", ("functions",), [("in all", len(bare)), *often])
+    listed(f"{path}: {name}" for path, name in bare)
+
+    lines: Counter[str] = Counter()
+    in_room = Counter(room_of(path) for path in product)
+    for path, text in product.items():
+        lines[room_of(path)] += text.count("\n")
+    print_rows("Rooms", ("lines", "files"), [(room, lines[room], in_room[room]) for room in sorted(in_room)])
+    tests = [text.count("\n") for path, text in texts.items() if path not in product]
+    whole = [("product", lines.total(), len(product)), ("tests", sum(tests), len(tests))]
+    print_rows("The whole", ("lines", "files"), whole)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
