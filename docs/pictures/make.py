@@ -43,13 +43,13 @@ COLOURS = 48
 """Of a PNG, so that it is small."""
 MISTAKES = """name: arm
 buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: ftdi}, return_delay_time: 0 us}
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: fdti}, return_delay_time: 0 us}
 loop: {rate: 1000}
 joints:
-  base: {bus: mian, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
-  elbow: {bus: main, id: 2, model: XL430-W205, reference: 180, direction: 1, limit: {velocity: 60 deg/s}}
+  base: {bus: main, id: "1", model: XL430-W250, reference: 180 deg, direction: 1}
+  elbow: {bus: main, id: 2, model: XL430-W250, reference: 180, direction: 1, limit: {velocity: 60 deg/s}}
 controllers:
-  arm: {type: joint_trajectory_controler, joints: [base, elbow]}
+  arm: {type: joint_trajectory_controller, joints: [base, elbow], active: on}
 """
 
 

@@ -21,7 +21,7 @@ joints:
   left_joint: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
   neck_joint: {bus: mian, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
   back_joint: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
-  tail_joint: {bus: main, id: 4, model: AX-12A, reference: 150, direction: 1}
+  tail_joint: {bus: main, id: 4, model: AX-12B, reference: 150 deg, direction: 1}
 """
 
 

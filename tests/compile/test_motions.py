@@ -122,10 +122,14 @@ def test_motion_for_a_controller_that_still_plays_another_one_is_refused():
     assert "gets this motion at 2.1 s, while it still plays that of" in problem.what
 
 
-def test_problems_of_robot_and_motion_files_come_together():
-    found = problems_in(PAIR.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
+def test_mistakes_of_form_of_robot_and_motion_are_reported_together_and_before_others():
+    motion = POSVEL.replace("controller: arms", "controller: amrs", 1)
+    assert motion != POSVEL
 
-    assert sorted(Path(p.mark.file).name for p in found) == ["motion0.yaml", "robot.yaml"]
+    found = problems_in(PAIR.replace("id: 2", "id: 999"), motion + "x: 1\n")
+    assert [Path(p.mark.file).name for p in found] == ["robot.yaml", "motion0.yaml"]
+    assert [p.what for p in problems_in(PAIR, motion + "x: 1\n")] == ["the file has an unknown key 'x'"]
+    assert [p.what for p in problems_in(PAIR, motion)] == ["the robot has no controller amrs"]
 
 
 def many(samples: int, formula: str = "sin(t)") -> str:
@@ -217,20 +221,3 @@ def test_a_formula_faster_than_the_servo_is_refused():
     (problem,) = problems_in(SPARE_ACTIVE, fast)
     assert problem.severity == "error"
     assert "right_arm_joint is asked for 9 rad/s" in problem.what
-
-
-def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed():
-    text = PAIR.replace("arms:\n", "arms:\n    active: maybe\n")
-    motion = """\
-    name: m
-    motions:
-      - {controller: arms, duration: 1 s, samples: 2, joints: {left_arm_joint: {position: t}}}
-      - {controller: amrs, duration: 1 s, samples: 2, joints: {left_arm_joint: {position: t +}}}
-    """
-
-    found = [p.what for p in problems_in(text, motion)]
-
-    assert len(found) == 3
-    assert "formula 't +' cannot be read" in found[0] + found[1]
-    assert "no controller amrs" in found[0] + found[1]
-    assert "active is the text 'maybe'" in found[2]

@@ -177,13 +177,11 @@ def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain() -> None:
     assert problems_in(text) == ()
 
 
-def test_the_mistakes_of_both_files_are_told_at_once_and_each_once() -> None:
+def test_mistakes_of_a_motor_file_of_two_joints_are_reported_once_with_those_of_the_robot() -> None:
     MOTOR_FILE.write_text(motor_text(MOTOR, {}).replace("12 V", "12 A") + "x: 1\n")
-    text = ROBOT.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}").replace(
-        "rate: 200", "rate: 0"
-    )
+    text = ROBOT.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}").replace("id: 2", "id: 1")
     assert [(Path(each.mark.file).name, each.mark.line) for each in problems_in(text)] == [
-        ("robot.yaml", 4),
+        ("robot.yaml", 7),
         ("shoulder.yaml", 3),
         ("shoulder.yaml", 15),
     ]

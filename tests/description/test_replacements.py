@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from tests.kit import desk
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.reading import Replacement, survey_robot
+from dxlrun.description.reading import Replacement, read_robot
 
 TEXT = """name: one
 arguments:
@@ -33,19 +34,16 @@ def test_a_value_is_replaced_in_a_mapping_in_a_list_and_where_an_argument_stands
         Replacement(("joints", "joint", "limits", "position", 1), "1 rad"),
         Replacement(("loop", "rate"), 80),
     ]
-    description = survey_robot(robot, {}, replacements).description
-    assert description is not None
+    description = read_robot(robot, {}, replacements)
     assert description.robot.joints["joint"].limits.position == (pytest.approx(-1.5707963267948966), 1.0)
     assert description.robot.loop.rate == 80.0
-    untouched = survey_robot(robot, {}).description
-    assert untouched is not None
+    untouched = read_robot(robot, {})
     assert untouched.robot.loop.rate == 50.0
 
 
 def test_a_value_is_put_where_the_file_has_none(robot: Path) -> None:
     place: KeyPath = ("joints", "joint", "registers", "d_gain")
-    description = survey_robot(robot, {}, [Replacement(place, 8)]).description
-    assert description is not None
+    description = read_robot(robot, {}, [Replacement(place, 8)])
     assert description.robot.joints["joint"].registers == {"d_gain": 8}
 
 
@@ -61,5 +59,5 @@ def test_a_value_is_put_where_the_file_has_none(robot: Path) -> None:
 def test_what_is_wrong_with_it_is_reported_at_its_place(
     robot: Path, place: KeyPath, value: object, problem: str
 ) -> None:
-    (found,) = survey_robot(robot, {}, [Replacement(place, value)]).problems
-    assert str(found).startswith(problem)
+    (found,) = desk.caught(lambda: read_robot(robot, {}, [Replacement(place, value)]))
+    assert found.startswith(problem)

@@ -163,44 +163,11 @@ def test_ten_mistakes_give_ten_errors_with_their_places() -> None:
     ]
 
 
-def test_a_survey_keeps_what_is_right_for_further_checks() -> None:
-    text = TORSO.replace("id: 1,", "id: 999,").replace("rate: ${rate}", "rate: ${rat}").replace("3 s", "3")
-    survey = desk.survey(text + "sensors: 5\n")
-    assert len(survey.problems) == 4
-    description = survey.description
-    assert set(description.robot.joints) == {"elbow", "swing"}
-    assert (description.robot.joints["swing"].id, survey.otherwise.robot.joints["swing"].id) == (0, 1)
-    assert (description.robot.loop.rate, survey.otherwise.robot.loop.rate) == (1.0, 1000.0)
-    assert description.robot.policies.exit_timeout == 2_000_000_000
-    assert description.left_out == {
-        ("loop", "rate"),
-        ("policies", "exit_timeout"),
-        ("sensors",),
-    }
-    assert set(description.robot.controllers) == {"broadcaster", "arm"}
-
-
-def test_a_survey_of_a_right_file_leaves_nothing_out() -> None:
-    survey = desk.survey(TORSO)
-    assert survey.problems == ()
-    assert survey.otherwise is None
-    assert survey.description == desk.robot(TORSO)
-    assert survey.description.left_out == frozenset()
-
-
-def test_a_survey_says_when_too_little_is_right() -> None:
-    survey = desk.survey("joints: 5\n")
-    assert survey.description is None
-    assert len(survey.problems) == 4
-
-
-def test_controllers_and_loop_that_are_no_mappings_are_left_out() -> None:
+def test_entry_and_section_that_are_not_mappings_are_reported_together() -> None:
     head = TORSO[: TORSO.index("controllers:")]
-    survey = desk.survey(head.replace("loop:\n", "loop: 50\nlop:\n") + "controllers: {a: 5}\n")
-    assert [problem.what for problem in survey.problems] == [
+    found = desk.refusals(head.replace("loop:\n", "loop: 50\nlop:\n") + "controllers: {a: 5}\n")
+    assert [one.split(": ", 1)[1].partition(";")[0] for one in found] == [
         "loop is 50, but must be a mapping",
         "the file has an unknown key 'lop'",
         "controllers.a is 5, but must be a mapping",
     ]
-    assert survey.description.left_out == {("loop",), ("lop",), ("controllers", "a")}
-    assert survey.description.robot.controllers == {}

@@ -9,7 +9,7 @@ import pytest
 from tests.kit.robots import robot_text
 
 from dxlrun.description.motion import MotionDescription, read_motion
-from dxlrun.description.reading import Description, Survey, read_robot, survey_robot
+from dxlrun.description.reading import Description, read_robot
 from dxlrun.errors import InputError
 
 TORSO = robot_text("torso")
@@ -26,11 +26,6 @@ def write(text: str | bytes, name: str = "robot.yaml") -> Path:
 def robot(text: str, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Description:
     """Read a robot file that is right."""
     return read_robot(write(text), arguments)
-
-
-def survey(text: str, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Survey:
-    """Read as much of a robot file as can be."""
-    return survey_robot(write(text), arguments)
 
 
 def motion(text: str) -> MotionDescription:

@@ -15,7 +15,7 @@ from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import report_speed
-from dxlrun.compile.problems import RobotFile, into_mark, joint_mark, left_out_names
+from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import Interfaces, SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.graph import below
@@ -211,8 +211,7 @@ def _check_graph(
     known = {*compiled, *(source.name for source in sources)}
     robot = file.robot
     named = (*(plan.name for plan in plans), *robot.devices, *robot.sensors)
-    left_out = (*left_out_names(file.description, "devices"), *left_out_names(file.description, "sensors"))
-    incomplete = frozenset(name for name in (*named, *left_out) if name not in known)
+    incomplete = frozenset(name for name in named if name not in known)
     by_name = {plan.name: plan for plan in plans}
     graph = ControllerGraph(tuple(robot.joints), plans, sources, incomplete)
     for mistake in graph.mistakes():

@@ -1,16 +1,10 @@
-"""Problems of a robot file: collected by all checks, each at its place in the file.
-
-Parts of a wrong form were reported when the file was read and are left out of its description, or guessed
-where a robot needs them, so that mistakes of form and of meaning are listed together. Problems that only
-follow from what was left out are dropped.
-"""
+"""Problems of a robot file whose form is right: collected by all checks, each at its place in the file."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.joints.joints import ServoJoint
 from dxlrun.description.reading import Description
 from dxlrun.errors import InputError, Mark, Problem, told_once
 
@@ -105,49 +99,3 @@ def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
     elif isinstance(value, list):
         for index, item in enumerate(value):
             yield from _texts(item, (*path, index))
-
-
-def left_out_names(description: Description, section: str) -> tuple[str, ...]:
-    """Return the names of the entries of a section (buses, joints, controllers) that were left out."""
-    return tuple(str(path[1]) for path in description.left_out if len(path) == 2 and path[0] == section)
-
-
-def independent_errors(description: Description, problems: Iterable[Problem]) -> tuple[Problem, ...]:
-    """Return the errors that do not follow from what was left out of a description."""
-    following = set(_following(description))
-    return tuple(p for p in problems if p.severity == "error" and p.mark not in following)
-
-
-def _following(description: Description) -> Iterator[Mark]:
-    """Yield the places whose problems may follow from what was left out."""
-    robot, marks = description.robot, description.marks
-    buses, joints = left_out_names(description, "buses"), left_out_names(description, "joints")
-    for name, joint in robot.joints.items():
-        if isinstance(joint, ServoJoint) and (joint.bus in buses or ("buses",) in description.left_out):
-            yield marks.value("joints", name, "bus")
-    for name, pose in robot.poses.items():
-        yield from (marks.key("poses", name, joint) for joint in pose if joint in joints)
-    poses = ("poses",) in description.left_out or left_out_names(description, "poses")
-    if poses or joints:  # steps that use them may be too few, or too short
-        for name, policy in robot.policies:
-            yield marks.value("policies", name)
-            for index in range(len(policy) if isinstance(policy, tuple) else 0):
-                yield marks.value("policies", name, index)
-                if poses:
-                    yield marks.value("policies", name, index, "pose")
-    yield from _following_controllers(description)
-    for name, controller in robot.controllers.items():
-        for path, text in _texts(controller.parameters, ("controllers", name)):
-            if text in joints:
-                yield marks.value(*path)
-
-
-def _following_controllers(description: Description) -> Iterator[Mark]:
-    """Yield the places that name controllers which were left out."""
-    marks, controllers = description.marks, left_out_names(description, "controllers")
-    for name, controller in description.robot.controllers.items():
-        if controller.fallback in controllers:
-            yield marks.value("controllers", name, "fallback")
-        for index, lower in enumerate(controller.into):
-            if lower in controllers:
-                yield into_mark(description, name, index)

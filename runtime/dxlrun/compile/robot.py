@@ -32,14 +32,15 @@ from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
-from dxlrun.compile.problems import RobotFile, independent_errors, left_out_names
+from dxlrun.compile.problems import RobotFile
 from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.sensors import compile_sensors, sensor_source
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
+from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.joints.joints import Joint
-from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
+from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.plan.bus_plan import BusPlan
@@ -89,52 +90,37 @@ def compile_files(
     *,
     replacements: Sequence[Replacement] = (),
 ) -> Compiled:
-    """Read robot file and motion files and compile them; raises InputError with the problems of all files.
+    """Read robot file and motion files and compile them.
 
     `replacements` stand in for values of the robot file. Only when nothing is wrong, the models of servos on
     real ports with `model: auto` are read by `ask`, if it is given.
+
+    Raises:
+        InputError: All problems of form of all files; if there are none, all problems that the checks find.
     """
+    description: Description | None = None
+    groups: Groups = NO_GROUPS
     read: list[MotionDescription] = []
-    survey = Survey(None, ())
     problems: list[Problem] = []
     try:
-        survey = survey_robot(robot, arguments, replacements)
-        problems += survey.problems
+        description = read_robot(robot, arguments, replacements)
+        groups = description.groups
     except InputError as error:
-        problems += _placed(error)
-    groups = {} if survey.description is None else survey.description.groups
+        problems += error.problems
     for path in motions:
         from dxlrun.description.motion import read_motion  # not above: most checks and runs play none
 
         try:
             read.append(read_motion(path, groups))
         except InputError as error:
-            problems += _placed(error)
-    description = survey.description
-    if not problems and description is not None:
-        compiled = compile_robot(description, read, duration_ns)
-        unknown = _unknown(description)
-        if ask is None or not unknown:
-            return compiled
-        return compile_robot(description, read, duration_ns, ask(compiled.plan.buses, unknown))
-    if description is not None:
-        found = _problems_of(description, read, duration_ns)
-        if survey.otherwise is not None:
-            also = {(one.mark, one.what) for one in _problems_of(survey.otherwise, read, duration_ns)}
-            found = [problem for problem in found if (problem.mark, problem.what) in also]
-        problems += found
-    raise InputError(sorted(problems, key=lambda problem: (problem.severity, problem.mark)))
-
-
-def _problems_of(
-    description: Description, motions: Sequence[MotionDescription], duration_ns: int | None
-) -> list[Problem]:
-    """Return the errors of a survey's description that do not follow from what was left out of it."""
-    try:
-        compile_robot(description, motions, duration_ns)
-    except InputError as error:
-        return [*independent_errors(description, _placed(error))]
-    return []
+            problems += error.problems
+    if description is None or problems:
+        raise InputError(problems)
+    compiled = compile_robot(description, read, duration_ns)
+    unknown = _unknown(description)
+    if ask is None or not unknown:
+        return compiled
+    return compile_robot(description, read, duration_ns, ask(compiled.plan.buses, unknown))
 
 
 def _unknown(description: Description) -> list[str]:
@@ -145,13 +131,6 @@ def _unknown(description: Description) -> list[str]:
         for name, joint in robot.joints.items()
         if isinstance(joint, Joint) and joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
     ]
-
-
-def _placed(error: InputError) -> tuple[Problem, ...]:
-    """Return the problems of an error; an error that names no place cannot be listed and is raised again."""
-    if not error.problems:
-        raise error
-    return error.problems
 
 
 def compile_robot(
@@ -202,7 +181,7 @@ def compile_robot(
     if motions:
         from dxlrun.compile.motions import check_times, compile_motion  # as above
 
-        names = (*file.robot.controllers, *left_out_names(description, "controllers"))
+        names = tuple(file.robot.controllers)
         for motion in motions:
             parts += compile_motion(motion, controllers, names, joints, file)
         check_times(parts, duration_ns, file)

@@ -219,11 +219,6 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
     return [f"{problem.what}; {problem.fix}" for problem in problems]
 
 
-def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
-    """Return every place that a model refused."""
-    return [_Error(details, marks).path for details in error.errors(include_url=False)]
-
-
 class _Error:
     """One error of pydantic, and the place in the file that it is about."""
 

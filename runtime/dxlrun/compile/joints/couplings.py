@@ -152,11 +152,8 @@ def _set(entry: object, key: str) -> bool:
 
 def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
     """Check that every joint has a servo, or a transmission that moves it."""
-    left_out = {path[0] for path in file.description.left_out if path[:1] == ("transmissions",)}
     for name, joint in file.robot.joints.items():
-        if not isinstance(joint, ServoJoint) and name not in owners and not left_out:
-            if ("joints", name, "servos") in file.description.left_out:
-                continue
+        if not isinstance(joint, ServoJoint) and name not in owners:
             file.error(
                 file.key("joints", name),
                 f"{name} has no servo, and no transmission moves it",
