@@ -33,11 +33,11 @@ __all__ = [
     "get_requires_for_build_wheel",
 ]
 SOURCES = tuple(
-    Path("dxlrun", *path)
+    Path(*path)
     for path in (
-        ("dynamixel", "exchange", "kernel.c"),
-        ("control", "gate.c"),
-        ("channels", "shared_memory.c"),
+        ("dxlwire", "exchange", "kernel.c"),
+        ("dxlrun", "control", "gate.c"),
+        ("dxlrun", "channels", "shared_memory.c"),
     )
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""

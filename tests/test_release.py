@@ -31,7 +31,7 @@ OBJECTS = {
         "dxl_source",
     },
     "dxlrun/control/libgate.so": {"gate_apply", "dxl_source"},
-    "dxlrun/dynamixel/exchange/libkernel.so": {
+    "dxlwire/exchange/libkernel.so": {
         "dxl_read",
         "dxl_write",
         "dxl_abandon",

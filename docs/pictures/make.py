@@ -207,9 +207,9 @@ class Maker:
 
     def lost(self) -> None:
         """A servo that falls silent for a second, and what `dxlrun analyze` says of it."""
-        from dxlrun.simulation.faults.fault import parse_fault
-        from dxlrun.simulation.faults.script import FaultScript
         from dxlrun.testing import simulated_robot
+        from dxlsim.faults.fault import parse_fault
+        from dxlsim.faults.script import FaultScript
 
         log = self.place / "arm.mcap"
         play = [self.place / "wave.yaml"]

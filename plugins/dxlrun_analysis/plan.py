@@ -9,10 +9,10 @@ from typing import NamedTuple
 import msgspec
 from msgspec import structs
 
-from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlwire.port.latency_timer import is_simulated
 
 
 class LoggedRegister(msgspec.Struct):

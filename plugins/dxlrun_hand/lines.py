@@ -7,10 +7,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 
 from dxlrun.description.bus import SIMULATED
-from dxlrun.dynamixel.port.reopening import lasting_name
 from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 from dxlrun.errors import InputError, PortError, suggestion
 from dxlrun_hand.dialogue import Dialogue
+from dxlwire.port.reopening import lasting_name
 
 TRIES = 3
 Opened = Callable[[str], TunablePort]

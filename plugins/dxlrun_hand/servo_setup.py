@@ -8,10 +8,6 @@ from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.robot import compile_robot
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
-from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.registers import compare, merged
@@ -19,10 +15,14 @@ from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
 from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError, ServoFault
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program
 from dxlrun_hand.dialogue import Dialogue, yes
 from dxlrun_hand.lines import BusLines
+from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlwire.control_table import ControlTable, control_table, models_by_number
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.retry import extend_timeouts, retry
+from dxlwire.port.remedies import choose_remedy
+from dxlwire.transaction import Outcome, Program
 
 SKIP = ("s", "skip")
 

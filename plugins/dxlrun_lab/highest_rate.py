@@ -26,9 +26,9 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
-from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_analysis.counts import median, quantile
 from dxlrun_lab.late_servos import overruns_by_servos
+from dxlsim.bus.ledger import read_ledger
 
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8

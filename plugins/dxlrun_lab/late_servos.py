@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log
-from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlsim.bus.ledger import LedgerEntry
 
 _BITS_A_BYTE = 10
 Longs = NDArray[np.int64]

@@ -21,10 +21,9 @@ import numpy as np
 
 from dxlrun.compile.simulation import INSTALL_MUJOCO, NEEDS_MUJOCO
 from dxlrun.errors import InputError
-from dxlrun.plan.simulation_plan import CoupledServo, Coupling, UrdfBodies, UrdfJoint
-from dxlrun.simulation.motion.coupled_joints import moved_together, parts_without_bodies, together
-from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import (
+from dxlsim.motion.coupled_joints import moved_together, parts_without_bodies, together
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.plant import (
     JAMMED_NM,
     Floats,
     Part,
@@ -34,6 +33,7 @@ from dxlrun.simulation.motion.plant import (
     Rows,
     one_plant,
 )
+from dxlsim.simulation_plan import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

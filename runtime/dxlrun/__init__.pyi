@@ -47,7 +47,6 @@ from dxlrun.description.units import Time as Time
 from dxlrun.description.units import Tolerance as Tolerance
 from dxlrun.description.units import Voltage as Voltage
 from dxlrun.description.units import distance_text as distance_text
-from dxlrun.dynamixel.port.serial_open import open_serial as open_serial
 from dxlrun.errors import ControllerFault as ControllerFault
 from dxlrun.errors import DxlrunError as DxlrunError
 from dxlrun.errors import GoalTimeout as GoalTimeout
@@ -70,3 +69,4 @@ from dxlrun.remote.live.listening import TopicMessage as TopicMessage
 from dxlrun.remote.requests.replies import GoalState as GoalState
 from dxlrun.remote.requests.replies import TopicState as TopicState
 from dxlrun.remote.sockets import running as running
+from dxlwire.port.serial_open import open_serial as open_serial

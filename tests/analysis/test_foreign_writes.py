@@ -8,10 +8,10 @@ import pytest
 
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketKind
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
+from dxlwire.control_table import control_table
+from dxlwire.wire import protocol1, protocol2
 
 S = 10**9
 WIRES: dict[float, Any] = {1.0: protocol1, 2.0: protocol2}

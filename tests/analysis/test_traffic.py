@@ -13,11 +13,11 @@ from tests.analysis import traffic_oracle as oracle
 from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import read_log
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.traffic import Traffic
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 VARIOUS = ("bioloid_torso", "humanoid_20", "mechanics", "wolfgang")

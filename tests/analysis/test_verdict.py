@@ -22,8 +22,6 @@ from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.run_log import log_header
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.conduct import steering
 from dxlrun_analysis.cycles import latency
@@ -38,6 +36,8 @@ from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RealTime, RunTotals, Tally
 from dxlrun_analysis.verdict import judge
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 Make = Callable[..., Any]
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"

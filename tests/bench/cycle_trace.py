@@ -32,14 +32,14 @@ from dxlrun.channels.events import EventRing
 from dxlrun.channels.mailbox import Mailbox, MailboxWriter
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RingWriter, create
-from dxlrun.clock import MonotonicClock
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.testing import plan_of
+from dxlwire.clock import MonotonicClock
+from dxlwire.port.ports import SerialPort, SerialPorts
 from exchange.simulated import SimulatedServos
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -42,21 +42,21 @@ from tests.kit.decoded import decode_packets
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover
-from dxlrun.clock import VirtualClock
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.exchange import kernel
-from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.plan.devices import device_blocks
-from dxlrun.dynamixel.plan.line import Line as LineTimes
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.port.ports import OwnProcessors
 from dxlrun.dynamixel.servo.life import ServoEvent
-from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.plan.bus_plan import BusPlan, DevicePlan
+from dxlwire.bus_plan import BusPlan, DevicePlan
+from dxlwire.clock import VirtualClock
+from dxlwire.control_table import control_table
+from dxlwire.control_table.device_table import read_device_table
+from dxlwire.exchange import kernel
+from dxlwire.exchange.bus import NEVER
+from dxlwire.modes import Mode
+from dxlwire.plan.devices import device_blocks
+from dxlwire.plan.line import Line as LineTimes
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.port.ports import OwnProcessors
+from dxlwire.wire import protocol1, protocol2
 
 IDS = (1, 7, 3, 20)
 ROBOTS = {

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 from fastcrc import crc16
 
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.dialect import Dialect
-from dxlrun.dynamixel.wire.receiver import Receiver
+from dxlwire.wire import protocol1, protocol2
+from dxlwire.wire.dialect import Dialect
+from dxlwire.wire.receiver import Receiver
 
 BATCH = 100
 """Packets between two flushes."""

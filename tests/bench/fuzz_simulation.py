@@ -22,10 +22,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.dynamixel.control_table import ControlTable, all_tables
-from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlwire.control_table import ControlTable, all_tables
 
 PER_SERVO = 250
 """Strings that one servo receives before another takes its place."""

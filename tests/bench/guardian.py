@@ -19,7 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"

@@ -221,9 +221,9 @@ def packets(log: Path) -> Iterator[tuple[str, int, bytes]]:
 
 def run(number: int, tree: Path, directory: Path, show: Path | None) -> dict[str, Any]:
     """Run one and return its hashes."""
-    from dxlrun.simulation.faults.fault import parse_fault
-    from dxlrun.simulation.faults.script import FaultScript
     from dxlrun.testing import simulated_robot
+    from dxlsim.faults.fault import parse_fault
+    from dxlsim.faults.script import FaultScript
 
     random = Random(f"same {number}")
     robot_file, arguments, motions = (shipped if number % 2 else made)(random, tree, directory)

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.kit.stages import Stage
 
 from dxlrun import Context, Controller, Floats, Interfaces, JointController, ParametersModel
-from dxlrun.description.modes import CommandName
+from dxlwire.modes import CommandName
 
 
 class Joints(ParametersModel):

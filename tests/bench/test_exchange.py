@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import ProcessFault
 from dxlrun_lab.late_servos import LedgerTransaction
+from dxlwire.wire import protocol1
 from exchange.bus import Settings, bench_bus, chosen_hosts, to_json
 from exchange.canned import CannedResponder
 from exchange.case import Case, Registers

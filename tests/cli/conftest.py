@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.plan.simulation_plan import BusConfig
-from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.simulation_plan import BusConfig
 from exchange.simulated import SimulatedServos
 
 

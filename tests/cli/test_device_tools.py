@@ -10,10 +10,10 @@ from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.compile.robot import compile_files
-from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")

@@ -28,18 +28,18 @@ from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
 from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.messages import SimulationJob, SimulationMessage
 from dxlrun.testing import plan_of, read_log, simulated_robot
 from dxlrun_view import dxlrun_commands
+from dxlsim.faults.fault import parse_fault
+from dxlsim.messages import SimulationJob, SimulationMessage
+from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
+from dxlwire.control_table import control_table
 
 ROOT = Path(__file__).parents[2]
-ROOTS = (ROOT, ROOT / "runtime/dxlrun", ROOT / "plugins")
+ROOTS = (ROOT, ROOT / "runtime", ROOT / "runtime/dxlrun", ROOT / "plugins")
 """Where a page's path to a file may begin."""
 PATHS = [
     ROOT / "README.md",
@@ -288,7 +288,11 @@ def test_the_links_of_a_page_lead_somewhere(path: Path) -> None:
 @pytest.mark.parametrize("path", [*PATHS, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
 def test_the_files_that_a_page_names_exist(path: Path) -> None:
     roots = ROOTS
-    folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {"logs", ".venv"}
+    folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {
+        "logs",
+        ".venv",
+        "dxlrun",
+    }
     text = path.read_text()
     typed = [word for line in re.findall(r"^    (.+)$", text, re.MULTILINE) for word in line.split()]
     for token in [*re.findall(r"`([\w.+-]+(?:/[\w.+-]+)*/?)`", text), *typed]:
@@ -365,8 +369,8 @@ def test_a_name_that_a_file_lacks_is_noticed(tmp_path: Path) -> None:
 def test_architecture_md_has_every_room() -> None:
     page = PAGES["architecture.md"]
     rooms = set(re.findall(r"`([\w/]+(?:/|\.py))`", page[page.index("## Rooms") : page.index("## The plan")]))
-    for folder in ("", "dynamixel/"):
-        entries = (ROOT / "runtime/dxlrun" / folder).iterdir()
+    for root, folder in (("", "dxlsim/"), ("", "dxlwire/"), ("dxlrun", ""), ("dxlrun", "dynamixel/")):
+        entries = (ROOT / "runtime" / root / folder).iterdir()
         names = {f"{folder}{one.name}" + "/" * one.is_dir() for one in entries if "__" not in one.name}
         assert {name for name in names if name.endswith((".py", "/"))} - rooms == set()
 

@@ -13,8 +13,8 @@ from tests.kit.answers import read_answer
 
 from dxlrun.channels import compiled
 from dxlrun.control.realtime import UNLIMITED
-from dxlrun.dynamixel.port.adapters import serial_devices, warnings_for
 from dxlrun.run.doctor import RATES, Finding, Machine, diagnose, may_schedule, set_rates
+from dxlwire.port.adapters import serial_devices, warnings_for
 
 GOOD = {
     "proc/sys/kernel/osrelease": "6.12.1-rt5",

@@ -9,7 +9,7 @@ import pytest
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.log.reader import read_log
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from tests.kit.pages import page_text
 import dxlrun as dxlrun_package
 from dxlrun.cli.tools.models import runs, unit_of
 from dxlrun.contract.hookspecs import HookSpecs
-from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.dynamixel.control_table.devices import device_tables
+from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table.devices import device_tables
 
 
 def test_without_a_name_all_models_are_listed(dxlrun):

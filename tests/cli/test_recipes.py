@@ -24,10 +24,10 @@ from tests.kit.pages import page_text
 import dxlrun as face
 from dxlrun import RemoteRobot, connect
 from dxlrun.remote.live.listening import Listening
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of
 from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("recipes.md")

@@ -10,10 +10,10 @@ from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
 from dxlrun.cli.tools.scan import draft, draft_file
 from dxlrun.compile.robot import compile_files
-from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.testing import simulated_robot
+from dxlwire.control_table import all_tables
 
 PORT = "/dev/ttyUSB0"
 

@@ -8,7 +8,7 @@ from tests.kit.answers import result_of
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 
 def servos(*models):
@@ -58,7 +58,7 @@ def test_no_servo_at_all_is_exit_code_one(dxlrun, simulated_line):
 
 HOLD = """
 import sys
-from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlwire.port.serial_open import open_serial
 port = open_serial(sys.argv[1], 57_600)
 print("open", flush=True)
 sys.stdin.read()

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")

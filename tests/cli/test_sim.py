@@ -22,7 +22,7 @@ import pytest
 from tests.kit.answers import read_answer, result_of
 from tests.kit.pages import page_text
 
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"

@@ -10,10 +10,10 @@ import pytest
 from tests.kit.pages import page_text
 
 from dxlrun.cli.sim import sim
-from dxlrun.plan.simulation_plan import SimulationConfig
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation.faults.kinds import KINDS
-from dxlrun.simulation.messages import SimulationJob, SimulationMessage
+from dxlsim.faults.kinds import KINDS
+from dxlsim.messages import SimulationJob, SimulationMessage
+from dxlsim.simulation_plan import SimulationConfig
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("simulation.md")

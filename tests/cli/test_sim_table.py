@@ -13,7 +13,7 @@ from rich.console import Console
 
 from dxlrun.cli.sim.sim_views import Shown, TableView, page
 from dxlrun.run.simulation_front import TypedLines
-from dxlrun.simulation.messages import ServoLook, SimulationMessage
+from dxlsim.messages import ServoLook, SimulationMessage
 
 
 def look(count: int, **changes: float) -> SimulationMessage:

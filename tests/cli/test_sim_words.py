@@ -11,8 +11,8 @@ from dxlrun.cli.sim.sim import link_of_each
 from dxlrun.cli.sim.sim_inputs import read_faults, servo_bus, with_adapter
 from dxlrun.cli.sim.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
-from dxlrun.simulation.messages import ServoLook, SimulationMessage
+from dxlsim.messages import ServoLook, SimulationMessage
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 BUS = BusConfig("main", 57_600, (ServoConfig(1, "XL430-W250", 0.0),), 2.0)
 

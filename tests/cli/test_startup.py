@@ -19,8 +19,10 @@ print(json.dumps(sorted(sys.modules)))
 """
 RUN_TIME = {
     "dxlrun.control": ("gate", "loop", "realtime", "safe_motion", "steering"),
-    "dxlrun.dynamixel": ("exchange", "hardware", "port", "servo/life", "servo/servos", "tools"),
+    "dxlrun.dynamixel": ("hardware", "servo/life", "servo/servos", "tools"),
     "dxlrun.log": ("recorder", "log_writer", "reader"),
+    "dxlsim": ("bus", "pseudo_terminal", "server"),
+    "dxlwire": ("exchange", "port"),
 }
 """Rooms of which `check` needs the plans, and the parts that it does not."""
 
@@ -46,7 +48,7 @@ def checked() -> set[str]:
 
 def test_check_imports_no_part_that_runs(checked: set[str]) -> None:
     run_time = (f"{room}.{part.replace('/', '.')}" for room, parts in RUN_TIME.items() for part in parts)
-    assert beneath(checked, *run_time, "dxlrun.simulation", "dxlrun.remote", "dxlrun.run") == set()
+    assert beneath(checked, *run_time, "dxlrun.remote", "dxlrun.run") == set()
     packages = beneath(checked, "dxlrun_analysis", "dxlrun_lab", "dxlrun_mujoco")
     assert packages <= {f"dxlrun_{one}{part}" for one in ("analysis", "lab") for part in ("", ".plugin")}
 
@@ -66,6 +68,6 @@ def test_check_imports_what_it_uses(checked: set[str]) -> None:
 
 def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
     ran = loaded("robots/bioloid_torso.yaml", "--virtual", "--duration", "0.1", "--no-record")
-    assert "dxlrun.simulation.server" not in ran
+    assert "dxlsim.server" not in ran
     assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "rich", "dxlrun.remote") == set()
     assert "dxlrun.run.virtual_run" in ran

@@ -16,10 +16,10 @@ from dxlrun import DxlrunError
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.cli.steering import watch
 from dxlrun.cli.steering.steer import Chosen
-from dxlrun.description.modes import Mode
 from dxlrun.output.table import Sentence
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.named.joints import states_of
+from dxlwire.modes import Mode
 
 
 class Robot:

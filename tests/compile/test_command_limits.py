@@ -9,7 +9,6 @@ import pytest
 
 from dxlrun.compile.joints.limits import beyond_limits
 from dxlrun.contract.controller import CommandModel, SpeedPeak
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_controllers.group import (
     EffortsCommand,
@@ -23,6 +22,7 @@ from dxlrun_controllers.motions.trajectory_command import (
     flat_trajectory,
     trajectory_speed_peaks,
 )
+from dxlwire.control_table import control_table
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)

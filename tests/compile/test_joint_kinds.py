@@ -8,9 +8,9 @@ import msgspec
 import pytest
 from tests.kit.robots import compile_text, problems_in, robot_text
 
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import from_json, to_json
+from dxlwire.modes import Mode
 
 TEXT = robot_text("cart")
 

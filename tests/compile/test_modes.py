@@ -2,7 +2,7 @@ import pytest
 from tests.kit import desk
 from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.description.modes import Mode
+from dxlwire.modes import Mode
 
 WHEELS = """\
 name: cart

@@ -17,9 +17,9 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import from_json, to_json
-from dxlrun.plan.simulation_plan import Load
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun_analysis.replay.changes import Setting, with_settings
+from dxlsim.simulation_plan import Load
 
 MOTOR = MotorModel(
     "MX-64", 12.0, 1.6, 3.5, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_500_000,

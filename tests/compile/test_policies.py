@@ -11,8 +11,8 @@ from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
 
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.compile.report import policy_rows
-from dxlrun.dynamixel.plan import planning as plan
 from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
+from dxlwire.plan import planning as plan
 
 POLICIES = robot_text("policies").removeprefix(PAIR)
 

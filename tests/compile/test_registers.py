@@ -9,7 +9,7 @@ from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.compile.joints.registers import declarable, register_value, steered_value
-from dxlrun.dynamixel.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, control_table
 
 ROBOT = """\
 name: arm

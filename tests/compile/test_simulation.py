@@ -14,7 +14,7 @@ from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
-from dxlrun.plan.simulation_plan import (
+from dxlsim.simulation_plan import (
     AdapterConfig,
     CoupledServo,
     Coupling,

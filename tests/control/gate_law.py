@@ -8,9 +8,9 @@ from math import inf, isfinite, isinf, isnan, nan, sqrt
 
 from dxlrun.channels.cycle import LIMP, Clamp
 from dxlrun.control import gate
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
+from dxlwire.modes import Mode
 
 BRAKING_S = 0.1
 """Of this time's way a joint in velocity mode may come nearer to a limit"""

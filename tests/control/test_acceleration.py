@@ -8,8 +8,8 @@ from tests.control.gate_law import BRAKING_S
 from tests.kit.loops import GateRig
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode
 
 DT_NS = 10_000_000
 DT = DT_NS * 1e-9

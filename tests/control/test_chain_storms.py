@@ -16,7 +16,7 @@ from tests.kit.loops import PERIOD_NS, Robot
 
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
+from dxlwire.modes import Mode
 
 GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
 CYCLES = 40

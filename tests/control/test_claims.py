@@ -7,8 +7,8 @@ from typing import Any
 from tests.kit.loops import plan_of
 
 from dxlrun.control.controllers.claims import claimed_modes, conflicts, conflicts_text
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlwire.modes import Mode
 
 
 def wants(name: str, joints: Any, command: Any = ("position",), **more: Any) -> ControllerPlan:

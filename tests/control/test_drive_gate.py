@@ -8,8 +8,8 @@ from tests.control.gate_law import BRAKING_S, LAG_S
 from tests.kit.loops import PERIOD_NS, GateRig
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.description.modes import COMMAND_INTERFACES, Mode
 from dxlrun.plan.policy_plan import SLOW_SPEED
+from dxlwire.modes import COMMAND_INTERFACES, Mode
 
 DT = PERIOD_NS * 1e-9
 DRIVEN = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}

@@ -11,9 +11,9 @@ from tests.kit.loops import GateRig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.control import gate
-from dxlrun.description.modes import Mode
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode
 
 FAR = float("inf")
 DT_NS = (1_000_000, 10_000_000, 10_000_000, 600_000_000, 0)

@@ -7,8 +7,8 @@ from tests.kit.loops import Robot, commanding
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import SLOW_SPEED
+from dxlwire.modes import Mode
 
 HOLD = commanding(position=0.1)
 

@@ -12,8 +12,8 @@ from dxlrun.channels.answers import Code, Done, Waiting
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.switching import MODE_TIMEOUT_NS
-from dxlrun.description.modes import Mode, mode_of
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode, mode_of
 
 POSITION, VELOCITY, EFFORT = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT
 TOO_LONG = MODE_TIMEOUT_NS // PERIOD_NS + 10

@@ -13,10 +13,10 @@ import threading
 
 import pytest
 
-from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Pacing, overshoot_ns
 from dxlrun.plan.loop_plan import SchedulerPlan
+from dxlwire.clock import MonotonicClock
 
 
 @pytest.fixture

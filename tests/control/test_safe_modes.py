@@ -9,8 +9,8 @@ import pytest
 
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.control.steering import PAUSED_CYCLE_NS
-from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
+from dxlwire.modes import Mode
 
 PERIOD_NS = 20_000_000
 POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")

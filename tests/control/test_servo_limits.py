@@ -13,11 +13,11 @@ from tests.kit.wire import all_writes
 
 from dxlrun.channels.cycle import Clamp
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
 from dxlrun.testing import VirtualRobot
+from dxlwire.control_table import control_table
+from dxlwire.modes import Mode
 
 ROBOT = """\
 name: limited

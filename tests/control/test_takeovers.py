@@ -12,8 +12,8 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import Standing, Step, conflicts
 from dxlrun.control.controllers.graph import lowers_first
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlwire.modes import Mode
 
 SPARE = {"active": False}
 EXPORTS = {"reference": ("position",)}

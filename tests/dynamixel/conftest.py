@@ -7,7 +7,7 @@ import json
 import pytest
 from tests.kit.bus_process import started
 
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 import pytest
 from tests.kit.rigs import make_x
 
-from dxlrun.dynamixel.control_table import control_table, decoded
-from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.registers import settle
-from dxlrun.plan.bus_plan import RegisterValue
-from dxlrun.plan.transaction import Outcome, Reply
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import control_table, decoded
+from dxlwire.plan.findings import Findings
+from dxlwire.transaction import Outcome, Reply
 
 PLAN = make_x((11,))
 ONE = reach(PLAN, PLAN.servos[0])

@@ -6,7 +6,7 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.wire import protocol1
+from dxlwire.wire import protocol1
 
 MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
 

@@ -2,11 +2,11 @@ import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.line import Line, listen
-from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.plan.transaction import Outcome, ProgramJob, Reply
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.line import Line, listen
+from dxlwire.transaction import Outcome, ProgramJob, Reply
+from dxlwire.wire import protocol1, protocol2
 
 LINE = Line(1_000_000, 0, 500_000)
 READ = LINE.read(7, 36, 6)

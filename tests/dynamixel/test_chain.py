@@ -4,10 +4,10 @@ import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import PacketLog
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.wire import protocol2
-from dxlrun.plan.transaction import Outcome
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.line import Line
+from dxlwire.transaction import Outcome
+from dxlwire.wire import protocol2
 
 LINE = Line(1_000_000, 0, 0, protocol2)
 SYNC_READ = LINE.read_many([(1, 126, 4), (2, 126, 4), (3, 126, 4)])

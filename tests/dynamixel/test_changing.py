@@ -5,14 +5,14 @@ from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.cli.tools.servo import VERBS, Asked
-from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import one_servo, servo_backup
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
-from dxlrun.plan.simulation_plan import ServoConfig
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.control_table import all_tables
+from dxlwire.wire.protocol2 import Reset
 
 RATE = 57_600
 

@@ -8,13 +8,13 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.checks import CHECKS, inspect, survey
-from dxlrun.plan.bus_plan import RegisterValue
-from dxlrun.plan.transaction import Outcome, Reply
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import control_table
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.planning import plan_line
+from dxlwire.transaction import Outcome, Reply
 
 FAILS = (
     (1.0, {"error": 0x04}, "reports an error: overheating"),

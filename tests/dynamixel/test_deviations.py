@@ -12,8 +12,12 @@ from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.compile.joints.registers import register_value
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import (
+from dxlrun.dynamixel.servo.access import first_reach
+from dxlrun.dynamixel.servo.checks import inspect
+from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
+from dxlrun.errors import StartUpError
+from dxlwire.bus_plan import BusPlan, RegisterValue
+from dxlwire.control_table import (
     ControlItem,
     ControlTable,
     all_tables,
@@ -21,15 +25,11 @@ from dxlrun.dynamixel.control_table import (
     find_deviations,
     read_control_table,
 )
-from dxlrun.dynamixel.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan, position_layout
-from dxlrun.dynamixel.servo.access import first_reach
-from dxlrun.dynamixel.servo.checks import inspect
-from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
-from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue
+from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
+from dxlwire.exchange.bus import Lines
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.planning import Wiring, bus_plan, position_layout
 
 TABLES = all_tables()
 ADDRESSES = {"id", "baud_rate", "baud_rate_bus", "protocol_type"}
@@ -128,7 +128,7 @@ def test_every_judgement_is_of_an_item_that_a_table_has():
 
 
 def test_an_item_of_a_plugin_without_a_judgement_is_reported():
-    text = Path("runtime/dxlrun/dynamixel/control_table/tables/protocol1/AX-12A.toml").read_text()
+    text = Path("runtime/dxlwire/control_table/tables/protocol1/AX-12A.toml").read_text()
     items = read_control_table(text.replace("\npunch = ", "\nshove = ")).items
     (found,) = find_deviations(items.values(), {"shove": 33})
     assert (found.item.name, found.judgement, found.factory) == ("shove", "report", 32)
@@ -138,7 +138,7 @@ def test_an_item_of_a_plugin_without_a_judgement_is_reported():
 @pytest.mark.parametrize(("value", "factory"), [(799, 800), (800, None), (1023, None), (0, 800)])
 def test_an_item_without_an_initial_value_begins_with_that_of_the_item_that_bounds_it(value, factory):
     """A value beyond that of the other item is no deviation: the other one may have been lowered later."""
-    text = Path("runtime/dxlrun/dynamixel/control_table/tables/protocol1/AX-12A.toml").read_text()
+    text = Path("runtime/dxlwire/control_table/tables/protocol1/AX-12A.toml").read_text()
     rule = 'deviation = {judgement = "report", limited_by = "max_torque", effect = "makes it weak"}'
     items = read_control_table(text.replace("torque_limit = {", f"torque_limit = {{{rule}, ")).items
     found = find_deviations([items["torque_limit"]], {"torque_limit": value, "max_torque": 800})

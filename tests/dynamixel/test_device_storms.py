@@ -12,8 +12,8 @@ import pytest
 from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 from .test_devices import ALL, NONE, SERVOS, device, devices
 

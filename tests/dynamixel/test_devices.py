@@ -14,12 +14,12 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.plan.devices import device_blocks, device_command
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import DevicePlan
+from dxlwire.bus_plan import DevicePlan
+from dxlwire.control_table.device_table import read_device_table
+from dxlwire.plan.devices import device_blocks, device_command
+from dxlwire.plan.line import Line
+from dxlwire.wire import protocol1, protocol2
 
 TABLE = """
 kind = "device"

@@ -9,8 +9,8 @@ from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.torque_off import limp, stand
+from dxlwire.modes import Mode
 
 
 def make_wheel(model="XM430-W350", protocol=2.0, **change):

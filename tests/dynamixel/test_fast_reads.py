@@ -9,8 +9,8 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.control_table import control_table, model_names
-from dxlrun.dynamixel.wire import protocol2
+from dxlwire.control_table import control_table, model_names
+from dxlwire.wire import protocol2
 
 IDS = rigs.X_IDS
 make_x = partial(rigs.make_x, fast=True)

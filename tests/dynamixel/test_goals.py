@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from tests.kit.rigs import make_plan, position_tick, speed_tick
 
 import fuzz_kernel as fuzz
-from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.life import ServoEvent
-from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlwire.modes import Mode
+from dxlwire.wire import protocol1, protocol2
 
 REPEATED = 50
 LEADS = {Mode.VELOCITY: 1, Mode.EFFORT: 2, Mode.PWM: 3}

@@ -10,9 +10,9 @@ from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick,
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp
-from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.plan.simulation_plan import ServoConfig
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.wire import protocol1
 
 
 def torque_read(plan, index):

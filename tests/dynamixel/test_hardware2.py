@@ -17,10 +17,10 @@ from tests.kit.rigs import (
 )
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table import all_tables
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import all_tables
+from dxlwire.wire import protocol2
 
 
 @pytest.fixture

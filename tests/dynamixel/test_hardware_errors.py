@@ -6,12 +6,12 @@ import pytest
 from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table, read_control_table
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.dynamixel.tools.scanning import Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import StartUpError
-from dxlrun.plan.simulation_plan import ServoConfig
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.control_table import ControlTable, all_tables, control_table, read_control_table
 
 X = {
     0x01: "input voltage",
@@ -210,7 +210,7 @@ def test_a_table_without_errors_names_none(plain_table):
 def plain_table():
     """The text of a table of Protocol 2.0 that names no errors, as a plug-in may have it."""
     path = "XM/XM430-W350.toml"
-    from dxlrun.dynamixel.control_table import sources
+    from dxlwire.control_table import sources
 
     text = (sources._TABLES / "protocol2" / path).read_text("utf-8")
     before, _, rest = text.partition("[errors]")

@@ -9,11 +9,11 @@ from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.reboots import RebootCount, TickReading
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.plan.bus_plan import RegisterValue
-from dxlrun.plan.transaction import Outcome, Reply
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.modes import Mode
+from dxlwire.transaction import Outcome, Reply
+from dxlwire.wire import protocol1, protocol2
 
 PROTOCOLS = pytest.mark.parametrize("protocol", [1.0, 2.0])
 

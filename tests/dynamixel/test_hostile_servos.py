@@ -11,9 +11,9 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, start_rig
 
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.mode_plan import in_mode
-from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlwire.modes import Mode
+from dxlwire.plan.mode_plan import in_mode
+from dxlwire.wire.dialect import dialect_of
 
 SEEDS = int(os.environ.get("DXLRUN_HOSTILE", "1"))
 ROBOTS = {

@@ -3,14 +3,14 @@ import math
 import pytest
 from tests.kit.rigs import make_plan
 
-from dxlrun.clock import VirtualClock
 from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
 
 ROBOT = """
 name: arm

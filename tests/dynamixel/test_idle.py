@@ -2,11 +2,11 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.wire import protocol2
-from dxlrun.plan.transaction import Outcome
+from dxlwire.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
+from dxlwire.plan.line import listen
+from dxlwire.plan.planning import plan_line
+from dxlwire.transaction import Outcome
+from dxlwire.wire import protocol2
 
 READ_NS = 270_000
 """14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""

@@ -21,15 +21,15 @@ import fuzz_kernel as fuzz
 from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.packets import RECORD_HEADER, PacketKind
-from dxlrun.clock import MonotonicClock
-from dxlrun.dynamixel.exchange import bus, kernel
-from dxlrun.dynamixel.exchange.bus import FREE_NS
-from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.port import ports
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
+from dxlwire.clock import MonotonicClock
+from dxlwire.exchange import bus, kernel
+from dxlwire.exchange.bus import FREE_NS
+from dxlwire.exchange.cyclic_reads import CALM_CYCLES
+from dxlwire.port import ports
+from dxlwire.port.ports import SerialPort, SerialPorts
+from dxlwire.wire import protocol2
 
 ROOT = Path(__file__).parents[2]
 
@@ -491,7 +491,7 @@ def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
     hook, data = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel"), {"force_include": {}}
     hook.initialize("standard", data)
     names = [
-        "dxlrun/dynamixel/exchange/libkernel.so",
+        "dxlwire/exchange/libkernel.so",
         "dxlrun/control/libgate.so",
         "dxlrun/channels/libshared_memory.so",
     ]

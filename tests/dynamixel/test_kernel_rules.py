@@ -9,8 +9,8 @@ import pytest
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
+from dxlwire.wire import protocol1, protocol2
 
 DATA = bytes((0, 2, 0, 0, 0, 0, 0, 2, 0, 0))
 """Of a servo: whatever its layout, its position is the same in each cycle, and in its range."""

@@ -18,18 +18,18 @@ import pytest
 from tests.kit.line_faults import STALLED, disturb_replies
 from tests.kit.rigs import VirtualLine, make_plan, make_rig, start_rig
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.plan.retry import extend_timeouts
 from dxlrun.dynamixel.tools.inspection import NOWHERE, _look, _run, identify
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault, StartUpError
-from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlrun_hand.servo_setup import _read_back, bring
+from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.bus_plan import BusPlan
+from dxlwire.control_table import control_table
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.plan.retry import extend_timeouts
 
 COUNT = os.environ.get("DXLRUN_LATE_REPLIES", "40")
 FARTHEST = 8  # Requests between two faults: later, the first one is over

@@ -6,19 +6,19 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten
-from dxlrun.dynamixel.port.remedies import (
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.plan.machine_load import MachineLoad
+from dxlrun.testing import VirtualRobot, plan_of
+from dxlwire.port.latency_timer import latency_timer, shorten
+from dxlwire.port.remedies import (
     CHECK,
     INJECTED,
     choose_remedy,
     describe_late_start,
     late_replies,
 )
-from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
-from dxlrun.dynamixel.port.serial_open import open_serial
-from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.machine_load import MachineLoad
-from dxlrun.testing import VirtualRobot, plan_of
+from dxlwire.port.reopening import KeptLines, Wanted
+from dxlwire.port.serial_open import open_serial
 
 BUSY = MachineLoad(10.0, busy_s=10.0, no_idle_core_s=10.0)
 MS = 1_000_000

@@ -11,10 +11,6 @@ from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import goals_in, make_plan, make_rig
 
 from dxlrun.channels.cycle import States
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
-from dxlrun.dynamixel.exchange.owed import OwedReplies
-from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.servo import life
 from dxlrun.dynamixel.servo.life import (
     GETS_GOALS,
@@ -25,6 +21,10 @@ from dxlrun.dynamixel.servo.life import (
     ServoState,
 )
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
+from dxlwire.exchange.cyclic_reads import CyclicReads
+from dxlwire.exchange.owed import OwedReplies
+from dxlwire.exchange.samples import Samples
+from dxlwire.modes import Mode
 
 LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in events}
 

@@ -11,8 +11,8 @@ import pytest
 from tests.kit.rigs import make_plan, random_fault, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.mode_plan import in_mode
+from dxlwire.modes import Mode
+from dxlwire.plan.mode_plan import in_mode
 
 STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "6"))
 FOLLOWED = {

@@ -9,12 +9,12 @@ from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import control_table
+from dxlwire.modes import Mode
+from dxlwire.plan.mode_plan import mode_in, position_reach
+from dxlwire.wire import protocol2
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
 FAMILIES = {

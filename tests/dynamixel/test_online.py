@@ -6,7 +6,7 @@ from tests.kit.answers import result_of
 from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.log.reader import read_log
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 ROBOT = """\
 name: pair

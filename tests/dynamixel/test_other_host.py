@@ -8,7 +8,7 @@ from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.servo.servos import UNREQUESTED_EVENT_NS
-from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlwire.wire import protocol1, protocol2
 
 WAYS = ["plain", "bulk", "sync", "fast"]
 IDLE_NS = 15_000_000

@@ -4,13 +4,13 @@ import pytest
 from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import Rig, make_plan, make_x, start_rig
 
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
-from dxlrun.dynamixel.plan.line import MOST_SPARE
-from dxlrun.dynamixel.plan.retry import ReplyTimes, extend_timeouts, retry
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.torque_off import limp
-from dxlrun.plan.transaction import Program, Reply, Transaction
+from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
+from dxlwire.plan.line import MOST_SPARE
+from dxlwire.plan.retry import ReplyTimes, extend_timeouts, retry
+from dxlwire.transaction import Program, Reply, Transaction
 
 READ = 2  # Instruction of Protocol 1.0
 MILLISECOND_NS = 1_000_000

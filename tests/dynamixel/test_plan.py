@@ -2,10 +2,10 @@ import msgspec
 import pytest
 from tests.kit.rigs import make_plan
 
-from dxlrun.dynamixel.control_table import control_table, model_names
-from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
-from dxlrun.dynamixel.plan.planning import torque_off_ns
-from dxlrun.plan.bus_plan import BusPlan
+from dxlwire.bus_plan import BusPlan
+from dxlwire.control_table import control_table, model_names
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
+from dxlwire.plan.planning import torque_off_ns
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency():

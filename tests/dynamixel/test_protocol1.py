@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.wire import protocol1
-from dxlrun.dynamixel.wire.protocol1 import Status, StatusError
+from dxlwire.wire import protocol1
+from dxlwire.wire.protocol1 import Status, StatusError
 
 ids = st.integers(0, protocol1.HIGHEST_ID)
 

@@ -5,7 +5,7 @@ from dynamixel_sdk import protocol2_packet_handler as sdk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.wire import protocol2 as p2
+from dxlwire.wire import protocol2 as p2
 
 INSTRUCTIONS = {
     "ping": (p2.ping(1), "FF FF FD 00 01 03 00 01 19 4E"),

@@ -3,8 +3,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fuzz_receiver
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.receiver import Receiver
+from dxlwire.wire import protocol1, protocol2
+from dxlwire.wire.receiver import Receiver
 
 
 class Heard:

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, random_fault, start_rig
 
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
 
 STORMS = int(os.environ.get("DXLRUN_REGISTER_STORMS", "3"))
 GAINS = {

@@ -7,14 +7,14 @@ from tests.kit.rigs import make_plan, make_rig, make_x
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketLog
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
-from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach, reach
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import all_tables, control_table
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.findings import Findings
 
 
 def register(table, name, value):

@@ -8,9 +8,9 @@ import pytest
 from msgspec.json import Decoder
 
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.dynamixel.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
 from dxlrun.errors import PortError
+from dxlwire.port.ports import SerialPort, SerialPorts
+from dxlwire.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
 
 PATIENCE_S = 60.0
 

@@ -4,8 +4,8 @@ import ctypes
 
 import pytest
 
-from dxlrun.dynamixel.exchange import kernel
-from dxlrun.dynamixel.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
+from dxlwire.exchange import kernel
+from dxlwire.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
 
 LIBRARY = kernel.library()
 

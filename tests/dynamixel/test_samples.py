@@ -11,8 +11,8 @@ from tests.kit.rigs import make_plan, make_rig
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
+from dxlwire.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
+from dxlwire.modes import Mode
 
 MS = 1_000_000
 SECOND_NS = 1_000_000_000

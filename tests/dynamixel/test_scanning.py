@@ -4,12 +4,12 @@ import pytest
 from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
-from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import Search, find, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
-from dxlrun.plan.simulation_plan import AdapterConfig, ServoConfig
+from dxlsim.simulation_plan import AdapterConfig, ServoConfig
+from dxlwire.control_table import all_tables
 
 
 def two(servo_id, model="XM430-W350", **more):

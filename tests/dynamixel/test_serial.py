@@ -16,17 +16,17 @@ from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.process import memory_file
-from dxlrun.clock import MonotonicClock
 from dxlrun.compile.robot import compile_files
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
-from dxlrun.dynamixel.port.serial_open import let_go, open_serial, rate_remark
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
 from dxlrun.process_table import robot_of
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.clock import MonotonicClock
+from dxlwire.port.ports import SerialPort, SerialPorts
+from dxlwire.port.reopening import KeptLines, Wanted
+from dxlwire.port.serial_open import let_go, open_serial, rate_remark
 
 
 @pytest.fixture
@@ -136,7 +136,7 @@ class Driver:
             return answer
 
         monkeypatch.setattr(fcntl, "ioctl", ioctl)
-        monkeypatch.setattr("dxlrun.dynamixel.port.serial_open.is_simulated", lambda path: False)
+        monkeypatch.setattr("dxlwire.port.serial_open.is_simulated", lambda path: False)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_the_process_that_has_the_line_is_named(terminal):
     _, path, _ = terminal
     code = (
         "import sys\n"
-        "from dxlrun.dynamixel.port.serial_open import open_serial\n"
+        "from dxlwire.port.serial_open import open_serial\n"
         "port = open_serial(sys.argv[1], 1_000_000)\n"
         "print('opened', flush=True)\n"
         "sys.stdin.read()\n"
@@ -230,7 +230,7 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     code = (
         "import sys\n"
         "from dxlrun.channels import process\n"
-        "from dxlrun.dynamixel.port.serial_open import open_serial\n"
+        "from dxlwire.port.serial_open import open_serial\n"
         "port = open_serial(sys.argv[1], 1_000_000)\n"
         'plan = process.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
         "print('opened', flush=True)\n"

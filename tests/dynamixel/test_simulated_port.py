@@ -13,7 +13,7 @@ from dxlrun.channels.heartbeat import (
     SimulationProgress,
     create_progress,
 )
-from dxlrun.dynamixel.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
+from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
 MS = 1_000_000
 SENT = 1_000 * MS  # when the request is off the wire

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.reads import slow_items
+from dxlwire.control_table import control_table
+from dxlwire.plan.reads import slow_items
 
 SECOND_NS = 1_000_000_000
 

@@ -7,13 +7,13 @@ from tests.kit.line_faults import corrupt_next, delay_next, disturb_replies, tru
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.port.remedies import INJECTED
 from dxlrun.dynamixel.servo.checks import _silence
-from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.bus.line import flipped
-from dxlrun.simulation.bus.simulated_bus import PacketFault
+from dxlsim.bus.line import flipped
+from dxlsim.bus.simulated_bus import PacketFault
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.port.remedies import INJECTED
+from dxlwire.wire import protocol1
 
 
 def refusal(rig):

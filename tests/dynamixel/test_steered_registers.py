@@ -2,7 +2,7 @@ import pytest
 from tests.kit.rigs import make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
+from dxlwire.modes import Mode
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
+from dxlwire.wire import protocol1
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.life import ServoState
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
+from dxlwire.modes import Mode
+from dxlwire.wire import protocol2
 
 PROTOCOLS = (1.0, 2.0)
 IDS = (11, 12, 13)

@@ -10,14 +10,14 @@ from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import RegisterValue
-from dxlrun.plan.transaction import Outcome, Reply
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import control_table
+from dxlwire.transaction import Outcome, Reply
+from dxlwire.wire import protocol2
 
 TRIPPED = 0xFF
 SECOND_NS = 1_000_000_000

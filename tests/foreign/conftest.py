@@ -17,8 +17,8 @@ from dynamixel_sdk import PortHandler
 from tests.foreign.patience import PATIENCE_S
 from tests.kit.bus_process import started
 
-from dxlrun.plan.simulation_plan import BusConfig
-from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.simulation_plan import BusConfig
 
 
 class Simulation:

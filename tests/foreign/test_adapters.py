@@ -20,7 +20,7 @@ from dynamixel_sdk import (
 )
 from tests.foreign.patience import PATIENCE_S
 
-from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 
 ADAPTERS = {
     "late": AdapterConfig(latency_timer_ns=16_000_000),

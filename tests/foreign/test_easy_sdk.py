@@ -18,8 +18,8 @@ from dynamixel_easy_sdk import (
 )
 from tests.foreign.patience import PATIENCE_S, until
 
-from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.control_table import all_tables, control_table
 
 NUMBERS = ControlTable.parsingModelList()
 MODELS = tuple(

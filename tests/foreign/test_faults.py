@@ -14,7 +14,7 @@ from dynamixel_sdk import (
 )
 from tests.foreign.patience import PATIENCE_S, until
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 ALERT = 0x80
 TORQUE, HARDWARE_ERROR = 64, 70

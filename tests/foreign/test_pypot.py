@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 IDS = range(11, 17)
 MIDDLE = 3.141593

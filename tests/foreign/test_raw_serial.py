@@ -16,7 +16,7 @@ import serial
 from tests.foreign.patience import PATIENCE_S
 from tests.kit.packets import crc, packet1, packet2
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 RATE = 1_000_000
 

@@ -9,8 +9,8 @@ import pytest
 import rustypot
 from tests.foreign.patience import PATIENCE_S, until
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.control_table import control_table
 
 RATE = 1_000_000
 POSITION = 2.0

@@ -11,7 +11,7 @@ import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite, Protocol1PacketHandler
 from tests.foreign.patience import PATIENCE_S, until
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 AX12, MX28 = 12, 29
 """Model numbers (e-Manual, control tables, Model Number (0))."""

@@ -20,7 +20,7 @@ from dynamixel_sdk import (
 )
 from tests.foreign.patience import until
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 XL430, XM430 = 1060, 1020
 """Model numbers (e-Manual, control tables, Model Number (0))."""

@@ -13,8 +13,8 @@ import pytest
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
 from tests.foreign.patience import until
 
-from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.control_table import ControlItem, control_table
 
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")
 FOLLOWER = {1: "XL430-W250", 2: "XL430-W250", **dict.fromkeys(range(3, 7), "XL330-M288")}

@@ -11,11 +11,11 @@ import pytest
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.compile.robot import compile_files
-from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import InputError, PortError, ServoFault
-from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.port.serial_open import open_serial
 
 ROBOT = """\
 # an arm

@@ -26,12 +26,12 @@ from dxlrun import connect
 from dxlrun.compile.robot import compile_files
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
-from dxlrun.dynamixel.control_table import ControlTable, control_table
-from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun_hand.commands.calibrate import calibrated
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.servo_setup import SetUp, factory_rate
 from dxlrun_hand.teaching import taught
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.control_table import ControlTable, control_table
 
 HANDS = int(os.environ.get("DXLRUN_HANDS", "3"))
 TAUGHT = int(os.environ.get("DXLRUN_TAUGHT", "0"))

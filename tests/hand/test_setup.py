@@ -12,11 +12,11 @@ from tests.kit.hands import HandLine, Script, interrupt, written
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id
 from dxlrun.errors import InputError, PortError
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
 from dxlrun_hand.servo_setup import SetUp
+from dxlsim.simulation_plan import ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
 
 ROBOT = """\
 name: arm

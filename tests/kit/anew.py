@@ -20,9 +20,9 @@ from dxlrun.channels.commands import CommandRing
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.messages import MessageRing, Topic
 from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.clock import VirtualClock
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
+from dxlwire.clock import VirtualClock
 
 Change = Callable[[Log], Log]
 OWN_METADATA, OWN_ATTACHMENT = ("dxlrun", "dxlrun_summary"), "header.json"

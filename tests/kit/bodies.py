@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import Plant
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.plant import Plant
 
 STEP_S = 0.002
 MASS, ARM = 0.5, 0.2

@@ -14,8 +14,8 @@ from typing import Any
 import msgspec
 
 from dxlrun.channels import process
-from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
-from dxlrun.simulation.messages import SimulationJob
+from dxlsim.messages import SimulationJob
+from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
 PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
@@ -31,7 +31,7 @@ def started(
     whole = config if isinstance(config, SimulationConfig) else SimulationConfig(tuple(config))
     job = process.memory_file("bus-process", msgspec.json.encode(SimulationJob(whole, **options)))
     ours, theirs = socket.socketpair()
-    command = [sys.executable, "-m", "dxlrun.simulation", "--job-fd", str(job)]
+    command = [sys.executable, "-m", "dxlsim", "--job-fd", str(job)]
     command += ["--control-fd", str(theirs.fileno())]
     inherited = (job, theirs.fileno())
     child = subprocess.Popen(command, pass_fds=inherited, stderr=errors, start_new_session=True)

@@ -19,8 +19,8 @@ from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.link import Loaded
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.table import Role
-from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import simulated_robot
+from dxlsim.bus.ledger import LedgerEntry
 
 MS = 1_000_000
 

@@ -18,9 +18,9 @@ from tests.kit.rigs import VirtualLine
 
 from dxlrun import running
 from dxlrun.dynamixel.tools.tool_line import TunablePort
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.simulation_plan import ServoConfig
 
 LOOK_NS = 20_000_000
 

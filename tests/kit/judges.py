@@ -20,10 +20,10 @@ from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
-from dxlrun.simulation.bus.ledger import FAULT, LedgerEntry
-from dxlrun.simulation.faults.fault import Fault, parse_fault
-from dxlrun.simulation.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun_analysis.plan import plan_of
+from dxlsim.bus.ledger import FAULT, LedgerEntry
+from dxlsim.faults.fault import Fault, parse_fault
+from dxlsim.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 
 WINDOW_NS = 2_000_000_000
 """An event that comes later reports something else [i]."""

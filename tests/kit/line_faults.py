@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from dxlrun.simulation.bus.line import Transmission, flipped
-from dxlrun.simulation.bus.simulated_bus import PacketFault, SimulatedBus
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.simulation.wire.packets import InstructionReceiver
+from dxlsim.bus.line import Transmission, flipped
+from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.wire.packets import InstructionReceiver
 
 STALLED = "the adapter stalls"
 OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins

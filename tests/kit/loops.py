@@ -14,13 +14,11 @@ from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.clock import VirtualClock
 from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import (
     ControllerPlan,
     JointPlan,
@@ -30,6 +28,8 @@ from dxlrun.plan.loop_plan import (
     ServoLimit,
 )
 from dxlrun.plan.policy_plan import SLOW_START_NS
+from dxlwire.clock import VirtualClock
+from dxlwire.modes import Mode
 
 PERIOD_NS = 20_000_000
 SCHEDULER = SchedulerPlan("other", 31, False)

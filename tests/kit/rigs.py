@@ -30,18 +30,18 @@ from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover
-from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.port.ports import OwnProcessors
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.clock import VirtualClock
+from dxlwire.control_table import control_table
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.port.ports import OwnProcessors
 
 MIDDLE = math.radians(150)
 X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)

@@ -34,14 +34,14 @@ from tests.kit.wire import (
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log
-from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.simulation.bus.ledger import LedgerEntry
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.client_commands import client_commands
+from dxlsim.bus.ledger import LedgerEntry
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlwire.bus_plan import BusPlan
 
 MS = 1_000_000
 SOME_CYCLES = 100

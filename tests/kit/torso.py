@@ -13,7 +13,7 @@ from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.wire import commands, taken_apart
 
 from dxlrun import running
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 JOINT, SERVO = "right_elbow_joint", 4

@@ -11,8 +11,8 @@ from typing import Literal, NamedTuple
 
 from tests.kit.packets import crc
 
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.simulation.bus.ledger import LedgerEntry
+from dxlsim.bus.ledger import LedgerEntry
+from dxlwire.bus_plan import BusPlan, ServoPlan
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x83, 0x82, 0x8A, 0x92

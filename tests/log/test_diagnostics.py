@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.description.modes import Mode
 from dxlrun.log import schemas
 from dxlrun.log.packing.diagnostics import DIAGNOSTICS_NS, Diagnostics
 from dxlrun.messages.cdr import Codec
+from dxlwire.modes import Mode
 
 JOINTS = ("elbow", "wheel", "head")
 

@@ -11,10 +11,10 @@ import pytest
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import LogFollower, read_log
+from dxlwire.clock import VirtualClock
 
 
 @pytest.fixture

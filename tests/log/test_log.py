@@ -30,13 +30,13 @@ from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import MOST_FAILED, Event, EventCode, EventRing, GoalReport, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
 from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
+from dxlwire.clock import VirtualClock
 
 Cycle = Callable[[int], bytes]
 PACKETS = [

@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
@@ -27,6 +26,7 @@ from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_analysis.cycles.latency import Punctuality
+from dxlwire.clock import VirtualClock
 
 SECOND = 1_000_000_000
 PER_SECOND = 50

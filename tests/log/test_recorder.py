@@ -26,10 +26,10 @@ from dxlrun.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
 from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
-from dxlrun.clock import VirtualClock
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
 from dxlrun.log.schemas import MACHINE_TOPIC, CycleSpan, LogHeader, RecorderJob
+from dxlwire.clock import VirtualClock
 
 Cycle = Callable[[int], bytes]
 

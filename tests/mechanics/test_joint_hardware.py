@@ -11,10 +11,10 @@ from tests.kit.rigs import Events
 
 from dxlrun.channels.cycle import Commands, States, Torque
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
 from dxlrun.plan.robot_plan import Plan
+from dxlwire.modes import Mode
 
 HIP, PITCH = 1, 3
 HIP_SERVOS = [1, 2]

@@ -28,7 +28,7 @@ from dxlrun.remote.network.certificates import client_context, keys_place
 from dxlrun.remote.network.network_link import NetworkLink
 from dxlrun.remote.requests.table import EXAMPLES, REQUESTS, Role
 from dxlrun.remote.sockets import Address, SocketLink, sockets
-from dxlrun.simulation.bus.ledger import read_ledger
+from dxlsim.bus.ledger import read_ledger
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 pytestmark = pytest.mark.timeout(600 if FRAMES <= 1000 else 0)

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import Torque
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlwire.control_table import control_table
+from dxlwire.plan.planning import Wiring, bus_plan
 
 GAIN = "/joints/pan/registers/position_p_gain"
 

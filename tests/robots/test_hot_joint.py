@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.simulation.motion import mechanics
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
+from dxlsim.motion import mechanics
 
 SECONDS = float(os.environ.get("DXLRUN_HOT_SECONDS", "18"))
 WHOLE = SECONDS >= 600

@@ -12,8 +12,8 @@ from tests.kit.clients import Ask, steered
 from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 SPEED = 0.5
 LIMIT = math.radians(60)

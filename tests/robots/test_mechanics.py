@@ -21,9 +21,9 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun_analysis.replay import replay_log
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT, MOTION = ROBOTS / "mechanics.yaml", ROBOTS / "motions" / "mechanics_reach.yaml"

@@ -17,10 +17,10 @@ from dxlrun.channels.events import EventCode
 from dxlrun.cli.steering.written import Written
 from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.client import RemoteGoal, RemoteRobot
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of
 from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 ROOT = Path(__file__).parents[2]
 PLAN = plan_of(ROOT / "robots" / "stand_up.yaml")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from tests.kit.clients import command_of, played
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation.motion.motor import motor_of
+from dxlsim.motion.motor import motor_of
+from dxlwire.control_table import control_table
 
 MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
 STEP_S = 3.0

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.control_table.devices import device_table
 from dxlrun.testing import simulated_robot
+from dxlwire.control_table import control_table
+from dxlwire.control_table.devices import device_table
 
 WOLFGANG = Path(__file__).parents[2] / "robots" / "wolfgang.yaml"
 MX_64, MX_106, XH540 = 311, 321, 1100

@@ -17,8 +17,8 @@ from tests.kit import wire
 from tests.kit.awaited import DEADLINE_S, until
 
 import dxlrun
-from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import plan_of
+from dxlsim.bus.ledger import LedgerEntry
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 PYTHON = os.getenv("DXLRUN_ROS2_PYTHON", "")

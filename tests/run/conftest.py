@@ -21,8 +21,8 @@ from tests.kit.wire import all_writes
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 from dxlrun_controllers.group import JointGroupPositionController
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\
@@ -97,7 +97,7 @@ class Running:
             except OSError:
                 continue
             if state not in "ZX" and command != [b""]:
-                modules = [word.decode() for word in command if word.startswith(b"dxlrun.")]
+                modules = [word.decode() for word in command if word.startswith((b"dxlrun.", b"dxlsim"))]
                 found[modules[0].removeprefix("dxlrun.") if modules else "dxlrun"] = int(path.name)
         return found
 

@@ -16,11 +16,11 @@ from dxlrun.compile import robot
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay, replay_log
 from dxlrun_analysis.report import analyze_log
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 HEAD = """\
 name: dozen

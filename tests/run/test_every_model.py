@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.testing import simulated_robot
+from dxlwire.control_table import control_table, model_names
 
 ROBOT = """\
 name: one

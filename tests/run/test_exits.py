@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_analysis.report import analyze
+from dxlsim.bus.ledger import read_ledger
 
 Running = Any
 Start = Callable[..., Any]
@@ -367,7 +367,7 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(odd, wait_for):
 def test_simulated_servos_that_are_gone_end_the_run(start, wait_for):
     run = start()
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.simulation"), signal.SIGKILL)
+    os.kill(run.child("dxlsim"), signal.SIGKILL)
     code, out, err = run.finish()
     assert code == 1
     assert "the simulated bus ended before the run did" in err
@@ -394,7 +394,7 @@ def test_a_run_listens_on_one_socket_that_only_its_user_may_open(start, listenin
     (path,) = map(Path, found.unix)
     assert stat.S_ISSOCK(path.stat().st_mode)
     assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
-    simulation = Path(f"/proc/{run.child('dxlrun.simulation')}/fd")
+    simulation = Path(f"/proc/{run.child('dxlsim')}/fd")
     terminals = {os.readlink(each) for each in simulation.iterdir()} | {
         os.readlink(each) for each in Path(f"/proc/{run.child('dxlrun.run.guardian')}/fd").iterdir()
     }

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import ProcessFault
 from dxlrun.output.json import json_text
-from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab.highest_rate import highest_rate
+from dxlsim.simulation_plan import AdapterConfig
 
 ROBOT = """
 name: two

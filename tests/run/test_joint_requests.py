@@ -18,12 +18,12 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.replay import replay_log
 from dxlrun_analysis.verdict import judge
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 MS = 1_000_000
 ROBOT = """\

@@ -18,9 +18,9 @@ from dxlrun.channels.cycle import Floats
 from dxlrun.channels.events import EventCode
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.policy_plan import SLOW_SPEED
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 MS = 1_000_000
 TICK = math.tau / 4096

@@ -7,9 +7,9 @@ import pytest
 from tests.kit.stories import replayed, send, switch, tell
 
 from dxlrun.channels.events import EventCode
-from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log, read_log
 from dxlrun_analysis.client_commands import client_commands
+from dxlwire.modes import Mode
 
 ROBOT = """\
 name: wheels

@@ -8,8 +8,8 @@ from tests.kit.stories import Clients, send, switch
 from tests.kit.wire import BROADCAST, SYNC_WRITE, WRITE, instructions, writes
 
 from dxlrun.channels.answers import Done
-from dxlrun.description.modes import Mode
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
+from dxlwire.modes import Mode
 
 ROBOT = """\
 name: cart

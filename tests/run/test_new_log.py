@@ -14,7 +14,7 @@ from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.run.run_log import discard_log, new_log
-from dxlrun.simulation.bus.ledger import Ledger
+from dxlsim.bus.ledger import Ledger
 
 
 @pytest.fixture

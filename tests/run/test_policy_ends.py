@@ -16,12 +16,12 @@ from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
-from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.run.guardian import SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
-from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import plan_of, simulated_robot
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.exchange.bus import Lines
 
 Start = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("no_memory_left")

@@ -10,12 +10,12 @@ from tests.kit.judges import log_has_every_byte
 
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.bus.ledger import Ledger, read_ledger
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of
+from dxlsim.bus.ledger import Ledger, read_ledger
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.simulation_plan import AdapterConfig
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

@@ -10,10 +10,10 @@ from tests.kit.line_faults import other_host
 
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim
-from dxlrun.plan.simulation_plan import SimulationConfig
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.testing import simulated_robot
+from dxlsim.messages import SimulationMessage
+from dxlsim.simulation_plan import SimulationConfig
 
 BOARD = """\
 kind = "device"

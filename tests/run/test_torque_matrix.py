@@ -33,14 +33,14 @@ from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.remote.preparation import Preparation
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlwire.modes import Mode
 
 MS = 1_000_000
 TURN = math.radians(100)

@@ -30,7 +30,7 @@ from tests.kit.answers import result_of
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketKind
-from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 A_RUN = 10

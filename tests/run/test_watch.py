@@ -23,15 +23,11 @@ from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, Proces
 from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
-from dxlrun.clock import VirtualClock
 from dxlrun.compile.robot import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.reading import read_robot
-from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.port.ports import StallCounter
-from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.process_table import read_stat
 from dxlrun.run import supervisor, watch
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
@@ -48,10 +44,14 @@ from dxlrun.run.watch import (
     duty_of,
     standstill_timeout_ns,
 )
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import plan_of
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
+from dxlwire.exchange import bus
+from dxlwire.port.ports import StallCounter
+from dxlwire.port.reopening import KeptLines
 
 pytestmark = pytest.mark.usefixtures("no_memory_left")
 

@@ -12,12 +12,12 @@ import pytest
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
 from dxlrun.contract.body import Shafts
-from dxlrun.plan.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint
 from dxlrun.run.sensor_process import RemoteBody
-from dxlrun.simulation.motion.body import SensedBody, ShaftsShown, SimulatedBody
-from dxlrun.simulation.motion.control_law import LIMP
-from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
-from dxlrun.simulation.motion.motor import Motor
+from dxlsim.motion.body import SensedBody, ShaftsShown, SimulatedBody
+from dxlsim.motion.control_law import LIMP
+from dxlsim.motion.mechanics import STEP_NS, Mechanics
+from dxlsim.motion.motor import Motor
+from dxlsim.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint
 
 TORSO = (Path(__file__).parents[2] / "robots/urdf/bioloid_torso.urdf").read_text()
 LINK = (

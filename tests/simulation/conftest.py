@@ -15,12 +15,12 @@ import pytest
 from tests.kit.bus_process import PATIENCE_S, bare
 from tests.kit.packets import crc, packet1, packet2
 
-from dxlrun.clock import VirtualClock
-from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
-from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger, LedgerEntry, read_ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
 
 
 class Answer(NamedTuple):

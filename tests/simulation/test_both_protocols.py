@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.servo.making import make_servo
+from dxlsim.servo.making import make_servo
+from dxlsim.simulation_plan import ServoConfig
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, CLEAR = 1, 2, 3, 4, 5, 6, 0x10
 SYNC_WRITE, BULK_READ, BULK_WRITE = 0x83, 0x92, 0x93

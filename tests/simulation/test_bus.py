@@ -4,9 +4,9 @@ import pytest
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.packets import packet1
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

@@ -27,9 +27,9 @@ from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
-from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlsim.faults.kinds import KINDS
+from dxlwire.bus_plan import BusPlan
 
 MS = 1_000_000
 SYNC_WRITE = 0x83

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
-from dxlrun.plan.simulation_plan import NO_LOAD, CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
-from dxlrun.simulation.motion.control_law import ServoCommand
-from dxlrun.simulation.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
-from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
-from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
+from dxlsim.motion.control_law import ServoCommand
+from dxlsim.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
+from dxlsim.motion.mechanics import Mechanics, plant_of
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
+from dxlsim.simulation_plan import NO_LOAD, CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
 
 S = 1_000_000_000
 RUBBING = msgspec.structs.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)

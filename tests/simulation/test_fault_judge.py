@@ -12,10 +12,10 @@ from tests.kit.judges import log_has_every_byte
 from tests.kit.line_faults import OTHER_HOST, other_host
 
 from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.dynamixel.wire import protocol2
 from dxlrun.log.reader import Log, read_log
-from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import simulated_robot
+from dxlsim.bus.ledger import LedgerEntry
+from dxlwire.wire import protocol2
 
 THREE = {"main": (2.0, 3)}
 FAULT = "silence servo=2 at=500ms for=200ms"

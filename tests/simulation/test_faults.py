@@ -9,8 +9,8 @@ import pytest
 from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.errors import InputError, PortError
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 PING, READ, WRITE = 0x01, 0x02, 0x03
 TORQUE_ENABLE, LED = 24, 25

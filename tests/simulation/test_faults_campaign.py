@@ -26,8 +26,8 @@ from tests.kit import storms
 from dxlrun.channels.answers import Answer, Code, Refusal, Waiting
 from dxlrun.channels.commands import Command
 from dxlrun.log.reader import read_log
-from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlsim.faults.kinds import KINDS
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml", ROBOTS / "motions/three_parts.yaml"

@@ -8,10 +8,10 @@ import pytest
 from tests.kit.packets import packet1, packet2
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.kinds import DEVICE, KINDS
-from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.faults.values import READERS
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.kinds import DEVICE, KINDS
+from dxlsim.faults.script import FaultScript
+from dxlsim.faults.values import READERS
 
 MS = 1_000_000
 VALUES: dict[str, tuple[str, ...]] = {

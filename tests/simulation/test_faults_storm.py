@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from dxlrun.clock import VirtualClock
 from dxlrun.errors import InputError
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.kinds import PASSING
-from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.kinds import PASSING
+from dxlsim.faults.script import FaultScript
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
 
 READ = 0x02
 MS = 1_000_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault import fault_help, parse_fault
-from dxlrun.simulation.faults.kinds import KINDS
-from dxlrun.simulation.faults.values import READERS
+from dxlsim.faults.fault import fault_help, parse_fault
+from dxlsim.faults.kinds import KINDS
+from dxlsim.faults.values import READERS
 
 LINES = (
     "lose servo=3 at=2s",

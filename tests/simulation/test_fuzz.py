@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.bench import fuzz_simulation
 from tests.kit.packets import crc, packet1, packet2
 
-from dxlrun.simulation.wire.protocol1 import ErrorBit
+from dxlsim.wire.protocol1 import ErrorBit
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)

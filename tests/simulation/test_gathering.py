@@ -9,9 +9,9 @@ import pytest
 from tests.kit.line_faults import corrupt_next, delay_next, truncate_next
 from tests.kit.packets import packet2
 
-from dxlrun.plan.simulation_plan import AdapterConfig, BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.ledger import Ledger, LedgerEntry
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 
 MICROFRAME_NS = 125_000
 SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x82, 0x8A, 0x92

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.plan.simulation_plan import Load, ServoConfig
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.servo.making import make_servo
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import motor_of
+from dxlsim.servo.making import make_servo
+from dxlsim.simulation_plan import Load, ServoConfig
+from dxlwire.control_table import all_tables, control_table
 
 S = 1_000_000_000
 

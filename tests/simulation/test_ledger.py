@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.errors import LogError
-from dxlrun.simulation.bus.ledger import FLUSH_NS, Ledger, LedgerEntry, read_ledger
+from dxlsim.bus.ledger import FLUSH_NS, Ledger, LedgerEntry, read_ledger
 
 ENTRIES = (
     LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),

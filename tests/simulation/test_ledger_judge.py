@@ -10,7 +10,7 @@ import pytest
 from tests.kit import judges
 
 from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.simulation.bus.ledger import LedgerEntry
+from dxlsim.bus.ledger import LedgerEntry
 
 SERVOS = {"main": {3: "elbow", 5: "wrist"}, "legs": {3: "knee"}}
 PLAN = {

@@ -10,13 +10,13 @@ import pytest
 import serial
 from tests.kit.packets import packet2
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import motor_of
+from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.control_table import control_table
 
 TICK = math.tau / 4096
 MASS, ARM = 0.5, 0.2

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.servo.making import make_servo
-from dxlrun.simulation.wire.protocol2 import ErrorNumber
+from dxlsim.servo.making import make_servo
+from dxlsim.simulation_plan import ServoConfig
+from dxlsim.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
 SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A

@@ -7,10 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table
-from dxlrun.plan.simulation_plan import Load
-from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
-from dxlrun.simulation.motion.mechanics import (
+from dxlsim.motion.control_law import LIMP, ServoCommand
+from dxlsim.motion.mechanics import (
     AMBIENT_C,
     COOLING_S,
     EAGER_NS,
@@ -19,7 +17,9 @@ from dxlrun.simulation.motion.mechanics import (
     STEP_NS,
     Mechanics,
 )
-from dxlrun.simulation.motion.motor import Motor, motor_of
+from dxlsim.motion.motor import Motor, motor_of
+from dxlsim.simulation_plan import Load
+from dxlwire.control_table import ControlTable, all_tables, control_table
 
 MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12.0, inertia=0.003)
 S = 1_000_000_000

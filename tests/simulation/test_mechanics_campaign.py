@@ -26,13 +26,13 @@ from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import LIMP
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.kinds import KINDS
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import replay_log
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.kinds import KINDS
+from dxlsim.faults.script import FaultScript
+from dxlwire.bus_plan import BusPlan, ServoPlan
 
 SEED = os.environ.get("DXLRUN_MECHANICS_SEED", "1")
 RUNS = int(os.environ.get("DXLRUN_MECHANICS_RUNS", "1"))

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
-from dxlrun.plan.simulation_plan import ServoConfig
-from dxlrun.simulation.servo.making import make_servo
-from dxlrun.simulation.wire.packets import InstructionPacket
+from dxlsim.servo.making import make_servo
+from dxlsim.simulation_plan import ServoConfig
+from dxlsim.wire.packets import InstructionPacket
+from dxlwire.control_table import ControlItem, ControlTable, all_tables
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]
 NEW = [table for table in all_tables() if table.protocol == 2.0]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.plan.simulation_plan import Load
-from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.wire.protocol2 import ErrorNumber
+from dxlsim.motion.motor import motor_of
+from dxlsim.simulation_plan import Load
+from dxlsim.wire.protocol2 import ErrorNumber
+from dxlwire.control_table import control_table
 
 TICK = math.tau / 4096
 RPM = math.tau / 60

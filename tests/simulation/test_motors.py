@@ -15,14 +15,14 @@ import pytest
 from msgspec import structs
 
 from dxlrun import MotorModel, Stribeck
-from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.plan.simulation_plan import Load, ServoConfig
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint
-from dxlrun.simulation.motion.shaft import critical_d
-from dxlrun.simulation.servo.making import make_servo
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import motor_of
+from dxlsim.motion.plant import IndependentJoints, PlantJoint
+from dxlsim.motion.shaft import critical_d
+from dxlsim.servo.making import make_servo
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.simulation_plan import Load, ServoConfig
+from dxlwire.control_table import all_tables, control_table
 
 S, STEP_NS = 1_000_000_000, 2_000_000
 START = 1.0

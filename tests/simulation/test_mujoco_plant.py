@@ -13,11 +13,11 @@ import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
 from dxlrun.errors import InputError
-from dxlrun.plan.simulation_plan import NO_LOAD, Load, UrdfBodies, UrdfJoint
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
+from dxlsim.simulation_plan import NO_LOAD, Load, UrdfBodies, UrdfJoint
 
 RUBBING = msgspec.structs.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import (
+from dxlsim.wire import protocol1, protocol2
+from dxlsim.wire.packets import (
     BROADCAST,
     GroupRead,
     InstructionPacket,
@@ -18,7 +18,7 @@ from dxlrun.simulation.wire.packets import (
     ReadEntry,
     ServoReply,
 )
-from dxlrun.simulation.wire.protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
+from dxlsim.wire.protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
 
 ONE, TWO = protocol1.CODEC, protocol2.CODEC
 MANY = settings(max_examples=200, deadline=None)

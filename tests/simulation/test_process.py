@@ -18,13 +18,13 @@ import rustypot
 import serial
 from tests.kit.bus_process import PATIENCE_S, bare, opened, receive
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlrun.simulation.bus.ledger import Ledger, read_ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlrun.simulation.realtime import PollBudget
-from dxlrun.simulation.server import _WRITTEN, lateness_us
+from dxlsim.bus.ledger import Ledger, read_ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.pseudo_terminal import DeviceLink, PseudoTerminal
+from dxlsim.realtime import PollBudget
+from dxlsim.server import _WRITTEN, lateness_us
+from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
+from dxlwire.control_table import control_table
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.motion.control_law import LIMP, Profiles, ServoCommand
+from dxlsim.motion.control_law import LIMP, Profiles, ServoCommand
 
 DT = 0.002
 

@@ -20,13 +20,13 @@ from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log, read_log
-from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
 from dxlrun.run import virtual_run
 from dxlrun.run.simulation_front import Served
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.recorded_bus import RecordedBus
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.messages import SimulationJob, SimulationMessage
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.recorded_bus import RecordedBus
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.messages import SimulationJob, SimulationMessage
+from dxlsim.simulation_plan import BusConfig, SimulationConfig
 from exchange.simulated import SimulatedServos
 
 ROBOT = """\

@@ -5,9 +5,9 @@ import math
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation.registers.memory import Memory
-from dxlrun.simulation.wire.protocol1 import ErrorBit
+from dxlsim.registers.memory import Memory
+from dxlsim.wire.protocol1 import ErrorBit
+from dxlwire.control_table import control_table
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
 BROADCAST = 0xFE

@@ -8,7 +8,7 @@ from unittest.mock import ANY
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.simulation.wire.protocol2 import ErrorNumber
+from dxlsim.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 0x10
 SYNC_WRITE, BULK_WRITE = 0x83, 0x93

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, ServoTimes
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig, ServoTimes
 
 MS = 1_000_000
 

@@ -16,16 +16,16 @@ from tests.kit.rigs import make_plan
 from dxlrun.channels import process
 from dxlrun.channels.heartbeat import SimulationProgress, create_progress
 from dxlrun.channels.packets import PacketSink
-from dxlrun.clock import MonotonicClock
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import ReplyTimes, extend_timeouts
-from dxlrun.dynamixel.port.ports import SerialPorts, SimulatedPort, StallCounter
-from dxlrun.dynamixel.port.serial_open import open_serial
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlrun.plan.transaction import Outcome, Program, Reply
 from dxlrun.run.simulation_front import first_message, start_simulation
-from dxlrun.simulation.messages import SimulationJob
+from dxlsim.messages import SimulationJob
+from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
+from dxlwire.clock import MonotonicClock
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.planning import plan_line
+from dxlwire.plan.retry import ReplyTimes, extend_timeouts
+from dxlwire.port.ports import SerialPorts, SimulatedPort, StallCounter
+from dxlwire.port.serial_open import open_serial
+from dxlwire.transaction import Outcome, Program, Reply
 
 IDS = (1, 2)
 PLAN = make_plan(IDS)

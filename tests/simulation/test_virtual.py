@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import pytest
 
-from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.errors import PortError
-from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
+from dxlwire.port.ports import Ports
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

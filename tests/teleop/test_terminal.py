@@ -19,8 +19,8 @@ from tests.kit.driven import changes
 from tests.kit.hands import CODE, DEADLINE_S, Screen
 
 from dxlrun import RemoteRobot, connect, running
-from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun.testing import plan_of
+from dxlsim.bus.ledger import read_ledger
 
 ROBOT = Path(__file__).parents[2] / "robots" / "diff_drive.yaml"
 GOAL_VELOCITY = 104

@@ -25,9 +25,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError
 from dxlrun.log.reader import Log, LogReader
+from dxlwire.modes import COMMAND_INTERFACES
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

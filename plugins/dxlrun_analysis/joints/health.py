@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.dynamixel.control_table import Fault
 from dxlrun.log.reader import Log
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
+from dxlwire.control_table import Fault
 
 Numbers = NDArray[np.int64]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun.dynamixel.control_table import ControlTable, Fault, HardwareErrors, control_table
 from dxlrun.log.reader import Log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
+from dxlwire.control_table import ControlTable, Fault, HardwareErrors, control_table
 
 _TICK_RAD = math.tau / 4096  # Where the log's plan does not have the servo's
 _NEAREST = (

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import CycleRecord, Floats
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun_analysis.replay.inputs import RecordedHardware
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
+from dxlwire.modes import COMMAND_INTERFACES
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)

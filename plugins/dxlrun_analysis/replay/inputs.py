@@ -19,12 +19,12 @@ from dxlrun.channels.commands import Command, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, States
 from dxlrun.channels.events import EventCode
 from dxlrun.control.loop import StopFlag
-from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, PortError
 from dxlrun.log.reader import UNREADABLE
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlrun_analysis.client_commands import ClientCommand
 from dxlrun_analysis.replay.recorded import RecordedInputs
+from dxlwire.modes import COMMAND_INTERFACES
 
 _STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
-from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos import requests
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
+from dxlwire.transaction import BROADCAST_ID
 
 _ROWS = 40  # Bits of an exchange's index in a key; above them the servo
 _BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s

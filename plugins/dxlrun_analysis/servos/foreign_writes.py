@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 from dxlrun.channels.events import Event, EventCode
 from dxlrun.channels.packets import LoggedPacket
-from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.finding import HURTS, listed
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
+from dxlwire.control_table import control_table
+from dxlwire.transaction import BROADCAST_ID
+from dxlwire.wire import protocol1, protocol2
 
 _AFTER_NS = 2_000_000_000  # A servo that fails so soon after it was written to fails by that
 _MOST_KEPT = 1000

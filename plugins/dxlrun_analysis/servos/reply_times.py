@@ -22,15 +22,15 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from dxlrun.dynamixel.port.remedies import late_replies
 from dxlrun.errors import counted
-from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
+from dxlwire.port.remedies import late_replies
+from dxlwire.transaction import BROADCAST_ID
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
 """Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone

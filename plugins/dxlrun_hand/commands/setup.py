@@ -12,9 +12,9 @@ from dxlrun.errors import InputError
 from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
-    from dxlrun.plan.bus_plan import BusPlan
     from dxlrun_hand.lines import Devices, Opened
     from dxlrun_hand.servo_setup import SetUp
+    from dxlwire.bus_plan import BusPlan
 
 
 def setup(
@@ -39,10 +39,10 @@ def setup(
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     """
     from dxlrun.description.reading import read_robot
-    from dxlrun.dynamixel.port.adapters import serial_devices
     from dxlrun.dynamixel.tools.tool_line import TunablePort
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.servo_setup import SetUp
+    from dxlwire.port.adapters import serial_devices
 
     known_file(robot)
     load_models()

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import Refused
 from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
 from dxlrun_lab.characterize.measured import Measured, not_measured
@@ -19,6 +18,7 @@ from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
 from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlwire.control_table import control_table
 
 Measurement = Literal["rate", "response", "speed", "dead_band", "gap"]
 MEASUREMENTS: Final[tuple[Measurement, ...]] = get_args(Measurement)

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun_lab.guided.experiment import Joint
 from dxlrun_lab.guided.segment import Recorded
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.plan.line import BITS_PER_BYTE
 
 
 class Trace(msgspec.Struct, frozen=True):

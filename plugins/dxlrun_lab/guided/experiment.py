@@ -13,13 +13,13 @@ from typing import Final, Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from dxlrun.description.modes import Mode, mode_of
 from dxlrun.errors import DxlrunError, Refused
-from dxlrun.plan.bus_plan import ServoPlan
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunGone
 from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
+from dxlwire.bus_plan import ServoPlan
+from dxlwire.modes import Mode, mode_of
 
 APPROACH_RAD_S: Final = 0.5
 """Highest speed on the way to where a segment begins."""

@@ -15,10 +15,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.description.modes import Mode
 from dxlrun.errors import InputError
 from dxlrun_lab.identify.model import STEP_S, Control, Floats, Pieces
 from dxlrun_lab.identify.servo import Servo
+from dxlwire.modes import Mode
 
 PIECE_S = 1.0
 """s of a piece that are compared"""

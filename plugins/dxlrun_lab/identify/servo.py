@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.errors import InputError, suggestion
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.plan.robot_plan import Plan, from_json
-from dxlrun.simulation.motion.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P
-from dxlrun.simulation.motion.mode_shaft import SAMPLING_S
-from dxlrun.simulation.motion.motor import Motor, motor_of
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
+from dxlsim.motion.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P
+from dxlsim.motion.mode_shaft import SAMPLING_S
+from dxlsim.motion.motor import Motor, motor_of
+from dxlwire.control_table import ControlTable, control_table
 
 
 class Servo(msgspec.Struct, frozen=True):

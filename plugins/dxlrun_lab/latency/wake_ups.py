@@ -17,12 +17,12 @@ import time
 import msgspec
 
 from dxlrun.channels.shared_memory import store
-from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Pacing
 from dxlrun.control.schedule import Schedule
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun_lab.latency.buffer import Buffer, Place
+from dxlwire.clock import Clock, MonotonicClock
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 

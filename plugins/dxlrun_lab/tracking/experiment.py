@@ -17,11 +17,11 @@ from dxlrun.output.terminal import show
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
-from dxlrun.simulation.bus.ledger import read_ledger
 from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion
 from dxlrun_lab.tracking.setups import Setup
+from dxlsim.bus.ledger import read_ledger
 
 _INTERRUPTED = 130
 

@@ -14,8 +14,8 @@ from dxlrun.errors import StartUpError
 
 _HINT = "install dxlrun again"
 SOURCES = tuple(
-    Path(__file__).parents[1] / name
-    for name in ("channels/shared_memory.c", "control/gate.c", "dynamixel/exchange/kernel.c")
+    Path(__file__).parents[2] / name
+    for name in ("dxlrun/channels/shared_memory.c", "dxlrun/control/gate.c", "dxlwire/exchange/kernel.c")
 )
 """All that the build compiles."""
 Library = TypeVar("Library", bound=ctypes.CDLL)

@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from dxlrun.channels.ring import RING_SECONDS, record_size
-from dxlrun.description.modes import COMMAND_INTERFACES
+from dxlwire.modes import COMMAND_INTERFACES
 
 Floats = NDArray[np.float64]
 """Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum where the servo measures no torque."""

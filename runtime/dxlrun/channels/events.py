@@ -11,7 +11,7 @@ import msgspec
 from msgspec import structs
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
-from dxlrun.clock import Clock
+from dxlwire.clock import Clock
 
 
 @unique

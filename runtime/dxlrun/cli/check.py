@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dxlrun.compile.report import PolicyRow, Row
     from dxlrun.compile.robot import Compiled
     from dxlrun.dynamixel.tools.inspection import DeviationRow, Found, RegisterRow
-    from dxlrun.plan.bus_plan import BusPlan
+    from dxlwire.bus_plan import BusPlan
 
 
 def check(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from dxlrun.channels.packets import PacketSink
     from dxlrun.compile.robot import Ask, Compiled
-    from dxlrun.plan.bus_plan import BusPlan
+    from dxlwire.bus_plan import BusPlan
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 """An option without a value."""

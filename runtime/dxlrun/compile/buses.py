@@ -16,15 +16,15 @@ from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
-from dxlrun.description.modes import Mode
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.control_table import ControlTable, control_table
-from dxlrun.dynamixel.control_table.device_table import DeviceTable
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
 from dxlrun.errors import suggestion
-from dxlrun.plan.bus_plan import Budget, BusPlan
+from dxlwire.bus_plan import Budget, BusPlan
+from dxlwire.control_table import ControlTable, control_table
+from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.modes import Mode
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.plan.reads import slow_items
 
 FAST_LATENCY_NS = 1_000_000  # The shortest latency timer of an FTDI adapter (protocol.md, Time budget)
 _COMFORTABLE = 0.9

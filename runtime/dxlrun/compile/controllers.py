@@ -24,13 +24,13 @@ from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.mistakes.foreign import ros_type
-from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.description.problems import errors_between_keys, problems_of
 from dxlrun.description.reading import Description
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
+from dxlwire.modes import CommandName, Mode, mode_of
+from dxlwire.plan.mode_plan import LACKS, controls_speed, model_modes
 
 _RATE_TOLERANCE = 1e-6  # Relative; a loop rate of 33.3 Hz is three times 11.1 Hz
 _OFFERED = (

@@ -16,14 +16,14 @@ from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable, read_device_table
-from dxlrun.dynamixel.control_table.devices import device_table, perhaps_meant_device
-from dxlrun.dynamixel.plan.devices import device_blocks, device_command
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import Mark, suggestion
-from dxlrun.plan.bus_plan import DeviceCommand, DevicePlan
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
+from dxlwire.bus_plan import DeviceCommand, DevicePlan
+from dxlwire.control_table.device_table import DeviceItem, DeviceTable, read_device_table
+from dxlwire.control_table.devices import device_table, perhaps_meant_device
+from dxlwire.plan.devices import device_blocks, device_command
+from dxlwire.plan.line import Line
+from dxlwire.wire.dialect import dialect_of
 
 
 class CompiledDevice(msgspec.Struct, frozen=True):

@@ -11,9 +11,7 @@ from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
 from dxlrun.description.units import distance_text
-from dxlrun.dynamixel.plan.planning import torque_off_ns
 from dxlrun.errors import suggestion
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.policy_plan import (
     HOLD,
     LIMP,
@@ -26,6 +24,8 @@ from dxlrun.plan.policy_plan import (
     Step,
     longest_pose_ns,
 )
+from dxlwire.bus_plan import BusPlan
+from dxlwire.plan.planning import torque_off_ns
 
 MARGIN_NS = 100_000_000
 """For the processor, and for servos that answer only the second time, while torque is switched off."""

@@ -15,10 +15,10 @@ from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.plan.bus_plan import BusPlan, DevicePlan, ServoPlan
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
+from dxlwire.bus_plan import BusPlan, DevicePlan, ServoPlan
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""

@@ -43,9 +43,9 @@ from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
+from dxlwire.bus_plan import BusPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import Row

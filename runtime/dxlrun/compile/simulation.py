@@ -15,11 +15,9 @@ from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import SIMULATED, Bus
 from dxlrun.description.joints.motor import MotorLoad
-from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.errors import InputError, suggestion
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.robot_plan import Plan, SimulationPlan
-from dxlrun.plan.simulation_plan import (
+from dxlsim.simulation_plan import (
     NO_LOAD,
     WHOLE_REPLIES,
     AdapterConfig,
@@ -36,10 +34,12 @@ from dxlrun.plan.simulation_plan import (
     UrdfBodies,
     UrdfJoint,
 )
+from dxlwire.bus_plan import BusPlan
+from dxlwire.control_table import added_control_tables
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
-    from dxlrun.plan.bus_plan import ServoPlan
+    from dxlwire.bus_plan import ServoPlan
 
 NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
 INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
@@ -230,7 +230,7 @@ def simulation_of(plan: Plan) -> SimulationConfig:
     if plan.simulation.physics != "independent":
         if sensed is None:
             raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
-        from dxlrun.simulation.motion.mechanics import plant_of  # not above: no check needs it
+        from dxlsim.motion.mechanics import plant_of  # not above: no check needs it
 
         bodies = sensed.bodies
         plant_of(bodies, sensed.couplings)

@@ -16,8 +16,8 @@ from dxlrun.channels.cycle import Commands, Floats, States
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
-from dxlrun.description.modes import CommandName
 from dxlrun.errors import ControllerFault
+from dxlwire.modes import CommandName
 
 
 class CommandModel(BaseModel):

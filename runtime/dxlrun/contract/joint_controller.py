@@ -12,8 +12,8 @@ from pydantic.errors import PydanticUserError
 from dxlrun.channels.cycle import Floats
 from dxlrun.contract.controller import LIVE, Context, Controller, Interfaces
 from dxlrun.description.form import ParametersModel
-from dxlrun.description.modes import CommandName
 from dxlrun.errors import ControllerFault, counted
+from dxlwire.modes import CommandName
 
 LAWS: dict[str, CommandName] = {"positions": "position", "velocities": "velocity", "efforts": "effort"}
 """Methods of a JointController, and the command interface that each of them claims."""

@@ -15,8 +15,8 @@ from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import STILL, STILL_LINEAR
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode
 
 MOVED = 0.0873
 """rad; 5 deg: a joint that was moved farther in a pause begins again where it is. One that follows an effort

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
+from dxlwire.modes import Mode
 
 SOURCE = Path(__file__).with_name("gate.c")
 STRUCTS = structs(SOURCE.read_text())

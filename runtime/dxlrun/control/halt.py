@@ -9,8 +9,8 @@ import numpy as np
 from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord
 from dxlrun.control.controllers.switching import Switching
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode
 
 STILL = 0.1
 """rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,

@@ -14,7 +14,6 @@ from dxlrun.channels.answers import Answer
 from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.clock import Clock
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.controllers.activity import is_interrupt
@@ -30,6 +29,7 @@ from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan, ServoLimit
 from dxlrun.plan.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
+from dxlwire.clock import Clock
 
 
 class StopFlag(msgspec.Struct):

@@ -21,8 +21,8 @@ from typing import ParamSpec
 import msgspec
 
 from dxlrun.channels.events import EventCode, EventSink, Granted, Severity
-from dxlrun.clock import MonotonicClock
 from dxlrun.plan.loop_plan import MOST_SHARE, Policy, SchedulerPlan
+from dxlwire.clock import MonotonicClock
 
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _RESET_ON_FORK = 1  # SCHED_FLAG_RESET_ON_FORK, linux/sched.h: for this process, not for its children

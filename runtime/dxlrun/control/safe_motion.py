@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
 from dxlrun.contract.hardware import Hardware
-from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
+from dxlwire.modes import Mode
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""

@@ -12,16 +12,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
-from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, Lines
-from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
-from dxlrun.dynamixel.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
-from dxlrun.dynamixel.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
-from dxlrun.dynamixel.exchange.samples import Samples
-from dxlrun.dynamixel.plan.retry import limit_patience, pause
-from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
 from dxlrun.dynamixel.servo.life import Done
@@ -31,8 +22,17 @@ from dxlrun.dynamixel.servo.startup import StartUp, report_failures
 from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits, restore_torque_limits
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.loop_plan import ServoLimit
+from dxlwire.bus_plan import BusPlan
+from dxlwire.clock import Clock
+from dxlwire.exchange.bus import LATE_NS, NEVER, Bus, Lines
+from dxlwire.exchange.cyclic_reads import MOST_BROKEN
+from dxlwire.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
+from dxlwire.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
+from dxlwire.exchange.samples import Samples
+from dxlwire.plan.retry import limit_patience, pause
+from dxlwire.port.ports import Ports
+from dxlwire.port.remedies import CHECK, choose_remedy
 
 STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
 LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then

@@ -10,8 +10,8 @@ import msgspec
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
-from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
+from dxlwire.modes import Mode
 
 if TYPE_CHECKING:
     from dxlrun.channels.cycle import CycleLayout

@@ -9,11 +9,11 @@ import msgspec
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.errors import Mark
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.plan.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
+from dxlsim.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
+from dxlwire.bus_plan import BusPlan, ServoPlan
 
 
 class SimulationPlan(msgspec.Struct, frozen=True):

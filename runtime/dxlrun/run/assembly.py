@@ -14,7 +14,6 @@ from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink
 from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.ring import Appender, RecordKind
-from dxlrun.clock import Clock
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
@@ -26,9 +25,10 @@ from dxlrun.control.sensors.readings import Readings
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
-from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
+from dxlwire.clock import Clock
+from dxlwire.port.ports import Ports
 
 
 @dataclass(slots=True)

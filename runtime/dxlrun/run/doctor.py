@@ -26,10 +26,10 @@ from dxlrun.control.realtime import (
     lockable_bytes,
     user,
 )
-from dxlrun.dynamixel.port.adapters import ONBOARD_PORTS, USB_PORTS, disturbances
-from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
-from dxlrun.dynamixel.port.rights import command_for_access, serial_group
-from dxlrun.dynamixel.port.serial_open import is_rate, open_serial
+from dxlwire.port.adapters import ONBOARD_PORTS, USB_PORTS, disturbances
+from dxlwire.port.latency_timer import fix, timer_ms
+from dxlwire.port.rights import command_for_access, serial_group
+from dxlwire.port.serial_open import is_rate, open_serial
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""

@@ -30,18 +30,18 @@ from dxlrun.channels.packets import PacketBatch, salvage
 from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
-from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts, SimulatedPort, StallCounter
-from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
-from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
+from dxlwire.bus_plan import BusPlan
+from dxlwire.clock import MonotonicClock
+from dxlwire.exchange.bus import Lines
+from dxlwire.port.ports import SerialPort, SerialPorts, SimulatedPort, StallCounter
+from dxlwire.port.reopening import KeptLines, Wanted
 
 _NEVER = 1 << 62
 

@@ -25,12 +25,12 @@ from dxlrun.channels.kept import (
 from dxlrun.channels.messages import OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Gap, Payload, RecordKind, RingReader
 from dxlrun.channels.tagged import decode
-from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.messages.cdr import Codec
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.plan.simulation_plan import NO_LOAD
+from dxlsim.simulation_plan import NO_LOAD
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.port.latency_timer import is_simulated
 
 SUFFIX = ".kept"
 _POLL_S = 0.1

@@ -31,20 +31,12 @@ from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.process import LineReturned, MessageChannel
 from dxlrun.channels.ring import RingWriter
 from dxlrun.channels.shared_memory import mapped
-from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.realtime import Pacing
 from dxlrun.dynamixel.hardware import TAKEN_BACK
-from dxlrun.dynamixel.port.ports import (
-    MOST_SHARE,
-    ReplyPolling,
-    SerialPorts,
-    StallCounter,
-)
-from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, StartUpError, counted
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun.plan.machine_load import SimulationWait
@@ -53,6 +45,14 @@ from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.guardian import LoopJob, make_ports
 from dxlrun.run.watch import Duty, LoopWatch
+from dxlwire.clock import MonotonicClock
+from dxlwire.port.ports import (
+    MOST_SHARE,
+    ReplyPolling,
+    SerialPorts,
+    StallCounter,
+)
+from dxlwire.port.reopening import LinesAgain
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):

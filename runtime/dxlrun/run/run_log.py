@@ -14,7 +14,6 @@ from msgspec.structs import replace
 
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
-from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
 from dxlrun.log.log_file import LOG_MODE
@@ -22,6 +21,7 @@ from dxlrun.log.part_writer import FOLDER_MODE
 from dxlrun.log.schemas import KEPT_ATTACHMENT, LogHeader
 from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
+from dxlwire.port.latency_timer import is_simulated
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic")
 

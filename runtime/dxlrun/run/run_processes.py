@@ -29,7 +29,7 @@ from dxlrun.run.guardian import GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob
 from dxlrun.run.simulation_front import first_message, start_simulation
-from dxlrun.simulation.messages import SimulationJob, SimulationMessage
+from dxlsim.messages import SimulationJob, SimulationMessage
 
 SensorMessage = Ready | Failed
 RecorderMessage = Ready | Draining | Failed | LogClosed

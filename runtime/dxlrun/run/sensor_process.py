@@ -25,8 +25,8 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import PlugInError
 from dxlrun.plan.loop_plan import SensorPlan
-from dxlrun.plan.simulation_plan import SensedBodies
-from dxlrun.simulation.motion.body import SimulatedBody
+from dxlsim.motion.body import SimulatedBody
+from dxlsim.simulation_plan import SensedBodies
 
 END_S = 1.0
 """How long a sensor may take to close its device."""

@@ -21,7 +21,7 @@ import msgspec
 from dxlrun.channels import process
 from dxlrun.channels.process import Child, MessageChannel
 from dxlrun.errors import PortError
-from dxlrun.simulation.messages import Request, SimulationJob, SimulationMessage
+from dxlsim.messages import Request, SimulationJob, SimulationMessage
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""
@@ -42,7 +42,7 @@ def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage
     inherited = [descriptor, *(one for one in (job.shafts, job.progress) if one >= 0)]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
-        return Child("simulated bus", "dxlrun.simulation", arguments, inherited, errors, messages)
+        return Child("simulated bus", "dxlsim", arguments, inherited, errors, messages)
     finally:
         os.close(descriptor)
 

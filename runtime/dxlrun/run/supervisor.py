@@ -38,8 +38,6 @@ from dxlrun.channels.process import (
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.realtime import Grant
-from dxlrun.dynamixel.port.ports import put_in_place, set_aside
-from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed
 from dxlrun.plan.machine_load import MachineLoad
@@ -81,7 +79,9 @@ from dxlrun.run.watch import (
     duty_of,
     loop_timeout_ns,
 )
-from dxlrun.simulation.messages import SimulationMessage
+from dxlsim.messages import SimulationMessage
+from dxlwire.port.ports import put_in_place, set_aside
+from dxlwire.port.serial_open import let_go
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -18,7 +18,6 @@ from dxlrun.channels.messages import MessageRing, MessageSink
 from dxlrun.channels.packets import PacketBatch, PacketLog
 from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
-from dxlrun.clock import VirtualClock
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
@@ -32,12 +31,13 @@ from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.device.on_links import fix_to_links
-from dxlrun.simulation.motion.body import SensedBody
-from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.device.on_links import fix_to_links
+from dxlsim.motion.body import SensedBody
+from dxlsim.motion.mechanics import Mechanics, plant_of
+from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.clock import VirtualClock
 
 if TYPE_CHECKING:
     from rich.console import Console

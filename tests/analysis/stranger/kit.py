@@ -25,20 +25,20 @@ from msgspec.structs import replace
 
 from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.channels.cycle import Torque
-from dxlrun.clock import VirtualClock
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.dynamixel.wire import protocol1 as wire1
-from dxlrun.dynamixel.wire import protocol2 as wire2
 from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.bus.line import Transmission
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import simulated_robot
+from dxlsim.bus.line import Transmission
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlwire.clock import VirtualClock
+from dxlwire.wire import protocol1 as wire1
+from dxlwire.wire import protocol2 as wire2
 
 MS, S = 1_000_000, 1_000_000_000
 HEAD = ("head_yaw", "head_pitch")

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-KERNEL = Path(__file__).parents[3] / "runtime/dxlrun/dynamixel/exchange/kernel.c"
+KERNEL = Path(__file__).parents[3] / "runtime/dxlwire/exchange/kernel.c"
 _COMPILE = "while cc -O3 -g -fPIC -Wall -c {kernel} -o {out}; do :; done"
 _HOG = "while True: pass"
 

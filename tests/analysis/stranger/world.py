@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from tests.analysis.stranger.kit import Spec, Story, instead
 
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlsim.servo.simulated_servo import SimulatedServo
 
 
 def carry(story: Story, joint: str, torque_nm: float) -> None:

@@ -12,8 +12,8 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.simulation.bus.ledger import LedgerEntry, read_ledger
 from dxlrun_lab.late_servos import Sent, transactions
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from exchange.canned import CannedResponder
 from exchange.case import Case
 from exchange.figures import CaseFigures, WireFigures, host_figures, wire_figures

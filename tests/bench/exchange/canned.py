@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import ProcessFault
-from dxlrun.plan.simulation_plan import BusConfig
+from dxlsim.simulation_plan import BusConfig
 from exchange.hosts import Host
 
 _RESPONDER = Path(__file__).with_name("responder.py")

@@ -12,7 +12,7 @@ from dxlrun.compile.robot import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.description.reading import Description, read_robot
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.plan.simulation_plan import BusConfig
+from dxlsim.simulation_plan import BusConfig
 
 MODELS = {1.0: "AX-12A", 2.0: "XM430-W350"}
 """Protocol -> model of the servos of a case."""

@@ -25,13 +25,13 @@ from dxlrun.channels.packets import (
     split_packets,
 )
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
-from dxlrun.clock import MonotonicClock
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
-from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun_lab.late_servos import Sent
+from dxlwire.clock import MonotonicClock
+from dxlwire.port.ports import ReplyPolling, SerialPort, SerialPorts
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk
 

@@ -26,9 +26,9 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.plan.simulation_plan import BusConfig
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig
 
 Does = Literal["rehearse", "learn", "play"]
 _MOST = 1 << 16

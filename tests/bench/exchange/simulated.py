@@ -9,9 +9,9 @@ from types import TracebackType
 
 from dxlrun.channels import process
 from dxlrun.errors import ProcessFault
-from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
 from dxlrun.run.simulation_front import first_message, start_simulation
-from dxlrun.simulation.messages import SimulationJob
+from dxlsim.messages import SimulationJob
+from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
 _PRIORITY = 33
 """As in a run: a servo's electronics do not wait for the host's processor."""

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-import dxlrun.dynamixel.control_table
-from dxlrun.dynamixel.control_table import ControlTable
+import dxlwire.control_table
+from dxlwire.control_table import ControlTable
 
-TABLES = Path(dxlrun.dynamixel.control_table.__file__).parent / "tables"
+TABLES = Path(dxlwire.control_table.__file__).parent / "tables"
 
 
 @pytest.fixture

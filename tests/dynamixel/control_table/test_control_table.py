@@ -8,13 +8,13 @@ import rustypot
 from hypothesis import given
 from hypothesis import strategies as st
 
-import dxlrun.dynamixel.control_table
-from dxlrun.dynamixel.control_table import ControlItem, control_table, model_names, read_control_table
+import dxlwire.control_table
+from dxlwire.control_table import ControlItem, control_table, model_names, read_control_table
 
 AX = control_table("AX-12A")
-AX_TEXT = (
-    Path(dxlrun.dynamixel.control_table.__file__).parent / "tables" / "protocol1" / "AX-12A.toml"
-).read_text("utf-8")
+AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables" / "protocol1" / "AX-12A.toml").read_text(
+    "utf-8"
+)
 
 
 def test_the_model_number_is_that_of_a_foreign_list() -> None:

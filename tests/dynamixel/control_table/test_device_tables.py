@@ -8,9 +8,9 @@ import tomllib
 
 import pytest
 
-from dxlrun.dynamixel.control_table import devices
-from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.control_table.devices import (
+from dxlwire.control_table import devices
+from dxlwire.control_table.device_table import read_device_table
+from dxlwire.control_table.devices import (
     add_device_table,
     device_table,
     device_tables,

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import rustypot
 
-from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table, models_by_number
+from dxlwire.control_table import ControlTable, all_tables, control_table, models_by_number
 
 PRO = {
     "L42-10-S300-R": 35072,
@@ -273,7 +273,7 @@ def test_the_sdk_is_still_wrong_about_what_we_correct() -> None:
 
 def test_tables_are_read_without_importing_anything_heavy() -> None:
     code = (
-        "import sys; from dxlrun.dynamixel.control_table import all_tables; assert len(all_tables()) > 60;"
+        "import sys; from dxlwire.control_table import all_tables; assert len(all_tables()) > 60;"
         "heavy = {'numpy', 'pydantic', 'yaml', 'serial', 'dynamixel_sdk'};"
         "print(sorted(heavy & set(sys.modules)))"
     )

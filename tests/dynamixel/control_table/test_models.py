@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-import dxlrun.dynamixel.control_table.models
-from dxlrun.dynamixel.control_table import add_control_table, control_table, model_names, models_by_number
-from dxlrun.dynamixel.control_table.sources import resolve
+import dxlwire.control_table.models
+from dxlwire.control_table import add_control_table, control_table, model_names, models_by_number
+from dxlwire.control_table.sources import resolve
 
 MINE = {'model = "AX-12A"': 'model = "Mine-1"', 'aliases = ["AX-12", "AX-12+"]': "aliases = []"}
 
 
 @pytest.fixture
 def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dxlrun.dynamixel.control_table.models, "_ADDED", {1.0: [], 2.0: []})
+    monkeypatch.setattr(dxlwire.control_table.models, "_ADDED", {1.0: [], 2.0: []})
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.control_table import (
+from dxlwire.control_table import (
     CAPABILITIES,
     ControlTable,
     all_tables,

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.plan.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.motion.control_law import ROWS
-from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
 from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.experiment import Procedure, Situation
 from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.motion.control_law import ROWS
+from dxlsim.motion.motor import motor_of
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
 
 FIVE_PERCENT = 0.05
 MS = 1_000_000

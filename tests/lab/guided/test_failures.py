@@ -13,13 +13,13 @@ import pytest
 
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import DxlrunError, Refused
-from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import FaultScript
 from dxlrun_lab.guided import experiment
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Joint, perform
 from dxlrun_lab.guided.rig import RunGone, RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
 
 ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.description.modes import Mode
 from dxlrun.errors import InputError
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import KnownLoad, identified
 from dxlrun_lab.identify.servo import Servo, servos_in
+from dxlwire.modes import Mode
 
 LOAD = KnownLoad(0.005, 0.3)
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))

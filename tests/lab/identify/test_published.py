@@ -23,13 +23,13 @@ import pytest
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import CycleLayout, Torque
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun_lab.identify.excitation import Room, excitation
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import Identified, KnownLoad, identified
 from dxlrun_lab.identify.servo import Servo
+from dxlwire.control_table import control_table
+from dxlwire.modes import Mode
 
 RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "0")
 TICK = math.tau / 4096

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from dxlrun.description.joints.motor_file import motor_text, read_motor
-from dxlrun.simulation.motion.motor import Motor
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import Identified, KnownLoad, identified
+from dxlsim.motion.motor import Motor
 
 GRAVITY, INERTIA = 0.3, 0.005
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))

@@ -14,11 +14,11 @@ import pytest
 from dxlrun.compile.robot import compile_files
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.simulation.bus.ledger import LedgerEntry
 from dxlrun.testing import VirtualRobot
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion, desired_motion
 from dxlrun_lab.tracking.setups import Setup, chosen
+from dxlsim.bus.ledger import LedgerEntry
 
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 PERIOD_NS = 3_125_000

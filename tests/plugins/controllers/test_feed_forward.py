@@ -11,11 +11,11 @@ from msgspec.structs import replace
 from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
-from dxlrun.plan.simulation_plan import Load
-from dxlrun.simulation.motion.motor import identified_motor
-from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint
 from dxlrun_controllers.feed_forward import FeedForward, FeedForwardParameters
 from dxlrun_controllers.laws.feed_forward import InverseServo, MotionAhead
+from dxlsim.motion.motor import identified_motor
+from dxlsim.motion.plant import IndependentJoints, PlantJoint
+from dxlsim.simulation_plan import Load
 
 MOTOR = MotorModel(
     "MX-64", 12.0, 1.6, 3.6, 0.011, 0.1, 0.08, 0.01, Stribeck(0.06, 0.5), 0.16, 32, 0,

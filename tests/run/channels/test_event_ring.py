@@ -18,7 +18,7 @@ from dxlrun.channels.events import (
 )
 from dxlrun.channels.ring import Handover, record_size
 from dxlrun.channels.tagged import decode
-from dxlrun.clock import VirtualClock
+from dxlwire.clock import VirtualClock
 
 
 def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: int = 5) -> bytes:

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dxlrun.cli.sim.sim_views import Shown
-    from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
     from dxlrun.run.simulation_front import Served
-    from dxlrun.simulation.faults.fault import Fault
-    from dxlrun.simulation.messages import SimulationJob
+    from dxlsim.faults.fault import Fault
+    from dxlsim.messages import SimulationJob
+    from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
 _ABOVE_LOOP = 2  # The guardian is one above the loop
@@ -129,7 +129,7 @@ def sim(
     check_simulated(buses, planned, seed)
     from dxlrun.channels.process import spare_core
     from dxlrun.cli.sim.sim_views import Shown, ending
-    from dxlrun.simulation.messages import SimulationJob
+    from dxlsim.messages import SimulationJob
 
     title = simulated.title
     config = msgspec.structs.replace(
@@ -169,7 +169,7 @@ def _simulated(
     baud: int | None,
     protocol: float | None,
 ) -> _Simulated:
-    from dxlrun.plan.simulation_plan import SimulationConfig
+    from dxlsim.simulation_plan import SimulationConfig
 
     if robot is None:
         if not servo:
@@ -213,7 +213,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     from dxlrun.log.reader import open_log
     from dxlrun.plan.robot_plan import from_json
-    from dxlrun.plan.simulation_plan import BusConfig, SimulationConfig
+    from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
     reader = open_log(log)
     try:
@@ -231,10 +231,10 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 
     Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
     """
-    from dxlrun.simulation.bus.ledger import Ledger
-    from dxlrun.simulation.bus.recorded_bus import RecordedBus
-    from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-    from dxlrun.simulation.faults.script import FaultScript
+    from dxlsim.bus.ledger import Ledger
+    from dxlsim.bus.recorded_bus import RecordedBus
+    from dxlsim.bus.simulated_bus import SimulatedBus
+    from dxlsim.faults.script import FaultScript
 
     ledger = Ledger(keep=False)
     try:

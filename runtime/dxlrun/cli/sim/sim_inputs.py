@@ -14,9 +14,9 @@ from dxlrun.description.document import read_file
 from dxlrun.errors import InputError, Mark, Problem
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlTable
-    from dxlrun.plan.simulation_plan import BusConfig
-    from dxlrun.simulation.faults.fault import Fault
+    from dxlsim.faults.fault import Fault
+    from dxlsim.simulation_plan import BusConfig
+    from dxlwire.control_table import ControlTable
 
 Split = Literal["whole", "byte", "random"]
 Absent = Literal["silent", "slot"]
@@ -57,8 +57,8 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
     they are not given. Raises InputError with a sentence for each thing that is wrong.
     """
     from dxlrun.control.controllers.plugins import load_plugins
-    from dxlrun.dynamixel.control_table import added_control_tables, control_table
-    from dxlrun.plan.simulation_plan import BusConfig, ServoConfig
+    from dxlsim.simulation_plan import BusConfig, ServoConfig
+    from dxlwire.control_table import added_control_tables, control_table
 
     load_plugins()  # they may bring servo models along
     models = _models(words)
@@ -102,7 +102,7 @@ def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
 
     In a file, empty lines and what follows a # are left out.
     """
-    from dxlrun.simulation.faults.fault import parse_fault
+    from dxlsim.faults.fault import parse_fault
 
     faults: list[Fault] = []
     wrong: list[str] = []
@@ -120,7 +120,7 @@ def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
 
 
 def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
-    from dxlrun.simulation.faults.fault import parse_fault
+    from dxlsim.faults.fault import parse_fault
 
     try:
         text = read_file(file).decode("utf-8")
@@ -175,7 +175,7 @@ def _ids(text: str) -> list[int]:
 
 
 def _unknown(models: Sequence[str]) -> list[str]:
-    from dxlrun.dynamixel.control_table import perhaps_meant, protocols_of
+    from dxlwire.control_table import perhaps_meant, protocols_of
 
     return [
         f"--servo: there is no model {model}; {perhaps_meant(model)}"
@@ -186,7 +186,7 @@ def _unknown(models: Sequence[str]) -> list[str]:
 
 def _protocol(models: Sequence[str], chosen: float | None) -> float:
     """Return the protocol that was chosen, or the one that all models have in common."""
-    from dxlrun.dynamixel.control_table import protocols_of
+    from dxlwire.control_table import protocols_of
 
     if chosen not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {chosen:g}; --protocol is 1.0 or 2.0")

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console, Group
 
-    from dxlrun.plan.simulation_plan import BusConfig
-    from dxlrun.simulation.messages import ServoLook, SimulationMessage
+    from dxlsim.messages import ServoLook, SimulationMessage
+    from dxlsim.simulation_plan import BusConfig
 
 _LOOK_S = 0.25
 _AROUND = 7
@@ -193,7 +193,7 @@ class JsonView:
 
 def fault_lines() -> Sequence[str]:
     """Return what can be typed: a line for each kind of fault."""
-    from dxlrun.simulation.faults.fault import fault_help
+    from dxlsim.faults.fault import fault_help
 
     return fault_help()
 

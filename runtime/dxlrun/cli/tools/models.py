@@ -16,9 +16,9 @@ from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-    from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
-    from dxlrun.simulation.motion.motor import Motor
+    from dxlsim.motion.motor import Motor
+    from dxlwire.control_table import ControlItem, ControlTable
+    from dxlwire.control_table.device_table import DeviceItem, DeviceTable
 
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
@@ -69,8 +69,8 @@ def models(
 
 def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable], list[DeviceTable]]:
     """Return the tables that were requested, of servos and devices; raises InputError when there is none."""
-    from dxlrun.dynamixel.control_table import all_tables, control_table, perhaps_meant, protocols_of
-    from dxlrun.dynamixel.control_table.devices import device_table, device_tables, perhaps_meant_device
+    from dxlwire.control_table import all_tables, control_table, perhaps_meant, protocols_of
+    from dxlwire.control_table.devices import device_table, device_tables, perhaps_meant_device
 
     if protocol not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
@@ -92,7 +92,7 @@ def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable
 
 def _motor_json(table: ControlTable) -> dict[str, object]:
     """Return the motor of the simulated servo, in SI units."""
-    from dxlrun.simulation.motion.motor import motor_of
+    from dxlsim.motion.motor import motor_of
 
     motor = motor_of(table)
     return {
@@ -170,7 +170,7 @@ def _commands(table: DeviceTable) -> list[str]:
 
 def _device_facts(table: DeviceTable) -> Table:
     """Return what holds for the whole model of a device."""
-    from dxlrun.dynamixel.control_table.device_table import CAPABILITIES
+    from dxlwire.control_table.device_table import CAPABILITIES
 
     known = ("ping, read and write", *(CAPABILITIES[name] for name in sorted(table.capabilities)))
     facts = [
@@ -227,8 +227,8 @@ def _title(table: ControlTable | DeviceTable) -> str:
 
 def _facts(table: ControlTable) -> Table:
     """Return what holds for the whole model."""
-    from dxlrun.dynamixel.control_table import CAPABILITIES
-    from dxlrun.simulation.motion.motor import motor_of
+    from dxlsim.motion.motor import motor_of
+    from dxlwire.control_table import CAPABILITIES
 
     facts = [
         ("travel", f"{_travel(table)}, a tick is {math.degrees(table.rad_per_tick):.6g} deg"),

@@ -19,9 +19,9 @@ from dxlrun.output.target import check_target, write_target
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlTable
     from dxlrun.dynamixel.tools.scanning import FoundServo, Scanned, Search
     from dxlrun.output.table import Table
+    from dxlwire.control_table import ControlTable
 
 Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
 HIGHEST_ID = 253
@@ -137,7 +137,7 @@ def load_models() -> None:
 
 def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
     """Show what was found; `rates`: those that the driver did not set as asked, and what it set."""
-    from dxlrun.dynamixel.port.adapters import warnings_for
+    from dxlwire.port.adapters import warnings_for
 
     nothing = (
         f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
@@ -308,7 +308,7 @@ def _robot_name(stem: str) -> str:
 
 
 def _joint(servo: FoundServo, velocity: int) -> list[str]:
-    from dxlrun.dynamixel.control_table import control_table
+    from dxlwire.control_table import control_table
 
     table = control_table(servo.model, servo.protocol)
     reference = _middle(table)

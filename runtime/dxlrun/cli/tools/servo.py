@@ -20,14 +20,14 @@ from dxlrun.output.target import check_target
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.control_table import ControlItem, ControlTable, FoundDeviation
-    from dxlrun.dynamixel.control_table.device_table import DeviceTable
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
     from dxlrun.output.table import Table
-    from dxlrun.plan.bus_plan import RegisterValue
+    from dxlwire.bus_plan import RegisterValue
+    from dxlwire.control_table import ControlItem, ControlTable, FoundDeviation
+    from dxlwire.control_table.device_table import DeviceTable
 
 Keep = Literal["nothing", "id", "id-and-baud"]
 _TORQUE_OFF = "its torque goes off, and what it holds falls"
@@ -175,9 +175,9 @@ def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) 
 def _registers(
     values: Mapping[str, int], table: ControlTable | DeviceTable, deviations: Sequence[FoundDeviation]
 ) -> Table:
-    from dxlrun.dynamixel.control_table import ControlTable
     from dxlrun.dynamixel.servo.registers import meaning
     from dxlrun.output.table import Column, Table
+    from dxlwire.control_table import ControlTable
 
     items: Mapping[str, ControlItem] = table.items
     errors = table.errors if isinstance(table, ControlTable) else None
@@ -346,7 +346,7 @@ def _value(text: str) -> int | str:
 
 def _id(one: OneServo, asked: Asked) -> None:
     from dxlrun.dynamixel.tools.one_servo import change_id
-    from dxlrun.dynamixel.wire.dialect import dialect_of
+    from dxlwire.wire.dialect import dialect_of
 
     new, highest = int(asked.words[0]), dialect_of(one.table.protocol).HIGHEST_ID
     if new > highest:
@@ -379,7 +379,7 @@ def _reboot(one: OneServo, asked: Asked) -> None:
 
 def _factory_reset(one: OneServo, asked: Asked) -> None:
     from dxlrun.dynamixel.tools.one_servo import factory_reset
-    from dxlrun.dynamixel.wire.protocol2 import Reset
+    from dxlwire.wire.protocol2 import Reset
 
     old = one.table.protocol == 1.0
     if old and asked.keep not in (None, "nothing"):

@@ -13,7 +13,7 @@ from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
     from dxlrun.channels.packets import PacketSink
-    from dxlrun.plan.bus_plan import BusPlan
+    from dxlwire.bus_plan import BusPlan
 
 TOOL_NAME = "tool"
 """The metadata record of a log that a tool wrote: its `command`."""

@@ -19,10 +19,10 @@ from dxlrun.description.joints.mechanics import (
     TOLERANCE_RAD,
     Transmission,
 )
-from dxlrun.description.modes import Mode
 from dxlrun.description.units import distance_text
-from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
+from dxlwire.modes import Mode
+from dxlwire.plan.mode_plan import model_modes
 
 MOST_CONDITION = 100.0
 """Condition number of a matrix: beyond it a tick of a servo is more than a hundred of a joint. [i]"""

@@ -11,7 +11,7 @@ from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import Register
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
-from dxlrun.plan.bus_plan import ServoPlan
+from dxlwire.bus_plan import ServoPlan
 
 
 class DescribedServo(msgspec.Struct, frozen=True):

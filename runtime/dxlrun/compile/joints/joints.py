@@ -24,12 +24,12 @@ from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_tr
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.joints import Joint, JointEntry
 from dxlrun.description.joints.motor import MotorModel
-from dxlrun.description.modes import Mode
 from dxlrun.description.units import plain
-from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlwire.control_table import ControlTable
+from dxlwire.modes import Mode
+from dxlwire.plan.mode_plan import model_modes
 
 _UNITS: Mapping[str, str] = {
     "Nm": "Nm",

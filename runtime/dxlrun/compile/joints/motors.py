@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description.joints.motor import MotorModel
-from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.errors import InputError, Mark
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import ControlTable
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription

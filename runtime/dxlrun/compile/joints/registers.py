@@ -10,10 +10,10 @@ from dxlrun.compile.joints.described_servos import DescribedServo, described_ser
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.reading import Description
 from dxlrun.description.units import quantity
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.control_table.device_table import DeviceTable
 from dxlrun.errors import Mark, suggestion
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlwire.control_table import ControlItem, ControlTable
+from dxlwire.control_table.device_table import DeviceTable
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")

@@ -16,10 +16,10 @@ from dxlrun.compile.problems import RobotFile
 from dxlrun.description.devices import Device
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
-from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
-from dxlrun.dynamixel.plan.mode_plan import mode_plans
 from dxlrun.errors import Mark, suggestion
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import ControlTable, control_table, perhaps_meant, protocols_of
+from dxlwire.plan.mode_plan import mode_plans
 
 AUTO = "auto"  # In place of a model: it is read from the servo
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # The model that is assumed where none is known, by protocol

@@ -12,8 +12,8 @@ import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.control.controllers.graph import Plans, below, commander, lowers_first, uppers_first
-from dxlrun.description.modes import Mode, mode_of
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlwire.modes import Mode, mode_of
 
 
 class Conflict(msgspec.Struct, frozen=True):

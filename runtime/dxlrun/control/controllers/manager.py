@@ -14,7 +14,6 @@ from dxlrun.channels.commands import Command, CommandSink, NoCommands, TakenComm
 from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.kept import KeptStates
-from dxlrun.clock import Clock
 from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts, parted_couplings
@@ -29,6 +28,7 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Provided
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
+from dxlwire.clock import Clock
 
 P = ParamSpec("P")
 

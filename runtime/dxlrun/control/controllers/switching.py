@@ -21,9 +21,9 @@ from dxlrun.channels.events import RUN_ENDED, EventCode, EventSink, Severity
 from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Event, Managed, Request, State
-from dxlrun.description.modes import Mode
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.modes import Mode
 
 MODE_TIMEOUT_NS = 5_000_000_000
 """How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Clamp, Commands, CycleLayout, CycleRecord, Floats, States
-from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlwire.modes import COMMAND_INTERFACES
 
 READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
 """States of a joint that any controller may read as `JOINT/position`; the age in s."""

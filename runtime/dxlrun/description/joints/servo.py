@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from dxlrun.description.modes import EffortUnit
+from dxlwire.modes import EffortUnit
 
 
 class ServoModel(msgspec.Struct, frozen=True):

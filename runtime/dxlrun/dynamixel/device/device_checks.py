@@ -5,14 +5,14 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import models_by_number
-from dxlrun.dynamixel.control_table.devices import devices_by_number
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.plan.retry import retry, setup_line
-from dxlrun.dynamixel.port.remedies import choose_remedy
-from dxlrun.plan.bus_plan import BusPlan, DevicePlan
-from dxlrun.plan.transaction import Outcome, Program
+from dxlwire.bus_plan import BusPlan, DevicePlan
+from dxlwire.control_table import models_by_number
+from dxlwire.control_table.devices import devices_by_number
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import Line
+from dxlwire.plan.retry import retry, setup_line
+from dxlwire.port.remedies import choose_remedy
+from dxlwire.transaction import Outcome, Program
 
 _MODEL_NUMBER = (0, 2)
 """Address and size of Model Number, in both protocols (e-Manual AX-12A, XM430-W350, Model Number (0))."""

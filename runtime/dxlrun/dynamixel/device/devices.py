@@ -14,14 +14,14 @@ from msgspec.structs import replace
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.device.device_checks import inspect_device
-from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
-from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.plan.bus_plan import DeviceCommand, DevicePlan
-from dxlrun.plan.transaction import Outcome, Program, Transaction
+from dxlwire.bus_plan import DeviceCommand, DevicePlan
+from dxlwire.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
+from dxlwire.exchange.idle import IdleScheduler, Urgency
+from dxlwire.exchange.samples import BusSamples
+from dxlwire.plan.line import Line
+from dxlwire.plan.planning import plan_line
+from dxlwire.transaction import Outcome, Program, Transaction
+from dxlwire.wire.dialect import dialect_of
 
 PROBE_NS = 1_000_000_000
 """A device that is lost is asked once a second, as a servo is (failures.md)."""

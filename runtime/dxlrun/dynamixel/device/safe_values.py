@@ -5,10 +5,10 @@ Needs neither numpy nor the loop: the guardian writes them after the loop died.
 
 from __future__ import annotations
 
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.retry import limit_patience, retry, setup_line
-from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.plan.transaction import Outcome, Program
+from dxlwire.bus_plan import BusPlan
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.retry import limit_patience, retry, setup_line
+from dxlwire.transaction import Outcome, Program
 
 
 def make_safe(lines: Lines) -> tuple[str, ...]:

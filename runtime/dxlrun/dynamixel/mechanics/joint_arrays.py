@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, Floats, States, Torque
-from dxlrun.description.modes import Mode
 from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlwire.modes import Mode
 
 _WORSE: tuple[Torque, ...] = (
     Torque.ON,

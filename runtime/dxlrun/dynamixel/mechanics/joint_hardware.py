@@ -13,9 +13,9 @@ from dxlrun.channels.cycle import LIMP, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.contract.hardware import Hardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlwire.bus_plan import BusPlan, ServoPlan
 
 FADE_NS = 1_000_000_000
 """In which time servos that disagree a little at the start are brought together: 1.5 deg a second at most by

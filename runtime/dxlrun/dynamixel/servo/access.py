@@ -6,12 +6,12 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, decoded, side_by_side
-from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.control_table import ControlItem, ControlTable, control_table, decoded, side_by_side
+from dxlwire.plan.line import MOST_SPARE, Line
+from dxlwire.plan.planning import plan_line
+from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
+from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 NEAR = 16  # Bytes between two items for which another read would take longer than to read them
 LONGEST_READ = 64  # Bytes; a longer reply would not fit between two cycles

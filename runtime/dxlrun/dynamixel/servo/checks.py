@@ -16,25 +16,25 @@ import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.bus import SIMULATED
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import (
+from dxlrun.dynamixel.servo.access import Access, first_reach
+from dxlrun.dynamixel.servo.registers import shown, tripped
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.control_table import (
     ControlItem,
     FoundDeviation,
     HardwareErrors,
     control_table,
     find_deviations,
 )
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.mode_plan import mode_in
-from dxlrun.dynamixel.plan.reads import servo_read
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
-from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
-from dxlrun.dynamixel.servo.access import Access, first_reach
-from dxlrun.dynamixel.servo.registers import shown, tripped
-from dxlrun.dynamixel.wire.protocol1 import describe_error
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import listen
+from dxlwire.plan.mode_plan import mode_in
+from dxlwire.plan.reads import servo_read
+from dxlwire.plan.retry import ATTEMPTS, retry
+from dxlwire.port.remedies import CHECK, choose_remedy
+from dxlwire.transaction import Outcome, Program, Reply
+from dxlwire.wire.protocol1 import describe_error
 
 RETURN_ALL = 2  # Status Return Level: every instruction is answered
 PINGS = 3  # Two servos of one ID collide in most of three answers

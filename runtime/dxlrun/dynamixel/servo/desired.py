@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.goals import GoalArrays
-from dxlrun.dynamixel.exchange.idle import Urgency
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import compare, merged, settle
 from dxlrun.dynamixel.servo.torque_limits import limits_positions, restore_torque_limit
-from dxlrun.plan.bus_plan import RegisterValue
-from dxlrun.plan.transaction import Program
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.exchange.goals import GoalArrays
+from dxlwire.exchange.idle import Urgency
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import listen
+from dxlwire.transaction import Program
 
 PAUSES_NS = (50_000_000, 150_000_000, 0)
 """After attempts to reach a register: a stalled machine or adapter is no reason to fail a request."""

@@ -46,11 +46,11 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
-from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.plan.transaction import Program
+from dxlwire.exchange.cyclic_reads import CyclicReads
+from dxlwire.exchange.idle import IdleScheduler, Urgency
+from dxlwire.transaction import Program
 
 
 @unique

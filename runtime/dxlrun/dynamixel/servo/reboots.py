@@ -6,10 +6,10 @@ from collections import deque
 from typing import NamedTuple
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.plan.retry import retry
-from dxlrun.dynamixel.port.remedies import choose_remedy
 from dxlrun.dynamixel.servo.life import Life
-from dxlrun.plan.transaction import Program, Reply, Transaction
+from dxlwire.plan.retry import retry
+from dxlwire.port.remedies import choose_remedy
+from dxlwire.transaction import Program, Reply, Transaction
 
 TICK_MODULUS_MS = 32_768
 """Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""

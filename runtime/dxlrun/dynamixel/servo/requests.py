@@ -8,9 +8,6 @@ stays so whatever happens to it, until it is requested.
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.life import (
     IN_DOUBT,
@@ -21,8 +18,11 @@ from dxlrun.dynamixel.servo.life import (
     ServoState,
 )
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, Offline, rejoin
-from dxlrun.dynamixel.wire import protocol2
-from dxlrun.plan.transaction import Outcome, Program
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.retry import retry
+from dxlwire.transaction import Outcome, Program
+from dxlwire.wire import protocol2
 
 
 class Requests:

@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.devices import Devices
-from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
-from dxlrun.dynamixel.exchange.goals import GoalArrays
-from dxlrun.dynamixel.exchange.idle import IdleScheduler
-from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.modes import servo_limits
@@ -27,10 +21,16 @@ from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
-from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import counted
 from dxlrun.plan.loop_plan import ServoLimit
-from dxlrun.plan.transaction import Program, Reply, Transaction
+from dxlwire.control_table import control_table
+from dxlwire.exchange.cyclic_reads import CyclicReads
+from dxlwire.exchange.goals import GoalArrays
+from dxlwire.exchange.idle import IdleScheduler
+from dxlwire.exchange.samples import BusSamples
+from dxlwire.plan.findings import Findings
+from dxlwire.transaction import Program, Reply, Transaction
+from dxlwire.wire.dialect import dialect_of
 
 NOISE_EVENT_NS = 1_000_000_000  # A noisy line has at most one event in this time
 UNREQUESTED_EVENT_NS = 10_000_000_000

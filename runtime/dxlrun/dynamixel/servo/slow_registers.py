@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.dynamixel.control_table import ControlItem, control_table, decoded, side_by_side
-from dxlrun.dynamixel.exchange.bus import NEVER
-from dxlrun.dynamixel.exchange.idle import Urgency
-from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.plan.transaction import Program
+from dxlwire.bus_plan import BusPlan
+from dxlwire.control_table import ControlItem, control_table, decoded, side_by_side
+from dxlwire.exchange.bus import NEVER
+from dxlwire.exchange.idle import Urgency
+from dxlwire.plan.reads import TEMPERATURES, VOLTAGES
+from dxlwire.transaction import Program
 
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0  # degrees C below the servo's own limit (failures.md)

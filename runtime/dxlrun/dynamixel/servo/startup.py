@@ -15,15 +15,22 @@ import msgspec
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.device_checks import survey_devices
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
-from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.retry import (
+from dxlrun.dynamixel.servo import modes, watchdog
+from dxlrun.dynamixel.servo.access import Access, first_reach, reach
+from dxlrun.dynamixel.servo.checks import survey
+from dxlrun.dynamixel.servo.registers import settle_bus
+from dxlrun.dynamixel.servo.servos import Servos
+from dxlrun.errors import PortError, StartUpError
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.control_table import control_table
+from dxlwire.exchange.bus import Lines
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import TIMEOUT_MARGIN_NS, listen
+from dxlwire.plan.planning import plan_line
+from dxlwire.plan.reads import state_read
+from dxlwire.plan.retry import (
     LONGER_NS,
     ReplyTimes,
     extend_timeouts,
@@ -31,15 +38,8 @@ from dxlrun.dynamixel.plan.retry import (
     retry,
     setup_line,
 )
-from dxlrun.dynamixel.port.remedies import choose_remedy, describe_late_start
-from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.access import Access, first_reach, reach
-from dxlrun.dynamixel.servo.checks import survey
-from dxlrun.dynamixel.servo.registers import settle_bus
-from dxlrun.dynamixel.servo.servos import Servos
-from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Program, Result
+from dxlwire.port.remedies import choose_remedy, describe_late_start
+from dxlwire.transaction import Program, Result
 
 GROUP = 3
 """Servos that get torque before the next ones do: eight at once could pull the supply down."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, first_reach
-from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
-from dxlrun.plan.bus_plan import BusPlan, ModePlan, ServoPlan
-from dxlrun.plan.transaction import Program
+from dxlwire.bus_plan import BusPlan, ModePlan, ServoPlan
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.transaction import Program
+from dxlwire.wire.dialect import dialect_of, sync_writes
 
 SILENT = "did not answer when its torque limit was read"
 

@@ -11,14 +11,14 @@ from collections.abc import Callable
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.retry import limit_patience
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.access import Access, reach
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.exchange.bus import Lines
+from dxlwire.modes import Mode
+from dxlwire.plan.line import listen
+from dxlwire.plan.retry import limit_patience
+from dxlwire.transaction import Outcome, Program, Reply
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
 """A write and its read-back are tried so often, and the read-back is awaited so much longer each time.

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.registers import tripped
-from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.plan.transaction import Program
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.control_table import ControlItem, control_table
+from dxlwire.plan.findings import Findings
+from dxlwire.transaction import Program
+from dxlwire.wire.dialect import dialect_of, sync_writes
 
 UNIT_NS = 20_000_000  # One step of the register (e-Manual XM430-W350, Bus Watchdog (98))
 MOST_TICKS = 127  # The longest time; beyond it stand the values that say that it has stopped

@@ -10,24 +10,24 @@ from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketSink
-from dxlrun.clock import Clock, MonotonicClock
-from dxlrun.dynamixel.control_table import FoundDeviation, control_table, models_by_number
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.plan.retry import extend_timeouts, setup_line
-from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
-from dxlrun.dynamixel.port.remedies import choose_remedy
-from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.errors import StartUpError
-from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply, Result
+from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.clock import Clock, MonotonicClock
+from dxlwire.control_table import FoundDeviation, control_table, models_by_number
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import listen
+from dxlwire.plan.retry import extend_timeouts, setup_line
+from dxlwire.port.ports import Ports, SerialPort, SerialPorts
+from dxlwire.port.remedies import choose_remedy
+from dxlwire.port.serial_open import open_serial
+from dxlwire.transaction import Outcome, Program, Reply, Result
 
 NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken
 NO_JOINTS: Mapping[int, JointPlan] = {}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
-from dxlrun.dynamixel.control_table.devices import device_table
-from dxlrun.dynamixel.plan.line import MOST_SPARE
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault
-from dxlrun.plan.transaction import Outcome, Program, Result, Transaction
+from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+from dxlwire.control_table.devices import device_table
+from dxlwire.plan.line import MOST_SPARE
+from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
+from dxlwire.transaction import Outcome, Program, Result, Transaction
 
 
 class OneDevice:

@@ -11,30 +11,30 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import (
-    ControlItem,
-    ControlTable,
-    FoundDeviation,
-    control_table,
-    side_by_side,
-)
-from dxlrun.dynamixel.plan.findings import Findings
-from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
-from dxlrun.dynamixel.plan.mode_plan import mode_in
-from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.checks import deviations
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.plan.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlwire.control_table import (
+    ControlItem,
+    ControlTable,
+    FoundDeviation,
+    control_table,
+    side_by_side,
+)
+from dxlwire.modes import Mode
+from dxlwire.plan.findings import Findings
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen
+from dxlwire.plan.mode_plan import mode_in
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.plan.retry import extend_timeouts, retry
+from dxlwire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlwire.wire import protocol1, protocol2
+from dxlwire.wire.protocol2 import Reset
 
 LONGEST_READ = 64  # Bytes of one read; neighbours are read together
 BLINK_NS = 300_000_000  # How long the LED is on, and then off

@@ -15,14 +15,14 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
-from dxlrun.dynamixel.control_table.devices import devices_by_number
-from dxlrun.dynamixel.plan.line import MOST_SPARE, Line, listen
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
-from dxlrun.dynamixel.port.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
-from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.plan.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
+from dxlwire.control_table import ControlItem, ControlTable, all_tables, models_by_number
+from dxlwire.control_table.devices import devices_by_number
+from dxlwire.plan.line import MOST_SPARE, Line, listen
+from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
+from dxlwire.port.remedies import CHECK, choose_remedy
+from dxlwire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
+from dxlwire.wire.dialect import dialect_of
 
 SHORT_TIMEOUT_NS = 2_000_000
 """How long a reply that probably does not come is awaited beyond the latest moment by the wire."""

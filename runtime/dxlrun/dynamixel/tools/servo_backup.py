@@ -8,10 +8,10 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.errors import InputError
 from dxlrun.output.target import write_target
-from dxlrun.plan.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import ControlTable
 
 FORMAT: Literal["dxlrun servo backup 1"] = "dxlrun servo backup 1"
 _ADDRESSED = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")

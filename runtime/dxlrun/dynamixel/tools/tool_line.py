@@ -7,16 +7,16 @@ import termios
 
 from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.channels.ring import Payload
-from dxlrun.clock import Clock, MonotonicClock
-from dxlrun.dynamixel.exchange.bus import Lines
-from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
-from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten
-from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
-from dxlrun.dynamixel.port.serial_open import open_serial
-from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import PortError
-from dxlrun.plan.bus_plan import Budget, BusPlan
-from dxlrun.plan.transaction import Program, Reply, Result
+from dxlwire.bus_plan import Budget, BusPlan
+from dxlwire.clock import Clock, MonotonicClock
+from dxlwire.exchange.bus import Lines
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
+from dxlwire.port.latency_timer import latency_timer, shorten
+from dxlwire.port.ports import Ports, SerialPort, SerialPorts
+from dxlwire.port.serial_open import open_serial
+from dxlwire.transaction import Program, Reply, Result
+from dxlwire.wire.dialect import dialect_of
 
 FIRST_RATE = 57_600  # At which a port is opened, bit/s; every adapter has it
 BOOT_NS = 2_000_000_000

@@ -7,9 +7,9 @@ from contextlib import suppress
 
 import numpy as np
 
-from dxlrun.description.modes import Mode
 from dxlrun.log.schemas import DIAGNOSTICS
 from dxlrun.messages.cdr import Codec
+from dxlwire.modes import Mode
 
 DIAGNOSTICS_NS = 1_000_000_000
 """The least time between two messages."""

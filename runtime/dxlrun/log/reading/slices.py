@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from dxlrun.channels.commands import TakenCommand, data_of
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import Event
-from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.columns import PacketColumns
@@ -27,6 +26,7 @@ from dxlrun.log.schemas import CycleSpan, LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
 from dxlrun.messages.cdr_columns import pieces
 from dxlrun.messages.definition import MessageType
+from dxlwire.modes import Mode
 
 _FOR_OTHERS = frozenset(
     (

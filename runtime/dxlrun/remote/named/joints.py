@@ -12,15 +12,15 @@ from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.loop_requests import Register, RegisterReading
 from dxlrun.compile.joints.registers import UnfitRegister, steered_value
 from dxlrun.description.joints.groups import ALL
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
-from dxlrun.plan.bus_plan import ServoPlan
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.preparation import refused
+from dxlwire.bus_plan import ServoPlan
+from dxlwire.control_table import ControlTable, control_table
+from dxlwire.modes import Mode
 
 _LONGEST = 80
 """Characters of a name in a refusal."""

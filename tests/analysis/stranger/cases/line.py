@@ -25,7 +25,7 @@ from tests.analysis.stranger.proof import seen, unread
 from tests.analysis.stranger.world import supply
 from tests.kit.line_faults import other_host
 
-from dxlrun.plan.simulation_plan import ServoConfig
+from dxlsim.simulation_plan import ServoConfig
 
 CASES: list[Case] = []
 case = collector(CASES)

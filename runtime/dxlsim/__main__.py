@@ -1,0 +1,54 @@
+"""`python -m dxlsim`: the process of the simulated buses, one pseudo-terminal each, in real time.
+
+It runs until the other end of the control socket is closed. It sends the ports when it is ready, or an error
+and ends; then it answers requests, and reports each fault as it happens and the ports when they changed:
+`dxlsim.messages`.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from msgspec.json import Decoder
+
+from dxlrun.channels import process
+from dxlrun.channels.heartbeat import SimulationProgress
+from dxlrun.channels.shared_memory import mapped
+from dxlrun.channels.slot import SlotWriter
+from dxlrun.errors import DxlrunError
+from dxlsim import realtime
+from dxlsim.bus.ledger import Ledger
+from dxlsim.messages import Request, SimulationJob, SimulationMessage
+from dxlsim.server import Server
+from dxlwire.control_table import add_control_table
+
+
+def main() -> int:
+    """Serve the buses of a job until the control socket ends or SIGTERM comes: `--job-fd N --control-fd M`.
+
+    Return 0, 1 when the ledger could not be written, 2 when the configuration cannot be served.
+    """
+    job, starter = process.begun(SimulationJob, Decoder(Request))
+    for text in dict.fromkeys(text for bus in job.config.buses for text in bus.control_tables):
+        add_control_table(text)
+    with Ledger(Path(job.ledger) if job.ledger else None, keep=False) as ledger:
+        try:
+            shafts = None if job.shafts < 0 else SlotWriter(mapped(job.shafts))
+            progress = None if job.progress < 0 else SimulationProgress(job.progress)
+            server = Server(job.config, ledger, starter, shafts, progress)
+        except (DxlrunError, OSError, LookupError, ValueError) as error:
+            starter.send(SimulationMessage(error=str(error)))
+            return 2
+        granted = realtime.prepare(job.priority, job.core)
+        if job.priority or job.core >= 0:
+            ledger.add(server.start_ns, "", "note", note=f"real time: {granted}")
+        server.run(granted)
+    if ledger.error is None:
+        return 0
+    print(ledger.error, file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

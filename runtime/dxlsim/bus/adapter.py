@@ -1,0 +1,142 @@
+"""The USB adapter between line and host: when it hands over what it has received, and in what pieces.
+
+Not modelled: the frames of USB itself (125 us or 1 ms), what a hub or another device on it costs, the way of
+the host's bytes to the line, and modem lines.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Sequence
+
+from dxlsim.bus.line import Transmission
+from dxlsim.simulation_plan import AdapterConfig
+
+BURST = 62
+"""Bytes that an FTDI chip hands over without waiting for its timer: a USB packet of 64 bytes less two of
+status (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
+
+UNREAD_LIMIT = 4096
+"""Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
+
+_LONGEST_PIECE = 8  # Bytes of the longest piece of `random`
+
+
+HandOver = tuple[int, bytes, Sequence[Transmission]]
+"""When bytes are planned for the host, the bytes, and what the host has then received to its end."""
+
+
+class SimulatedAdapter:
+    """Holds what has passed the wire until the host receives it."""
+
+    def __init__(self, config: AdapterConfig, start_ns: int) -> None:
+        self.timer_ns = config.latency_timer_ns
+        self._split = config.split
+        self.immediate = config.latency_timer_ns == 0 and config.split == "whole"
+        """True: what ends on the wire is with the host at that moment."""
+        self._arrived: deque[Transmission] = deque()
+        """What has passed the wire to its end and is not all handed over."""
+        self._chance = random.Random(config.seed)
+        self._piece = self._next_piece()  # Bytes of the next piece
+        self._timed_ns = start_ns
+        """When the latency timer last ran out, or a burst went before it did."""
+        self._burst: deque[HandOver] = deque()  # Pieces of what the timer let go
+
+    def set_timer(self, timer_ns: int, now_ns: int) -> None:
+        """Change the latency timer; it starts anew."""
+        self.timer_ns, self._timed_ns = timer_ns, now_ns
+        self.immediate = timer_ns == 0 and self._split == "whole"
+
+    def accept(self, new: Transmission) -> bool:
+        """Take what has passed the wire; False: there is no room for it."""
+        if self._arrived and sum([len(each.data) for each in self._arrived]) + len(new.data) > UNREAD_LIMIT:
+            return False
+        self._arrived.append(new)
+        return True
+
+    def forget(self) -> None:
+        """Lose everything that the host has not received."""
+        self._arrived.clear()
+        self._burst.clear()
+
+    def next_ns(self, passing: Sequence[Transmission]) -> int | None:
+        """Return when the next bytes are handed over, were nothing to disturb them; None: never."""
+        if self._burst:
+            return self._burst[0][0]
+        if not (self._arrived or passing):
+            return None
+        if self.timer_ns:
+            return self._timer_end_ns((*self._arrived, *passing))
+        first = self._arrived[0] if self._arrived else passing[0]
+        return first.passed_ns(min(len(first.data), first.given + self._piece) - 1)
+
+    def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
+        """Return what the host receives by a time."""
+        given: list[HandOver] = []
+        while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
+            if self._burst:
+                given.append(self._burst.popleft())
+            elif self.timer_ns:
+                self._timed_ns = due_ns
+                self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))
+            else:
+                first = self._arrived[0] if self._arrived else passing[0]
+                most = min(self._piece, len(first.data) - first.given)
+                given.append(self._gather(due_ns, most, passing))
+                self._piece = self._next_piece()
+        return given
+
+    def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
+        """Return when the timer runs out with a byte there, or so many are there that it does not count.
+
+        It starts anew with each hand-over and runs out with nothing to give, too (AN232B-04).
+        """
+        timer_ns = self.timer_ns
+        oldest_ns = max(queue[0].passed_ns(queue[0].given), self._timed_ns + 1)
+        runs_out_ns = self._timed_ns - -(oldest_ns - self._timed_ns) // timer_ns * timer_ns
+        missing = BURST
+        for each in queue:
+            left = len(each.data) - each.given
+            if left >= missing:
+                return min(runs_out_ns, max(self._timed_ns, each.passed_ns(each.given + missing - 1)))
+            missing -= left
+        return runs_out_ns
+
+    def _gather(self, now_ns: int, most: int, passing: Sequence[Transmission]) -> HandOver:
+        """Take up to so many bytes that have passed the wire."""
+        data, ended = b"", []
+        for each in (*self._arrived, *passing):
+            if each.first_ns >= now_ns:
+                continue
+            first, end = each.given, min(len(each.data), each.given + most - len(data))
+            if each.due_ns > now_ns:
+                while end > first and each.passed_ns(end - 1) > now_ns:
+                    end -= 1
+            each.given = end
+            data += each.data[first:end]
+            if end == len(each.data):
+                ended.append(each)
+        while self._arrived and self._arrived[0].given == len(self._arrived[0].data):
+            self._arrived.popleft()
+        return now_ns, data, ended
+
+    def _pieces(self, due_ns: int, burst: HandOver) -> list[HandOver]:
+        """Return a burst in pieces, so far from each other that a host can distinguish them [i]."""
+        if self._split == "whole":
+            return [burst]
+        _, data, ended = burst
+        pieces: list[HandOver] = []
+        start = 0
+        while start < len(data):
+            end = min(len(data), start + self._piece)
+            self._piece = self._next_piece()
+            planned_ns = due_ns + len(pieces) * 10_000
+            pieces.append((planned_ns, data[start:end], ended if end == len(data) else ()))
+            start = end
+        return pieces
+
+    def _next_piece(self) -> int:
+        if self._split == "random":
+            return self._chance.randint(1, _LONGEST_PIECE)
+        return UNREAD_LIMIT if self._split == "whole" else 1

@@ -1,0 +1,133 @@
+"""A recorded bus: a host hears what the host of a log heard, with the delays of then.
+
+- An instruction that was sent in the recording gets what was heard after it then, bytes, errors, noise and
+  silence; each time what came the next time, and behind the end of the recording the last again.
+- A ping, or a read that was never sent as such, is answered where all of it is known from other reads: with
+  the values that were heard last, without an error, after the recorded return delay at the least.
+- Anything else is not answered; where an answer was due it is a note in the ledger.
+- A host at another rate than the recorded one is not heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.line import Transmission
+from dxlsim.bus.recording import Heard, Recording
+from dxlsim.bus.simulated_bus import RATE_TOLERANCE, SimulatedBus
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.simulation_plan import BusConfig
+from dxlsim.wire import protocol2
+from dxlsim.wire.packets import (
+    BROADCAST,
+    Instruction,
+    InstructionPacket,
+    InstructionReceiver,
+    ReadEntry,
+)
+
+_MODEL, _FIRMWARE = (0, 1), (6,)
+"""Addresses of what a ping of Protocol 2.0 answers (e-Manual, X series, Control Table); of other models the
+firmware is elsewhere, and a ping that was not recorded is not answered."""
+_ANSWER_NS = 500_000  # Delay of an answer that is put together: Return Delay Time as shipped (e-Manual)
+
+
+class RecordedBus(SimulatedBus):
+    """The line of a recording, without servos. Raises LogError where the log cannot be read."""
+
+    def __init__(
+        self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
+    ) -> None:
+        super().__init__(config, ledger, start_ns, mechanics)
+        self._recorded_rate = config.baud_rate
+        self._recording = Recording(Path(config.recorded), config.name, config.baud_rate)
+        self._reads = tuple(self._recorded_reads())
+
+    def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
+        if abs(self.baud_rate - self._recorded_rate) < RATE_TOLERANCE * self.baud_rate:
+            heard = self._recording.take(packet.raw)
+            if heard is None:
+                heard = self._known(packet)
+            if heard is None and (packet.servo_id != BROADCAST or self._codec.group_read(packet)):
+                self.note(f"not in the recording: {packet.raw.hex(' ')}")
+            for reply in self._transmissions(heard or (), end_ns):
+                self._send_reply(packet.servo_id, reply)
+        self._count_packet()
+
+    def _transmissions(self, heard: tuple[Heard, ...], end_ns: int) -> Iterator[Transmission]:
+        """Yield what was heard as it passes the wire; what came at once is one."""
+        waiting: Transmission | None = None
+        for delay_ns, data in heard:
+            wire_ns = self._line.duration_ns(len(data))
+            # of a host that sent into a reply the bytes that arrived all the same came before its own end
+            due_ns = max(end_ns + delay_ns, self.now_ns)
+            if waiting is not None and due_ns <= waiting.due_ns:
+                waiting = Transmission(waiting.first_ns, waiting.due_ns, waiting.data + data)
+                continue
+            first_ns = due_ns - wire_ns
+            if waiting is not None:
+                yield waiting
+                first_ns = max(first_ns, waiting.due_ns)  # an adapter kept the one before back
+            waiting = Transmission(first_ns, due_ns, data)
+        if waiting is not None:
+            yield waiting
+
+    # What is known from other reads
+
+    def _recorded_reads(self) -> Iterator[tuple[bytes, tuple[ReadEntry, ...]]]:
+        for instruction in self._recording.instructions:
+            packet = InstructionReceiver(self._codec).feed(instruction)
+            if packet is None or not packet.intact:
+                continue
+            group = self._codec.group_read(packet)
+            if group is not None and not group.fast:
+                yield instruction, group.entries
+            elif (entry := self._read(packet)) is not None:
+                yield instruction, (entry,)
+
+    def _read(self, packet: InstructionPacket) -> ReadEntry | None:
+        """Return what a read of one servo reads; None: it is none."""
+        if packet.instruction != Instruction.READ or packet.servo_id == BROADCAST:
+            return None
+        place = self._codec.read(packet.parameters)
+        return None if place is None else ReadEntry(packet.servo_id, *place)
+
+    def _known(self, packet: InstructionPacket) -> tuple[Heard, ...] | None:
+        """Return the answer to a ping or a read by what was heard of other reads; None: not all is known."""
+        if not packet.intact or packet.servo_id == BROADCAST:
+            return None
+        entry = self._read(packet)
+        if entry is not None:
+            addresses = tuple(range(entry.address, entry.address + entry.length))
+        elif packet.instruction == Instruction.PING and not packet.parameters:
+            addresses = (*_MODEL, *_FIRMWARE) if self._codec is protocol2.CODEC else ()
+        else:
+            return None
+        known = self._registers(packet.servo_id)
+        if not known or not all(address in known for address in addresses):
+            return None
+        content = bytes(known[address] for address in addresses)
+        data = self._codec.status_packet(packet.servo_id, 0, content)
+        return (Heard(_ANSWER_NS + self._line.duration_ns(len(data)), data),)
+
+    def _registers(self, servo_id: int) -> dict[int, int]:
+        """Return the bytes of a servo's control table that were heard, by address."""
+        known: dict[int, int] = {}
+        for instruction, entries in self._reads:
+            asked = {entry.servo_id: entry for entry in entries}
+            if servo_id not in asked:
+                continue
+            for _, data in self._recording.newest(instruction):
+                status = InstructionReceiver(self._codec).feed(data)
+                if status is None or not status.intact or status.servo_id != servo_id:
+                    continue
+                # a status packet has its error where an instruction has its kind, or behind that
+                content = status.parameters[1:] if self._codec is protocol2.CODEC else status.parameters
+                entry = asked[servo_id]
+                if len(content) == entry.length:
+                    known.update(
+                        zip(range(entry.address, entry.address + entry.length), content, strict=True)
+                    )
+        return known

@@ -1,0 +1,136 @@
+"""What a simulated device measures: each item shows a quantity, by the name of its state."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from random import Random
+
+import msgspec
+
+from dxlrun.description.frames.transform import (
+    NO_TURN,
+    Quaternion,
+    Transform,
+    Vector,
+    product,
+    rotated,
+    turn,
+)
+from dxlsim.simulation_plan import Shown
+from dxlwire.control_table.device_table import DeviceItem
+
+STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
+ROOM_CELSIUS = 25.0
+_AXES = "xyzw"
+_UNIT: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_VECTORS = {"angular_velocity": 3, "linear_acceleration": 3, "orientation": 4}
+_TURNS = ("roll", "pitch", "yaw")
+
+
+class Measured(msgspec.Struct):
+    """The world around one device, in SI units."""
+
+    volts: float
+    angular_velocity: Vector = (0.0, 0.0, 0.0)  # rad/s, in the device's own axes
+    linear_acceleration: Vector = (0.0, 0.0, STANDARD_GRAVITY)
+    """m/s^2, in the device's own axes; gravity counts as upward, as of every accelerometer at rest."""
+    orientation: Quaternion = NO_TURN  # Quaternion x, y, z, w of the device in the world
+    celsius: float = ROOM_CELSIUS
+    update: Callable[[], None] = lambda: None  # Brings what moves to the time of the device
+
+    def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:
+        """Let the device be turned about an axis of its own from now on, beside what moves it otherwise.
+
+        `angle` returns how far it is turned, rad, and how fast, rad/s.
+        """
+        update, about = self.update, _UNIT[axis]
+        upright = self.angular_velocity, self.linear_acceleration, self.orientation
+
+        def tipped() -> None:
+            self.angular_velocity, self.linear_acceleration, self.orientation = upright
+            update()
+            turned, speed = angle()
+            back = turn(about, -turned)
+            x, y, z = rotated(back, self.angular_velocity)
+            self.angular_velocity = x + speed * about[0], y + speed * about[1], z + speed * about[2]
+            self.linear_acceleration = rotated(back, self.linear_acceleration)
+            self.orientation = product(self.orientation, turn(about, turned))
+
+        self.update = tipped
+
+    @property
+    def roll_pitch_yaw(self) -> Vector:
+        """The orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
+        return Transform(rotation=self.orientation).rpy
+
+
+def shown(
+    items: Mapping[str, DeviceItem], config: Shown, world: Measured, random: Random
+) -> dict[str, Callable[[], int]]:
+    """Return for each item that measures something what its integer on the wire is now.
+
+    An item shows the value that the configuration gives it, else what the name of its state says; one that
+    can be written, and that no robot reads, keeps what was written. What the simulation does not know is 0.
+    """
+    live: dict[str, Callable[[], int]] = {}
+    for name, item in items.items():
+        value = _value(config.states.get(name, item.state), world)
+        if (fixed := config.values.get(name)) is not None:
+            value = _constant(fixed)
+        elif item.access == "RW" and name not in config.states:
+            continue
+        elif value is None and item.unit and item.access == "R" and item.initial is None:
+            value = _constant(0.0)
+        noise = config.noise.get(name, 0.0)
+        if value is not None or noise:
+            live[name] = _reading(item, value or _constant(0.0), noise, random)
+    return live
+
+
+def _constant(value: float) -> Callable[[], float]:
+    return lambda: value
+
+
+def _value(state: str, world: Measured) -> Callable[[], float] | None:
+    """Return what is measured under the name of a state; None: nothing that the simulation knows."""
+    what, _, axis = state.partition(".")
+    index = _AXES.find(axis) if axis else -1
+    if 0 <= index < _VECTORS.get(what, 0):
+        return _moving(world, lambda: getattr(world, what)[index])
+    if state in _TURNS:
+        return _moving(world, lambda: world.roll_pitch_yaw[_TURNS.index(state)])
+    if what == "voltage":
+        return lambda: world.volts
+    return (lambda: world.celsius) if state == "temperature" else None
+
+
+def _moving(world: Measured, show: Callable[[], float]) -> Callable[[], float]:
+    def value() -> float:
+        world.update()
+        return show()
+
+    return value
+
+
+def _reading(item: DeviceItem, value: Callable[[], float], noise: float, random: Random) -> Callable[[], int]:
+    def read() -> int:
+        measured = value()
+        if noise:
+            measured += random.gauss(0.0, noise)
+        return on_the_wire(item, measured)
+
+    return read
+
+
+def on_the_wire(item: DeviceItem, value: float) -> int:
+    """Return the integer that means a value, SI units, within the item's range."""
+    if item.bit is not None:
+        return int(value != 0)
+    number = (value - item.offset) / item.scale
+    if item.encoding == "float32":
+        return int.from_bytes(struct.pack("<f", number), "little")
+    if math.isnan(number):
+        return 0
+    return round(max(item.minimum, min(number, item.maximum)))

@@ -1,0 +1,54 @@
+"""Simulated devices on links of the robot's URDF: an IMU feels how its link turns and moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from dxlrun.contract.body import LinkMotion, Shafts
+from dxlrun.description.frames.transform import rotated
+from dxlsim.device.measured import STANDARD_GRAVITY, Measured
+from dxlsim.device.simulated_device import SimulatedDevice
+from dxlsim.motion.body import SimulatedBody
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.simulation_plan import SensedBodies
+
+
+def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: SensedBodies) -> None:
+    """Let each device that is on a link measure that link's motion, at the time of each reading.
+
+    Raises KeyError for a link that the URDF does not have.
+    """
+    body, count = SimulatedBody(sensed), len(sensed.bodies.joints)
+    mechanics.sense()
+    for device in devices:
+        if device.link:
+            body.motion(device.link)
+            device.world.update = _feeling(device, body, lambda t_ns: mechanics.shafts(t_ns, count))
+
+
+def _feeling(
+    device: SimulatedDevice, body: SimulatedBody, shafts: Callable[[int], Shafts]
+) -> Callable[[], None]:
+    """Return what brings what a device measures to its time, once for all items of a reading."""
+    at_ns = -1
+
+    def update() -> None:
+        nonlocal at_ns
+        if device.now_ns != at_ns:
+            at_ns = device.now_ns
+            body.move(shafts(at_ns))
+            feel(device.world, body.motion(device.link))
+
+    return update
+
+
+def feel(world: Measured, motion: LinkMotion) -> None:
+    """Let a device measure the motion of its link: an accelerometer at rest shows gravity upward."""
+    x, y, z, w = motion.orientation.tolist()
+    pull = np.array(rotated((-x, -y, -z, w), (0.0, 0.0, STANDARD_GRAVITY)))
+    ax, ay, az = (motion.linear_acceleration + pull).tolist()
+    gx, gy, gz = motion.angular_velocity.tolist()
+    world.linear_acceleration, world.angular_velocity = (ax, ay, az), (gx, gy, gz)
+    world.orientation = (x, y, z, w)

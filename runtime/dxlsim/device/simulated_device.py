@@ -1,0 +1,260 @@
+"""A simulated device: registers that show what it measures and keep what is written; no torque, no motion.
+
+It knows ping, read and write, and of the others what its control table names. An instruction that it does not
+know stays without a reply, as of boards with the maker's Dynamixel2Arduino (utility/slave.cpp, processInst).
+Its EEPROM is never locked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from random import Random
+from types import MappingProxyType
+
+from msgspec.structs import replace
+
+from dxlsim.device.measured import Measured, shown
+from dxlsim.registers.access import ACCESS, device_error
+from dxlsim.registers.memory import Memory
+from dxlsim.servo.node import Answer, SimulatedNode, baud_value
+from dxlsim.simulation_plan import DeviceConfig
+from dxlsim.wire.packets import GroupRead, Instruction, InstructionPacket
+from dxlwire.control_table import ControlItem, ControlTable
+from dxlwire.control_table.device_table import WAITS, DeviceTable, read_device_table
+from dxlwire.control_table.devices import device_table
+
+CHAIN_WAIT_NS = 50_000_000
+"""How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
+built natively); each other status restarts it."""
+BOOT_NS = 100_000_000  # How long it receives nothing after a reboot [i]
+
+
+class SimulatedDevice(SimulatedNode):
+    """One device: the bus calls `execute` and `reply_to_group_read`; faults and tests do the rest."""
+
+    kind = "device"
+
+    def __init__(
+        self,
+        table: DeviceTable,
+        config: DeviceConfig,
+        world: Measured,
+        *,
+        baud_rate: int,
+        note: Callable[[str], None],
+        now_ns: int,
+    ) -> None:
+        self.table = table
+        self._line_rate = baud_rate
+        self.link = config.shown.link
+        """Link of the robot's URDF with which it moves; empty: it stands upright and still."""
+        self.world = world  # What it measures
+        self.now_ns = now_ns
+        self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
+        random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
+        self._shown = shown(table.items, config.shown, world, random)
+        self._awaited_id: int | None = None  # Whose status it waits for in a group read
+        self._waits_until_ns = 0
+        registers = _registers(table)
+        self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
+        memory = Memory(registers, registers.items["firmware_version"].initial or 1)
+        super().__init__(memory, device_error, note, now_ns)
+        memory["id"] = config.servo_id
+        if "return_delay_time" in memory:
+            memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
+        if "baud_rate" in memory:
+            memory["baud_rate"] = baud_value(registers, baud_rate)
+        memory.watch(ACCESS.identity, self._identify)
+
+    def _identify(self) -> None:
+        self.servo_id = self.registers["id"]
+
+    # What the bus asks
+
+    @property
+    def baud_rate(self) -> int:
+        """The rate at which it listens, bit/s: that of the line where it has no item for it."""
+        return super().baud_rate if "baud_rate" in self.registers else self._line_rate
+
+    def advance(self, now_ns: int) -> None:
+        """Bring what it measures to a time; going back is ignored."""
+        self.now_ns = max(self.now_ns, now_ns)
+
+    def receives(self, now_ns: int) -> bool:
+        """Take an instruction on the line at a time; return whether it reaches the device."""
+        if self._silent or now_ns < self._deaf_until_ns:
+            return False
+        if self._awaited_id is not None and now_ns < self._waits_until_ns:
+            self.note(f"{self.called}: waits for the status of {self._awaited_id}, and obeys nothing")
+            return False
+        self._awaited_id = None
+        self.advance(now_ns)
+        return all(contact() for contact in self._contacts)
+
+    def chain(self, read: GroupRead, now_ns: int) -> None:
+        """Wait for the status ahead of its own in a group read, if it is a board that does."""
+        listed = [entry.servo_id for entry in read.entries]
+        place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
+        if place and self.receives(now_ns):
+            self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
+
+    def overhear(self, servo_id: int, now_ns: int) -> None:
+        """Take notice of a status packet on the line."""
+        if self._awaited_id == servo_id:
+            self._awaited_id = None
+        elif self._awaited_id is not None and now_ns < self._waits_until_ns:
+            self._waits_until_ns = now_ns + CHAIN_WAIT_NS
+
+    def can(self, capability: str) -> bool:
+        """Return whether it knows an instruction, in the words of control tables."""
+        return capability in self.table.capabilities
+
+    # Instructions
+
+    def _knows(self, instruction: int) -> bool:
+        needs = {
+            Instruction.SYNC_WRITE: "sync_write",
+            Instruction.BULK_WRITE: "bulk_write",
+            Instruction.REBOOT: "reboot",
+        }
+        known = (Instruction.PING, Instruction.READ, Instruction.WRITE)
+        return instruction in known or (instruction in needs and self.can(needs[Instruction(instruction)]))
+
+    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
+        """Return whether a status packet follows: of broadcasts only to a ping, if it takes part in that."""
+        known = self._knows(packet.instruction) and (own or self.can("broadcast_ping"))
+        return known and super()._replies_to(packet, own)
+
+    def _obey(self, packet: InstructionPacket) -> Answer:
+        known = packet.intact and self._knows(packet.instruction)
+        return super()._obey(packet) if known else (0, b"")
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        if packet.instruction != Instruction.REBOOT:
+            return super()._manage(packet)
+        self.reset()
+        self._receive_nothing_until(self.now_ns + BOOT_NS)
+        return 0
+
+    def _written(self, names: frozenset[str]) -> None:
+        """Do nothing: only bytes change."""
+
+    def _takes_part(self, read: GroupRead) -> bool:
+        bulk = read.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ)
+        return self.can("bulk_read" if bulk else "sync_read") and (
+            not read.fast or self.can("fast_sync_read")
+        )
+
+    def _state(self) -> int:
+        return 0
+
+    # What it shows
+
+    def _live_items(self) -> Mapping[str, Callable[[], int]]:
+        live = {name: show for name, show in self._shown.items() if self.table.items[name].bit is None}
+        for item in _registers(self.table).items.values():
+            bits = {
+                each.bit: self._shown[each.name]
+                for each in self.table.items.values()
+                if each.bit is not None and each.address == item.address and each.name in self._shown
+            }
+            if bits:
+                live[item.name] = _put_together(bits)
+        return live
+
+    def _set(self, name: str, wire: int) -> None:
+        """Set an item as if it had been so before; what it measured there it shows no more."""
+        address, size, bit = self._bits[name]
+        place = self._place_names[address, size]
+        if bit is not None:
+            wire = self.registers[place] & ~(1 << bit) | wire << bit
+        self.registers[place] = wire
+        self.registers.show_no_more(place)
+
+    # What faults do
+
+    def protect(self, refused: int = 0) -> None:
+        """Do nothing: a device has no torque to take away."""
+
+    def reset(self) -> None:
+        """Cut and give back its power: RAM is lost."""
+        self.note(f"{self.called}: power cycle")
+        self.registers.restore_ram()
+
+    def tip(self, axis: str, by: float, for_ns: int) -> None:
+        """Turn it about one of its own axes, x, y or z, by an angle, rad, evenly in a time; it stays so."""
+        begin_ns = self.now_ns
+
+        def angle() -> tuple[float, float]:
+            share = (self.now_ns - begin_ns) / for_ns
+            return (by, 0.0) if share >= 1.0 else (by * share, by * 1e9 / for_ns)
+
+        self.world.tip(axis, angle)
+        self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
+
+    def set_voltage(self, volts: float) -> None:
+        """Supply it with another voltage, V."""
+        self.world.volts = volts
+        self.note(f"{self.called}: voltage {volts} V")
+
+    @property
+    def voltage(self) -> float:
+        """Voltage of the supply, V."""
+        return self.world.volts
+
+
+def _registers(table: DeviceTable) -> ControlTable:
+    """Return a device's items as a control table; bits of one place are one item, of the first bit's name."""
+    items: dict[str, ControlItem] = {}
+    places: set[tuple[int, int]] = set()
+    for name, item in table.items.items():
+        if (item.address, item.size) not in places:
+            whole = item if item.bit is None else replace(item, maximum=(1 << 8 * item.size) - 1)
+            items[name] = whole
+        places.add((item.address, item.size))
+    return ControlTable(
+        model=table.model,
+        aliases=table.aliases,
+        model_number=table.model_number or items["model_number"].initial or 0,
+        protocol=table.protocol,
+        items=MappingProxyType(items),
+        baud_rates=table.baud_rates,
+        capabilities=table.capabilities,
+        # it has no shaft, so these say nothing
+        goal_speed_item="",
+        present_speed_item="",
+        effort_item="",
+        rad_per_tick=0.0,
+        min_tick=0,
+        max_tick=0,
+        rad_s_per_tick=0.0,
+        max_speed_tick=0,
+        effort_per_tick=0.0,
+        effort_unit="1",
+        max_speed=0.0,
+        stall_torque=0.0,
+    )
+
+
+def make_device(
+    config: DeviceConfig,
+    protocol: float,
+    world: Measured,
+    *,
+    baud_rate: int,
+    note: Callable[[str], None],
+    now_ns: int,
+) -> SimulatedDevice:
+    """Return a device that was just switched on, and listens at a rate, bit/s.
+
+    Raises LookupError for a model without a table of the protocol, ValueError for a rate that it lacks.
+    """
+    table = (
+        read_device_table(config.shown.table) if config.shown.table else device_table(config.model, protocol)
+    )
+    return SimulatedDevice(table, config, world, baud_rate=baud_rate, note=note, now_ns=now_ns)
+
+
+def _put_together(bits: Mapping[int, Callable[[], int]]) -> Callable[[], int]:
+    return lambda: sum((show() & 1) << bit for bit, show in bits.items())

@@ -1,0 +1,110 @@
+"""A fault as one line of text, `lose servo=3 at=2s`: read, checked, and written back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+
+from dxlrun.errors import InputError, suggestion
+from dxlsim.faults.kinds import DEVICE, KINDS, Kind
+from dxlsim.faults.values import READERS, Value
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """One thing that goes wrong on simulated buses; `str()` gives the line that `parse_fault` reads back."""
+
+    kind: str  # one of KINDS
+    given: Mapping[str, Value]
+    """By key; times are ns, angles degrees. It happens at `at`, counted from the start of the simulation, or
+    after `packet` more instruction packets on the bus; without both of them now."""
+
+    def number(self, key: str) -> int | None:
+        """Return a whole number of it, such as an ID or a time; None: not given."""
+        value = self.given.get(key)
+        return value if isinstance(value, int) else None
+
+    @property
+    def bus(self) -> str | None:
+        """Name of the bus; None: the only one there is."""
+        value = self.given.get("bus")
+        return value if isinstance(value, str) else None
+
+    @property
+    def servo(self) -> int | None:
+        """ID; for a packet: of the servo whose reply it is."""
+        return self.number("servo")
+
+    @property
+    def at_ns(self) -> int | None:
+        """When it happens."""
+        return self.number("at")
+
+    def __str__(self) -> str:
+        readers, given = KINDS[self.kind].readers, self.given
+        written = [key for key in READERS if key in given and (key, given[key]) != ("count", 1)]
+        return " ".join((self.kind, *(f"{key}={readers[key].show(given[key])}" for key in written)))
+
+
+def parse_fault(text: str) -> Fault:
+    """Return the fault of one line such as `silence servo=3 at=1s for=500ms`.
+
+    Raises InputError with one sentence: what is wrong and how to write it.
+    """
+    words = text.split()
+    if not words:
+        raise InputError("a fault is missing; write one such as: lose servo=3 at=2s")
+    name = words[0]
+    kind = KINDS.get(name)
+    if kind is None:
+        known = suggestion(name, tuple(KINDS), f"the faults are {', '.join(KINDS)}")
+        raise InputError(f"there is no fault {name!r}; {known}")
+    given: dict[str, Value] = {}
+    for word in words[1:]:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise InputError(f"{name}: {word!r} is no key=value; write it as in: {usage(name)}")
+        if key not in kind.readers:
+            known = suggestion(key, tuple(kind.readers), f"it takes {', '.join(kind.readers)}")
+            raise InputError(f"{name} takes no {key!r}; {known}")
+        if key in given:
+            raise InputError(f"{name}: {key}= is there twice; leave one of them out")
+        try:
+            given[key] = kind.readers[key].read(value)
+        except ValueError as error:
+            raise InputError(f"{name}: {key}={value}: {error}") from error
+    _check(name, kind, given)
+    return Fault(name, {key: value for key, value in given.items() if (key, value) != ("count", 1)})
+
+
+def usage(name: str) -> str:
+    """Return how a kind is written: `lose [servo=ID] [from=host] ...`; raises KeyError for no kind."""
+    kind = KINDS[name]
+    keys = [(key, f"{key}={reader.example}") for key, reader in kind.readers.items()]
+    return " ".join((name, *(text if key in kind.needs else f"[{text}]" for key, text in keys)))
+
+
+def fault_help() -> tuple[str, ...]:
+    """Return what a person can write: for each kind its line, and what it does."""
+    return tuple(f"{usage(name)}: {kind.does}" for name, kind in KINDS.items())
+
+
+def _check(name: str, kind: Kind, given: Mapping[str, Value]) -> None:
+    missing = [f"{key}=" for key in kind.needs if key not in given]
+    if missing:
+        raise InputError(f"{name} needs {' and '.join(missing)}; write it as in: {usage(name)}")
+    for one, other in (("at", "packet"), ("data", "size")):
+        if one in given and other in given:
+            raise InputError(f"{name} has both {one}= and {other}=; leave one of them out")
+    if "from" in kind.readers and ("servo" in given) == ("from" in given):
+        raise InputError(f"{name} needs either servo=ID, for its reply, or from=host, for an instruction")
+    low, high = given.get("low"), given.get("high")
+    if isinstance(low, float) and isinstance(high, float) and low >= high:
+        raise InputError(f"{name} has low= above high=; exchange them")
+    stormy = given.get("kinds")
+    if isinstance(stormy, tuple):
+        possible = [each for each, one in KINDS.items() if one.of != DEVICE and each != "storm"]
+        unknown = [each for each in stormy if each not in possible]
+        if unknown:
+            near = suggestion(unknown[0], possible, f"write some of {', '.join(possible)}")
+            raise InputError(f"{name}: kinds={','.join(stormy)}: a storm has no {unknown[0]!r}; {near}")

@@ -1,0 +1,136 @@
+"""Faults of simulated buses: planned from lines of text, and entered in the ledger as they happen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from keyword import iskeyword
+from random import Random
+
+from dxlrun.errors import InputError
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import Fault
+from dxlsim.faults.kinds import DEVICE, KINDS, SERVO, WHEN, Happening, Holds
+from dxlsim.faults.values import Value
+
+
+class FaultScript:
+    """Faults that happen to buses at their times; what they leave open is drawn from `seed`.
+
+    A fault that happens is a note in the ledger, `fault: ` and its text, exactly once: one of a packet
+    when that packet passes, any other at its time. A storm's faults are there one by one.
+    """
+
+    def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
+        self._faults = tuple(faults)
+        self._seed = seed
+        self._buses: Sequence[SimulatedBus] = ()
+        self._start_ns = 0
+        self._lines = 0
+        self._planned: list[tuple[Fault, Happening]] = []
+        self._holds: Holds = {}
+
+    def attach(self, buses: Sequence[SimulatedBus], *, start_ns: int = 0, now_ns: int | None = None) -> None:
+        """Plan every fault on its bus; those without a time happen at `now_ns`, at `start_ns` when None.
+
+        `start_ns` is when the simulation started, on the clock of the buses. Raises InputError with one
+        sentence for each fault that could never happen; then none is planned.
+        """
+        self._buses, self._start_ns = tuple(buses), start_ns
+        self._plan(self._faults, start_ns if now_ns is None else now_ns)
+
+    def add(self, fault: Fault, now_ns: int) -> None:
+        """Plan one more fault on the attached buses, by hand; without a time it happens at `now_ns`.
+
+        Raises InputError with one sentence when it could never happen.
+        """
+        self._plan((fault,), now_ns)
+
+    def _plan(self, faults: Sequence[Fault], now_ns: int) -> None:
+        planned: list[tuple[Fault, Happening]] = []
+        wrong: list[str] = []
+        for index, fault in enumerate(faults, start=self._lines):
+            try:
+                planned += self._placed(fault, index, now_ns - self._start_ns)
+            except InputError as error:
+                wrong.append(f"{fault}: {error}")
+        if wrong:
+            raise InputError("\n".join(wrong))
+        self._lines += len(faults)
+        for fault, happening in planned:
+            begin = _action(fault, happening)
+            if (packet := fault.number("packet")) is not None:
+                happening.bus.after(packet, begin)
+            else:
+                at_ns = fault.at_ns
+                happening.bus.at(now_ns if at_ns is None else self._start_ns + at_ns, begin)
+        self._planned += planned
+
+    @property
+    def waiting(self) -> tuple[Fault, ...]:
+        """Faults that have not happened, so far or for ever: a servo that is not read loses no reply."""
+        return tuple(fault for fault, happening in self._planned if not happening.happened)
+
+    def _placed(self, fault: Fault, index: int, since_ns: int) -> list[tuple[Fault, Happening]]:
+        """Return what happens, on which bus; of a storm each of its faults, in the order of their times.
+
+        Each of those names its bus where there are several, its servo, and its time: its text alone repeats
+        it. Without `at=` a storm starts at `since_ns`.
+        """
+        buses = _chosen(fault, self._buses)
+        if fault.at_ns is not None and fault.at_ns < since_ns:
+            raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; leave at= out for now")
+        random = self._random(fault, index)
+        if fault.kind != "storm":
+            return [(fault, Happening(fault.kind, str(fault), buses[0], random, self._holds))]
+        drawn: list[tuple[SimulatedBus, Fault]] = []
+
+        def strike(bus: SimulatedBus, kind: str, given: dict[str, Value]) -> None:
+            name = bus.name if len(buses) > 1 else fault.bus
+            drawn.append((bus, Fault(kind, given if name is None else {**given, "bus": name})))
+
+        begin_ns = since_ns if fault.at_ns is None else fault.at_ns
+        _action(fault, strike, random=random, buses=buses, begin_ns=begin_ns)()
+        drawn.sort(key=lambda one: one[1].at_ns or 0)
+        return [
+            (each, Happening(each.kind, str(each), bus, self._random(each, number), self._holds))
+            for number, (bus, each) in enumerate(drawn)
+        ]
+
+    def _random(self, fault: Fault, index: int) -> Random:
+        seed = fault.number("seed")
+        return Random(f"{self._seed if seed is None else seed} {index} {fault}")
+
+
+def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]:
+    """Return what lets a fault happen: the function of its kind with the values of its line."""
+    named = {f"{key}_" if iskeyword(key) else key: value for key, value in fault.given.items()}
+    return partial(
+        KINDS[fault.kind].act, first, **{key: named[key] for key in named if key not in WHEN}, **others
+    )
+
+
+def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBus]:
+    """Return the bus that is meant, for a storm without one all; raises InputError when nothing is there."""
+    names = " or ".join(f"bus={bus.name}" for bus in buses)
+    chosen = [bus for bus in buses if fault.bus in (None, bus.name)]
+    if not chosen:
+        raise InputError(f"there is no bus {fault.bus!r}; write {names}")
+    if len(chosen) > 1 and fault.kind != "storm":
+        raise InputError(f"there are {len(chosen)} buses; choose one: {names}")
+    of = KINDS[fault.kind].of
+    for bus in chosen:
+        ids = sorted({servo.servo_id for servo in bus.servos})
+        others = sorted({device.servo_id for device in bus.devices} - set(ids))
+        if (fault.servo in others and of == SERVO) or (fault.servo in ids and of == DEVICE):
+            what = "no servo" if of == SERVO else "a servo"
+            raise InputError(
+                f"{fault.servo} on bus {bus.name} is {what}, so {fault.kind} cannot happen to it"
+            )
+        if fault.servo is not None and fault.servo not in (*ids, *others):
+            known = f"its servos are {', '.join(map(str, ids))}" if ids else "it has none"
+            known += f", its other devices {', '.join(map(str, others))}" if others else ""
+            raise InputError(f"bus {bus.name} has no servo {fault.servo}; {known}")
+        if fault.kind == "storm" and not ids:
+            raise InputError(f"bus {bus.name} has no servos; name another one with bus=")
+    return chosen

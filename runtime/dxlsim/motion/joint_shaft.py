@@ -1,0 +1,191 @@
+"""The shaft of servos with angle limits and a moving speed: Protocol 1.0, and the XL-320."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from dxlsim.motion.control_law import FREE, ServoCommand
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.shaft import Shaft, Trajectory, in_turn
+from dxlsim.registers.access import ACCESS, multi_turn_mode, wheel_mode
+from dxlsim.registers.memory import Memory
+from dxlsim.simulation_plan import Load
+
+SLOPE_TICK = math.radians(300) / 1023
+"""Unit of Compliance Slope (28), rad: 0x40 is about 18.8 degrees (manual of the RX-28, example 17)."""
+
+SLOPE_TIMES_P = 1024
+"""P gain 32 is as stiff as slope 32, 8 as slope 128 (e-Manual, MX-28, PID Gains (26, 27, 28)); an identified
+P gain (`Motor.p_gain_duty`) has priority."""
+
+_MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
+"""Tick of no current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
+
+_WHEEL_P, _WHEEL_I = 4.0, 40.0
+"""Duty per part of the no-load speed that is missing, and per s of it: 0.12 s until a speed is there [i]."""
+
+
+class JointShaft(Shaft):
+    """Joint, wheel and multi-turn mode, and where there is Goal Torque, torque control mode.
+
+    In joint mode the trajectory goes at Moving Speed, with Goal Acceleration where there is one; 0 is no
+    limit. AX and RX models turn the error into torque by compliance margin, slope and punch, the MX and
+    the XL-320 by PID gains. In wheel mode Moving Speed is a duty without control of the speed on the AX and
+    RX (unit 0.1 %), and a controlled speed on the MX.
+    """
+
+    items = ACCESS.joint_shaft
+
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, motor, load, angle)
+        self._turns_apart = 0.0
+        """rad of whole turns between the shaft and the turn in which joint mode counts"""
+        self._aimed: tuple[int, int, int] = (0, 0, 0)
+        self._reach = memory.table.max_tick * memory.table.rad_per_tick
+
+    def within_a_turn(self, angle: float) -> float:
+        """Return the angle: such a servo counts no turns."""
+        return angle
+
+    def position_tick(self, angle: float) -> int:
+        """Return what Present Position shows; beyond the reach the nearest end [i]."""
+        table = self.memory.table
+        if multi_turn_mode(self.memory):
+            tick = round(angle / table.rad_per_tick / self.memory["resolution_divider"])
+            return tick + self.memory.ticks("multi_turn_offset") & 0xFFFF  # in two's complement
+        if wheel_mode(self.memory):
+            angle = in_turn(angle)
+        else:
+            angle = in_turn(angle - self._whole_turns(angle)) if angle > math.tau or angle < -1 else angle
+        tick = round(angle / table.rad_per_tick)
+        if tick > table.max_tick and wheel_mode(self.memory):
+            dead_zone = math.tau / table.rad_per_tick - table.max_tick
+            return table.max_tick if tick - table.max_tick < dead_zone / 2 else 0
+        return max(0, min(table.max_tick, tick))
+
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
+        return {
+            "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,  # turns below 0: as goals
+            "present_speed": self._present_speed,
+            "present_load": self._present_load,
+            "moving": lambda: int(self.moving),
+            "current": lambda: self._present_current("current"),
+            "sensed_current": lambda: self._present_current("sensed_current"),
+        }
+
+    def _present_speed(self) -> int:
+        table = self.memory.table
+        unit = table.rad_s_per_tick
+        if wheel_mode(self.memory) and not self._controls_speed:
+            unit = table.max_speed / table.max_speed_tick
+        return _sign_magnitude(self.velocity / unit, table.max_speed_tick)
+
+    def _present_load(self) -> int:
+        fraction = self.memory.table.items["present_load"].scale
+        return _sign_magnitude(self.duty / fraction, 1023)
+
+    def _present_current(self, name: str) -> int:
+        item = self.memory.table.items[name]
+        return max(item.minimum, min(item.maximum, _MID_OF_CURRENT[name] + round(self.current / item.scale)))
+
+    @property
+    def _controls_speed(self) -> bool:
+        return "resolution_divider" in self.memory
+
+    @property
+    def _controls_position(self) -> bool:
+        return not wheel_mode(self.memory) and not self.memory.get("torque_ctrl_mode_enable")
+
+    @property
+    def _noticed_speed(self) -> float:
+        return self.memory.table.rad_s_per_tick / 2
+
+    def _whole_turns(self, angle: float) -> float:
+        """Return the whole turns to an angle, rad; what lies a little outside the reach is within it."""
+        outside = max(math.tau - self._reach, 0.1) / 2
+        return math.tau * math.floor((angle + outside) / math.tau)
+
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
+        memory, table = self.memory, self.memory.table
+        aimed = (memory["goal_position"], memory["moving_speed"], memory.get("goal_acceleration"))
+        if aimed == self._aimed and not afresh:
+            return None
+        if afresh:
+            self._turns_apart = self._whole_turns(self.angle)
+        self._aimed = aimed
+        if multi_turn_mode(memory):
+            signed = aimed[0] - (aimed[0] >> 15 << 16)
+            ticks = (signed - memory.ticks("multi_turn_offset")) * memory["resolution_divider"]
+            goal = ticks * table.rad_per_tick
+        else:
+            goal = aimed[0] * table.rad_per_tick + self._turns_apart
+        speed = (
+            abs(memory.ticks("moving_speed")) * table.rad_s_per_tick or FREE
+        )  # a direction does not count [i]
+        ramp = aimed[2] * table.items["goal_acceleration"].scale if aimed[2] else FREE
+        return goal, speed, ramp
+
+    def _command(self) -> ServoCommand:
+        memory, table = self.memory, self.memory.table
+        limit = memory["torque_limit"] / 1023
+        if memory.get("torque_ctrl_mode_enable"):
+            ampere = memory.ticks("goal_torque") * table.items["goal_torque"].scale
+            torque = ampere * self.motor.torque_per_ampere
+            return ServoCommand(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+        if wheel_mode(memory):
+            return self._wheel(limit)
+        return self._pid(limit) if "p_gain" in memory else self._compliance(limit)
+
+    def _wheel(self, limit: float) -> ServoCommand:
+        table, ticks = self.memory.table, self.memory.ticks("moving_speed")
+        if not self._controls_speed:
+            return ServoCommand(bias=ticks / table.max_speed_tick, limit=limit)
+        stiff, damped = _WHEEL_I / table.max_speed, _WHEEL_P / table.max_speed
+        speed = ticks * table.rad_s_per_tick
+        return ServoCommand(turning=1.0, speed=speed, p_ccw=stiff, p_cw=stiff, d=damped, limit=limit)
+
+    def _compliance(self, limit: float) -> ServoCommand:
+        memory = self.memory
+        punch = memory["punch"] / 1023
+        unit = memory.table.rad_per_tick
+        seen = unit / 2 if punch else 0.0  # less than half a tick of error is none
+        return ServoCommand(
+            p_ccw=(1.0 - punch) / (_slope(memory["ccw_compliance_slope"]) * SLOPE_TICK),
+            p_cw=(1.0 - punch) / (_slope(memory["cw_compliance_slope"]) * SLOPE_TICK),
+            margin_ccw=max(seen, memory["ccw_compliance_margin"] * unit),
+            margin_cw=max(seen, memory["cw_compliance_margin"] * unit),
+            punch=punch,
+            limit=limit,
+        )
+
+    def _pid(self, limit: float) -> ServoCommand:
+        """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains).
+
+        What Punch does beside PID gains is in no manual: nothing here [?].
+        """
+        memory = self.memory
+        unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))
+        p = memory["p_gain"] / 8 * unit
+        return ServoCommand(
+            p_ccw=p,
+            p_cw=p,
+            i=memory["i_gain"] * 1000 / 2048 * unit,
+            d=memory["d_gain"] * 4 / 1000 * unit,
+            limit=limit,
+        )
+
+
+def _slope(value: int) -> int:
+    """Return the slope that counts: the power of two up to the value, 2 to 128.
+
+    e-Manual, AX-12A, Compliance Slope (28): "7 steps".
+    """
+    return min(128, 1 << max(1, value.bit_length() - 1))
+
+
+def _sign_magnitude(ticks: float, limit: int) -> int:
+    magnitude = min(limit, round(abs(ticks)))
+    return magnitude | 1 << 10 if ticks < 0 and magnitude else magnitude

@@ -1,0 +1,268 @@
+"""The shaft of servos with an operating mode: Protocol 2.0 but the XL-320."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from dxlsim.motion.control_law import FREE, LIMP, ServoCommand
+from dxlsim.motion.mechanics import Mechanics
+from dxlsim.motion.motor import Motor
+from dxlsim.motion.shaft import Shaft, Trajectory, critical_d
+from dxlsim.registers.access import ACCESS, OperatingMode, watchdog_expired
+from dxlsim.registers.memory import Memory
+from dxlsim.simulation_plan import Load
+
+REVERSE, TIME_BASED = 0x01, 0x04
+"""Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
+
+_OF_POSITION = (
+    OperatingMode.POSITION,
+    OperatingMode.EXTENDED_POSITION,
+    OperatingMode.CURRENT_BASED_POSITION,
+)
+
+_RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
+_ARRIVED, _ON_THE_WAY = 0x01, 0x02
+"""Bits of Moving Status (123): the profile's kind, in position, a profile is under way."""
+
+_IN_POSITION_TICKS = 10  # So near is "in position"; the manual of the X series names no number [i]
+
+
+SAMPLING_S = 1e-3
+"""What the e-Manual's conversions of gains include, as it says without a figure (X series, Velocity PI Gain
+(76, 78) and Position PID Gain (80 to 84)): they count in PWM units, ticks and velocity units [i]."""
+
+UNKNOWN_P = 150.0
+"""Duty per rad where the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
+
+ROBOTIS' own examples for the PRO line wait until at most 20 ticks are left (DynamixelSDK,
+c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of the
+finest model are 0.000125 rad.
+"""
+
+UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
+"""There, per part of the no-load speed that is missing, and per s of it [i]"""
+
+
+class ModeShaft(Shaft):
+    """Moves by the goal of its mode, with the profile beside it.
+
+    Where Profile Velocity is 0 there is no profile (a step), where Profile Acceleration is 0 it is
+    rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
+    """
+
+    items = ACCESS.mode_shaft
+
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, motor, load, angle)
+        self._aimed: tuple[int, int, int] = (0, 0, 0)
+        self._profile_kind = 0
+        items = memory.table.items
+        self._speed_item = memory.table.goal_speed_item
+        """What the profile's speed is: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
+        of_pro = self._speed_item == "goal_velocity"
+        self._ramp_item = "goal_acceleration" if of_pro else "profile_acceleration"
+        item = items.get(self._ramp_item)
+        self._acceleration_unit = item.scale if item is not None else 1.0
+        self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
+        self._current_unit = items["present_current"].scale if "present_current" in items else 0.001
+        self._torque_item = items.get("goal_torque" if of_pro else "goal_current")
+        self._scale = {name: item.scale for name, item in items.items()}
+        self._rad_per_tick = memory.table.rad_per_tick
+        self._sign, self._offset = 1, 0
+        memory.watch(("drive_mode", "homing_offset"), self._orient)
+
+    def within_a_turn(self, angle: float) -> float:
+        """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
+        shown = self._sign * angle
+        if self.memory.table.items["min_position_limit"].minimum < 0:
+            return self._sign * (shown - math.tau * round(shown / math.tau))
+        # less than half a tick below 0 is still 0
+        half = self.memory.table.rad_per_tick / 2
+        return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
+
+    def position_tick(self, angle: float) -> int:
+        """Return what Present Position shows."""
+        tick = round(self._sign * angle / self._rad_per_tick)
+        return tick + self._offset
+
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
+        return {
+            "present_position": lambda: self.position_tick(self.angle),
+            "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
+            "position_trajectory": lambda: self.position_tick(self._trajectory_angle),
+            "velocity_trajectory": lambda: self._velocity_tick("velocity_trajectory", self._trajectory_speed),
+            "present_load": lambda: round(self._sign * self.duty * 1000),  # unit 0.1 %, as the output is
+            "present_current": lambda: round(self._sign * self.current / self._current_unit),
+            "present_pwm": lambda: round(self._sign * self.duty / self._pwm_unit),
+            "moving": lambda: int(self.moving),
+            "moving_status": self._moving_status,
+        }
+
+    def _velocity_tick(self, name: str, velocity: float) -> int:
+        return round(self._sign * velocity / self._scale[name])
+
+    @property
+    def _trajectory_angle(self) -> float:
+        if not self._goes_to_goal:
+            return self.angle
+        ahead_s = max(0, self.now_ns - self.mechanics.grid_ns) * 1e-9
+        return float(self.mechanics.profiles.position[self.index]) + self._trajectory_speed * ahead_s
+
+    @property
+    def _trajectory_speed(self) -> float:
+        speed = float(self.mechanics.profiles.velocity[self.index])
+        return speed if self._goes_to_goal or (self._last and self._last.turning) else 0.0
+
+    def _moving_status(self) -> int:
+        if not self._goes_to_goal:
+            return _ARRIVED if not self.moving else 0
+        if self._under_way:
+            return self._profile_kind | _ON_THE_WAY
+        goal = float(self.mechanics.profiles.position[self.index])
+        near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
+        return self._profile_kind | (_ARRIVED if near else 0)
+
+    def _orient(self) -> None:
+        self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
+        self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
+
+    @property
+    def _controls_position(self) -> bool:
+        return self.memory["operating_mode"] in _OF_POSITION
+
+    @property
+    def _noticed_speed(self) -> float:
+        threshold = self.memory.get("moving_threshold", 1)
+        return max(threshold, 0.5) * self.memory.table.rad_s_per_tick
+
+    def _command(self) -> ServoCommand:
+        memory, mode = self.memory, self.memory["operating_mode"]
+        if watchdog_expired(memory):
+            return LIMP
+        duty = self._part("goal_pwm", "pwm_limit")
+        limit = memory.get("pwm_limit", round(1 / self._pwm_unit)) * self._pwm_unit
+        if mode == OperatingMode.PWM:
+            return ServoCommand(bias=duty, limit=limit)
+        limit = min(limit, abs(duty)) if "goal_pwm" in memory else limit
+        torque = self._goal_torque()
+        if mode == OperatingMode.CURRENT:
+            return ServoCommand(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+        if mode == OperatingMode.VELOCITY:
+            return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
+        if not self._controls_position:
+            return LIMP  # a value that the model's manual does not name
+        most = (
+            abs(torque)
+            if mode == OperatingMode.CURRENT_BASED_POSITION and "goal_current" in memory
+            else self._most_torque(torque)
+        )
+        return _position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
+
+    def _most_torque(self, torque: float) -> float:
+        """Return what limits the torque beside a position or a speed, Nm.
+
+        Of PRO it is Goal Torque (604), where that is 0 Torque Limit (30) (e-Manual, Goal Torque (604)); of
+        the RH-P12-RN the latter is inferred [i].
+        """
+        if self._torque_item is None or self._torque_item.name != "goal_torque":
+            return FREE
+        return abs(torque) or self.memory["torque_limit"] * self._torque_unit
+
+    def _turn(self, limit: float) -> ServoCommand:
+        memory = self.memory
+        speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
+        ramp = self._profile(self._ramp_item) * self._acceleration_unit or FREE
+        return _velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
+
+    def _part(self, name: str, otherwise: str) -> float:
+        memory = self.memory
+        ticks = memory.ticks(name) if name in memory else memory.get(otherwise)
+        return self._sign * ticks * self._pwm_unit
+
+    def _goal_torque(self) -> float:
+        memory = self.memory
+        if self._torque_item is None:
+            return FREE
+        return self._sign * memory.ticks(self._torque_item.name) * self._torque_unit
+
+    @property
+    def _torque_unit(self) -> float:
+        """Nm per tick of the goal: it counts current, or parts of the stall torque (L42-10-S300-R)."""
+        if self._torque_item is None:
+            return 0.0
+        parts = self._torque_item.unit == "1"
+        whole = self.motor.stall_torque if parts else self.motor.torque_per_ampere
+        return self._torque_item.scale * whole
+
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
+        memory, table = self.memory, self.memory.table
+        velocity, ramp = self._profile(self._speed_item), self._profile(self._ramp_item)
+        aimed = (memory["goal_position"], velocity, ramp)
+        if aimed == self._aimed and not afresh:
+            return None
+        self._aimed = aimed
+        goal = self._sign * (memory.ticks("goal_position") - self._offset) * table.rad_per_tick
+        if not velocity:
+            self._profile_kind = 0
+            return goal, FREE, FREE
+        distance = abs(goal - float(self.mechanics.profiles.position[self.index]))
+        if memory.get("drive_mode") & TIME_BASED:
+            return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
+        speed = velocity * table.rad_s_per_tick
+        acceleration = ramp * self._acceleration_unit or FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
+
+    def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
+        """Return the move that takes a duration, s, and a time to come to speed, s, at most half of it."""
+        if distance == 0.0:
+            return goal, FREE, FREE
+        ramp = min(ramp, duration / 2)
+        speed = distance / (duration - ramp)
+        acceleration = speed / ramp if ramp else FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
+
+    def _profile(self, name: str) -> int:
+        return abs(self.memory.ticks(name)) if name in self.memory else 0
+
+
+def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> int:
+    if not ramp:
+        return _RECTANGULAR
+    return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR
+
+
+def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
+    """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
+
+    Where the P gain was identified as another one, the others go with it [i].
+    """
+    table = memory.table
+    if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:
+        d = critical_d(UNKNOWN_P, motor)
+        return ServoCommand(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
+    unit = 128 * motor.p_gain_duty or table.items["goal_pwm"].scale / table.rad_per_tick
+    p = memory["position_p_gain"] / 128 * unit
+    return ServoCommand(
+        p_ccw=p,
+        p_cw=p,
+        i=memory["position_i_gain"] / 65536 * unit / SAMPLING_S,
+        d=memory["position_d_gain"] / 16 * unit * SAMPLING_S,
+        feed_velocity=memory.get("feedforward_1st_gain") / 4 * unit * SAMPLING_S,
+        feed_acceleration=memory.get("feedforward_2nd_gain") / 4 * unit * SAMPLING_S**2,
+    )
+
+
+def _velocity_gains(memory: Memory) -> ServoCommand:
+    """Return the gains of velocity control, KVP / 128 and KVI / 65536, on the integrated speed."""
+    table = memory.table
+    if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
+        p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed
+        return ServoCommand(p_ccw=i, p_cw=i, d=p)
+    unit = table.items["goal_pwm"].scale / table.rad_s_per_tick
+    i = memory["velocity_i_gain"] / 65536 * unit / SAMPLING_S
+    return ServoCommand(p_ccw=i, p_cw=i, d=memory["velocity_p_gain"] / 128 * unit)

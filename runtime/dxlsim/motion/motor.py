@@ -1,0 +1,161 @@
+"""The motor of a simulated servo with its gear, from the manual's figures and published identifications."""
+
+from __future__ import annotations
+
+import fnmatch
+import functools
+import tomllib
+from pathlib import Path
+
+import msgspec
+from msgspec.structs import replace
+
+from dxlrun.description.joints.motor import MotorModel, Stribeck
+from dxlwire.control_table import ControlTable
+
+STALL_POWER_W = 20.0
+"""Stall torque times no-load speed where the manual gives no stall torque: as an XM430-W350 [i]."""
+
+STALL_CURRENT_A = 1.5  # Where the manual gives none and the model measures none: as an AX-12A [i]
+
+_FILE = Path(__file__).parent / "motors.toml"
+
+
+class Motor(msgspec.Struct, frozen=True):
+    """A direct-current motor with its gear, as felt at the horn: torque falls with speed in a line.
+
+    Friction is at most `friction + load_friction * |motor's torque - load's torque|`, and in motion
+    `viscous_friction` times the speed beside it: model M3 of M. Duclusaud et al., "Extended Friction Models
+    for the Physics Simulation of Servo Actuators" (arXiv 2410.08650).
+    """
+
+    stall_torque: float  # Nm of the motor at `voltage` and standstill; friction is not taken off
+    damping: float
+    """Nm s/rad that the motor loses to its own voltage: torque constant squared over resistance"""
+    torque_per_ampere: float  # Nm/A
+    voltage: float  # V at which `stall_torque` holds; 0: whatever it is supplied with
+    inertia: float  # kg m^2 of rotor and gear
+    friction: float = 0.0  # Nm (Coulomb)
+    load_friction: float = 0.0  # Nm of friction for each Nm between the motor's torque and the load's
+    viscous_friction: float = 0.0  # Nm s/rad
+    p_gain_duty: float = 0.0
+    """Duty for each rad of error and each unit of the P gain; 0: not identified, the manual's holds"""
+    source: str = ""  # Where the figures are from that no manual gives
+    gain_source: str = ""  # Where `p_gain_duty` is from
+    stribeck: Stribeck | None = None  # More friction near standstill
+
+    @property
+    def time_constant(self) -> float:
+        """How fast the motor takes up speed without load and friction, s: J R / kt^2."""
+        return self.inertia / self.damping
+
+    @property
+    def no_load_speed(self) -> float:
+        """rad/s at `voltage` and full duty: where motor and friction are in balance."""
+        driving = 1.0 - self.load_friction
+        return (driving * self.stall_torque - self.friction) / (
+            driving * self.damping + self.viscous_friction
+        )
+
+
+class _Gain(msgspec.Struct, frozen=True):
+    item: str
+    duty_per_rad: float
+    models: tuple[str, ...]
+    identified: tuple[str, ...]
+    source: str
+
+
+class _Scaled(msgspec.Struct, frozen=True):
+    models: tuple[str, ...]  # Patterns
+    like: str  # An identified model
+
+
+class _Motors(msgspec.Struct, frozen=True):
+    identified: tuple[MotorModel, ...]
+    scaled: tuple[_Scaled, ...]
+    gain: tuple[_Gain, ...]
+
+
+def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
+    """Return a model's motor: that of a motor file, or else an identified one.
+
+    Where there is neither it is the manual's, with inertia and friction of one like it.
+    """
+    known = _known(table)
+    if model is None:
+        return known
+    motor = identified_motor(model)
+    if motor.p_gain_duty:
+        return motor
+    return replace(motor, p_gain_duty=known.p_gain_duty, gain_source=known.gain_source)
+
+
+def _known(table: ControlTable) -> Motor:
+    motors, model = _motors(), table.model.partition("-FW")[0]
+    identified = {each.model: each for each in motors.identified}
+    if model in identified:
+        motor = identified_motor(identified[model])
+    else:
+        motor = _scaled(table, identified[next(one.like for one in motors.scaled if _among(model, one))])
+    for gain in motors.gain:
+        if gain.item in table.items and _among(model, gain):
+            known = "" if model in gain.identified else f"[i] as {gain.identified[0]}; "
+            return replace(motor, p_gain_duty=gain.duty_per_rad, gain_source=known + gain.source)
+    return motor
+
+
+def identified_motor(model: MotorModel) -> Motor:
+    """Return the motor of a motor file, or of motors.toml."""
+    return Motor(
+        stall_torque=model.torque_constant * model.voltage / model.resistance,
+        damping=model.torque_constant**2 / model.resistance,
+        torque_per_ampere=model.torque_constant,
+        voltage=model.voltage,
+        inertia=model.inertia,
+        friction=model.friction,
+        load_friction=model.load_friction,
+        viscous_friction=model.viscous_friction,
+        p_gain_duty=model.position_gain or 0.0,
+        source=model.source,
+        gain_source=model.source if model.position_gain else "",
+        stribeck=model.stribeck,
+    )
+
+
+def _scaled(table: ControlTable, like: MotorModel) -> Motor:
+    """Return a motor of the manual's stall torque and no-load speed, the rest in proportion to another one's.
+
+    Damping is what leaves just that speed with friction f, load friction l and viscous friction v:
+    (1 - l) * (stall torque - damping * speed) = f + v * speed.
+    """
+    model = identified_motor(like)
+    torque = table.stall_torque or STALL_POWER_W / table.max_speed
+    friction = model.friction / model.stall_torque
+    viscous = model.viscous_friction / model.damping
+    driving = 1.0 - model.load_friction
+    damping = torque * (driving - friction) / (table.max_speed * (driving + viscous))
+    limit = table.items.get("current_limit") or table.items.get("torque_limit")  # PRO has the latter, in A
+    measured = STALL_CURRENT_A
+    if limit is not None and limit.unit == "A":
+        measured = limit.maximum * limit.scale
+    return Motor(
+        stall_torque=torque,
+        damping=damping,
+        torque_per_ampere=torque / (table.stall_current or measured),
+        voltage=table.nominal_voltage,
+        inertia=model.time_constant * damping,
+        friction=friction * torque,
+        load_friction=model.load_friction,
+        viscous_friction=viscous * damping,
+        source=f"[i] scaled from the {like.model}: {like.source}",
+    )
+
+
+def _among(model: str, those: _Scaled | _Gain) -> bool:
+    return any(fnmatch.fnmatchcase(model, pattern) for pattern in those.models)
+
+
+@functools.cache
+def _motors() -> _Motors:
+    return msgspec.convert(tomllib.loads(_FILE.read_text("utf-8")), _Motors)

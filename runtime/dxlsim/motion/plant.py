@@ -1,0 +1,196 @@
+"""What simulated servos move: joints with inertia, friction and gravity, all of them in one step.
+
+The servos give the torque with which they drive at standstill and how much of it each rad/s takes away; a
+plant turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.description.joints.motor import Stribeck
+from dxlsim.motion.motor import Motor
+from dxlsim.simulation_plan import Load
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+JAMMED_NM = 1e6  # Friction of a blocked joint: more than any motor has
+
+
+class PlantJoint(msgspec.Struct, frozen=True):
+    """One servo's shaft as a plant takes it over."""
+
+    motor: Motor  # Its inertia and friction are the plant's to apply
+    load: Load
+    angle: float  # rad from the servo's raw 0, at the start
+    recounted: float = 0.0  # rad that its count has shifted by since it was mounted
+
+
+class Plant(Protocol):
+    """All joints of a simulation, in the order in which the servos were added."""
+
+    @property
+    def angle(self) -> Floats:
+        """Angles, rad; the same array for ever."""
+
+    @property
+    def velocity(self) -> Floats:
+        """Speeds, rad/s, counter-clockwise positive; the same array for ever."""
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest."""
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere, as after a power cycle: rad."""
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it."""
+
+
+Part = tuple[Sequence[int], Plant]  # Some of the servos, by index, and what moves them
+
+PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
+"""Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
+
+
+class IndependentJoints:
+    """Joints that do not feel one another.
+
+    Velocity first, damping taken at the end of the step: stable at any damping and any step. That alone would
+    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % of an MX-64's); the inertia
+    of the step is less by it, which makes it Crank and Nicolson's. Friction is that of `Motor` and of `Load`.
+    """
+
+    def __init__(self, joints: Sequence[PlantJoint]) -> None:
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        self._inertia = np.array([each.motor.inertia + each.load.inertia for each in joints])
+        self._own_damping = np.array([each.motor.damping + each.motor.viscous_friction for each in joints])
+        self._friction = np.array([each.motor.friction + each.load.friction for each in joints])
+        self._load_friction = np.array([each.motor.load_friction for each in joints])
+        self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
+        self._gravity = np.array([each.load.gravity for each in joints])
+        self._down = np.array([each.load.gravity_angle + each.recounted for each in joints])
+        self._turns = np.array([each.load.turns for each in joints])
+        self._steady = np.array([each.load.steady for each in joints])
+        self._stribeck = Stribecks(joints) if any(each.motor.stribeck for each in joints) else None
+        self._free_friction = self._friction.copy()
+        self._dt_s = 0.0
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        if dt_s != self._dt_s:
+            self._set_step(dt_s)
+        velocity, per_torque = self.velocity, self._per_torque
+        pull = np.sin((self.angle - self._down) * self._turns) * self._gravity + self._steady
+        # the motor's torque, which gravity's is added to
+        most = np.abs(drive - damping * velocity + pull) * (self._load_friction * per_torque)
+        most += self._friction * per_torque
+        if self._stribeck is not None:
+            most += self._stribeck.friction(velocity) * per_torque
+        free = velocity + (drive - pull) * per_torque  # as it would be without friction and damping
+        # what friction takes in a step, and no more: a joint that it stops stays at rest
+        rubbed = free - np.maximum(np.minimum(free, most), -most)
+        velocity[:] = rubbed / (per_torque * damping + self._undamped)
+        self.angle += velocity * dt_s
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a joint where it is, or free it."""
+        self._friction[index] = JAMMED_NM if on else self._free_friction[index]
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+        self.angle[index] = angle
+        self.velocity[index] = 0.0
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere."""
+        self.angle[index] += by
+        self._down[index] += by
+
+    def _set_step(self, dt_s: float) -> None:
+        self._dt_s = dt_s
+        # not less than half: a step as long as the motor's time constant is no more exact by it
+        inertia = np.maximum(self._inertia - self._own_damping * dt_s / 2, self._inertia / 2)
+        self._per_torque: Floats = dt_s / inertia
+        self._undamped: Floats = 1.0 + self._viscous_friction * self._per_torque
+
+
+class SeveralPlants:
+    """Plants that do not feel one another, each with some of the servos."""
+
+    def __init__(self, joints: Sequence[PlantJoint], parts: Sequence[Part]) -> None:
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        self._parts = [(np.array(rows, dtype=np.intp), plant) for rows, plant in parts]
+        self._place_of = {
+            row: (rows, plant, place)
+            for rows, plant in self._parts
+            for place, row in enumerate(rows.tolist())
+        }
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        for rows, plant in self._parts:
+            self._hand(rows, plant)
+            plant.step(drive[rows], damping[rows], dt_s)
+            self._take(rows, plant)
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest."""
+        rows, plant, place = self._place_of[index]
+        self._hand(rows, plant)
+        plant.place(place, angle)
+        self._take(rows, plant)
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere."""
+        rows, plant, place = self._place_of[index]
+        self._hand(rows, plant)
+        plant.recount(place, by)
+        self._take(rows, plant)
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it."""
+        _, plant, place = self._place_of[index]
+        plant.jam(place, on)
+
+    def _hand(self, rows: Rows, plant: Plant) -> None:
+        """Hand a plant the shafts as they are: they may have been changed in the arrays of all."""
+        plant.angle[:] = self.angle[rows]
+        plant.velocity[:] = self.velocity[rows]
+
+    def _take(self, rows: Rows, plant: Plant) -> None:
+        self.angle[rows] = plant.angle
+        self.velocity[rows] = plant.velocity
+
+
+def one_plant(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
+    """Return the plant that these parts are together; rows are in the order of the joints."""
+    rows, plant = parts[0]
+    return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
+
+
+class Stribecks:
+    """The friction of joints that is there near standstill only."""
+
+    def __init__(self, joints: Sequence[PlantJoint]) -> None:
+        parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
+        self._most = np.array([part.friction for part in parts])
+        self._speed = np.array([part.velocity for part in parts])
+        self._exponent = np.array([part.exponent for part in parts])
+
+    def friction(self, velocity: Floats) -> Floats:
+        """Return it at some velocities, rad/s, in Nm."""
+        friction: Floats = self._most * np.exp(-((np.abs(velocity) / self._speed) ** self._exponent))
+        return friction

@@ -1,0 +1,172 @@
+"""The shaft of a simulated servo: what the registers command, and what they show of how it moves."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import ClassVar
+
+from dxlsim.motion.control_law import LIMP, ServoCommand
+from dxlsim.motion.mechanics import STEP_NS, Mechanics
+from dxlsim.motion.motor import Motor
+from dxlsim.registers.access import ShaftItems
+from dxlsim.registers.memory import Memory
+from dxlsim.simulation_plan import Load
+
+Trajectory = tuple[float, float, float]
+"""Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
+
+
+class Shaft(ABC):
+    """Follows what is written, and is looked at; a subclass for each family of registers."""
+
+    items: ClassVar[ShaftItems]
+
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
+        self.memory = memory
+        self.mechanics = mechanics
+        self.motor = motor
+        self._torque_per_ampere = self.motor.torque_per_ampere
+        self.index = mechanics.add(self.motor, load, angle)
+        self.now_ns = mechanics.grid_ns
+        self._last: ServoCommand | None = None
+        self._goes_to_goal = False
+        self.response_delay_ns = 0  # Until what is commanded acts; torque off acts at once
+        self._withdrawn = 0  # How often what had not acted yet was withdrawn
+
+    @property
+    def angle(self) -> float:
+        """Angle, rad from raw 0, of the shaft itself: turns count, Homing Offset and reversal do not."""
+        plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
+        angle: float = plant.angle.item(self.index)
+        return angle + plant.velocity.item(self.index) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
+
+    @property
+    def velocity(self) -> float:
+        """Speed, rad/s, counter-clockwise positive."""
+        return self.mechanics.plant.velocity.item(self.index)
+
+    @property
+    def current(self) -> float:
+        """Current of the motor, A, positive when it drives counter-clockwise."""
+        return self.mechanics.law.torque.item(self.index) / self._torque_per_ampere
+
+    @property
+    def duty(self) -> float:
+        """Part of the supply's voltage that the motor gets, -1 to 1."""
+        return self.mechanics.law.duty.item(self.index)
+
+    @property
+    def moving(self) -> bool:
+        """True while its trajectory moves, or it is faster than its threshold."""
+        return self._under_way or abs(self.velocity) > self._noticed_speed
+
+    @property
+    def torque_on(self) -> bool:
+        """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
+        return self.memory.get("torque_enable") == 1 and self.memory.get("torque_limit", 1) > 0
+
+    def recount(self, angle: float) -> None:
+        """Put the shaft to rest where it is, its angle counted in another turn."""
+        self.mechanics.recount(self.index, angle)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._withdrawn += 1
+        self._last = None
+        self._goes_to_goal = False
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass; going back is ignored."""
+        if now_ns > self.now_ns:
+            self.now_ns = now_ns
+            if now_ns - self.mechanics.grid_ns >= STEP_NS:
+                self.mechanics.advance(now_ns)
+
+    def plan(self, written: Iterable[str]) -> None:
+        """Command what was written, if that is something else."""
+        if self.items.aims.isdisjoint(written) and self.items.others.isdisjoint(written):
+            return
+        if self._goes_to_goal and self.items.aims.issuperset(written):
+            if (trajectory := self._new_trajectory()) is not None:
+                self._act(partial(self.mechanics.aim, self.index, *trajectory))
+            return
+        command = self._command() if self.torque_on else LIMP
+        self._goes_to_goal = command.limit > 0.0 and self._controls_position
+        if self._goes_to_goal and (trajectory := self._new_trajectory(afresh=True)) is not None:
+            goal, speed, acceleration = trajectory
+            command = command._replace(goal=goal, speed=speed, acceleration=acceleration)
+        if command != self._last:
+            self._last = command
+            if command.limit == 0.0:
+                self._withdrawn += 1
+                self.mechanics.command(self.index, command)
+            else:
+                self._act(partial(self.mechanics.command, self.index, command))
+
+    def _act(self, action: Callable[[], None]) -> None:
+        """Do something to the mechanics after the response delay, at the next point of its grid.
+
+        Up to a step late, a half on average: as much as a plant is ahead, whose velocity comes first.
+        """
+        withdrawn = self._withdrawn
+
+        def act() -> None:
+            if withdrawn == self._withdrawn:
+                action()
+
+        self.mechanics.call_at(self.now_ns + self.response_delay_ns, act)
+
+    def power_up(self) -> None:
+        """Come to rest within one turn, and take the angle as the goal [i]."""
+        self.recount(self.within_a_turn(self.angle))
+        self.memory["goal_position"] = self.position_tick(self.angle)
+
+    @abstractmethod
+    def within_a_turn(self, angle: float) -> float:
+        """Return an angle as the servo finds it when it is switched on."""
+
+    @abstractmethod
+    def position_tick(self, angle: float) -> int:
+        """Return what Present Position shows."""
+
+    @abstractmethod
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
+
+    @abstractmethod
+    def _command(self) -> ServoCommand:
+        """Return what the registers command while torque is on, the trajectory to a goal left out."""
+
+    @property
+    @abstractmethod
+    def _controls_position(self) -> bool: ...
+
+    @property
+    @abstractmethod
+    def _noticed_speed(self) -> float: ...
+
+    @abstractmethod
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
+        """Return the trajectory that the registers command; None: it is the current one."""
+
+    @property
+    def _under_way(self) -> bool:
+        return self._goes_to_goal and not self.mechanics.profiles.at_goal(self.index)
+
+
+def in_turn(angle: float) -> float:
+    """Return the same direction between 0 and a whole turn."""
+    return angle if 0 <= angle < math.tau else angle % math.tau
+
+
+def critical_d(p: float, motor: Motor) -> float:
+    """Return the D gain, duty per rad/s, with which a P gain, duty per rad, does not overshoot.
+
+    With the motor's time constant T, and w its stall torque over damping, the loop is
+    T x'' + (1 + D w) x' + P w x = 0.
+    """
+    speed = motor.stall_torque / motor.damping
+    return max(0.0, 2 * math.sqrt(p * speed * motor.time_constant) - 1.0) / speed

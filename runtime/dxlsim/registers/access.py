@@ -1,0 +1,188 @@
+"""Which writes a simulated servo or device refuses, and with which error; `[i]` marks what no manual has.
+
+A write is refused as a whole [i]. What items mean to a servo is a table, `access.toml`.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from enum import IntEnum, unique
+from pathlib import Path
+
+import msgspec
+
+from dxlsim.registers.memory import Memory, Run, signed
+from dxlsim.wire.protocol1 import ErrorBit
+from dxlsim.wire.protocol2 import ErrorNumber
+from dxlwire.control_table import SIGN_BIT, ControlItem, ControlTable
+
+ErrorOf = Callable[[Memory, ControlItem, int], int]
+"""The error of a value of an item, with its sign where it has one; 0: it is taken."""
+
+_TURNS = 256
+"""Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
+_MULTI_TURN_GOAL = 28_672  # Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))
+_MULTI_TURN_LIMIT = 4095
+_MAGNITUDE = (1 << SIGN_BIT) - 1
+TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y
+
+
+class ShaftItems(msgspec.Struct, frozen=True):
+    """Items whose writing may change the motion of one kind of shaft."""
+
+    aims: frozenset[str]
+    others: frozenset[str]
+
+
+class _Values(msgspec.Struct, frozen=True):
+    range: tuple[int, int]
+    values: frozenset[int]
+    torque_enable: int | None = None
+    without: str = ""
+
+    def fit(self, item: ControlItem, table: ControlTable) -> bool:
+        return (
+            self.range == (item.minimum, item.maximum)
+            and self.torque_enable in (None, table.items["torque_enable"].address)
+            and self.without not in table.items
+        )
+
+
+class AccessTable(msgspec.Struct, frozen=True):
+    """`access.toml`, which explains its keys."""
+
+    identity: tuple[str, ...]
+    goals: frozenset[str]
+    gains: tuple[str, ...]
+    profile: tuple[str, ...]
+    joint_shaft: ShaftItems
+    mode_shaft: ShaftItems
+    limits: Mapping[str, str]
+    limits_of_p: Mapping[str, str]
+    values: Mapping[str, tuple[_Values, ...]]
+
+
+ACCESS = msgspec.convert(tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8")), AccessTable)
+
+
+@unique
+class OperatingMode(IntEnum):
+    """Operating Mode (11); the position limits hold in POSITION."""
+
+    CURRENT = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    CURRENT_BASED_POSITION = 5
+    PWM = 16
+
+
+def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
+    """Return the error with which a write would be refused; 0 when it would not.
+
+    Protocol 1.0: the error bits of all its items; a cell that no item owns is a range error [i].
+    Protocol 2.0: the first error; the EEPROM is closed while the torque is on, and part of an item is a
+    length error (e-Manual, Protocol 2.0, "Error": Data Length Error).
+    """
+    cells = run.cells
+    errors = (error_of(memory, item, signed(item, run.after[item.name])) for item in cells.items)
+    if memory.table.protocol == 1.0:
+        error = 0 if cells.items else int(ErrorBit.RANGE)
+        for each in errors:
+            error |= each
+        return error
+    if not cells.items or cells.read_only or (cells.eeprom and memory.get("torque_enable")):
+        return ErrorNumber.ACCESS
+    return next(filter(None, errors), 0) if cells.whole else ErrorNumber.DATA_LENGTH
+
+
+def device_error(memory: Memory, item: ControlItem, value: int) -> int:
+    """Return the error of a value of a device's item: of one outside its range."""
+    taken = item.access == "RW" and item.minimum <= value <= item.maximum
+    return 0 if taken else ErrorBit.RANGE if memory.table.protocol == 1.0 else ErrorNumber.DATA_RANGE
+
+
+def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
+    """Return the error of a value in Protocol 1.0, where Lock (47) closes the EEPROM until the power is cut.
+
+    A read-only item, a locked one and a value out of its range are range errors [i]; a goal outside the angle
+    limits is an angle limit error (e-Manual, Goal Position (30)).
+
+    A Moving Speed with a direction bit is taken in joint mode too [i]: the manual has only "0 ~ 1,023 can be
+    used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
+    """
+    if item.name == "goal_position" and multi_turn_mode(memory):  # it counts turns, in two's complement
+        return ErrorBit.RANGE if abs(value - (value >> 15 << 16)) > _MULTI_TURN_GOAL else 0
+    locked = memory.get("lock") == 1 and (not value if item.name == "lock" else item.area == "EEPROM")
+    # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
+    strong = item.name == "goal_torque" and value & _MAGNITUDE > memory["torque_limit"]
+    if locked or strong:
+        return ErrorBit.RANGE
+    error = device_error(memory, item, value)
+    return error or (ErrorBit.ANGLE_LIMIT if _outside_angle_limits(memory, item, value) else 0)
+
+
+def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
+    """Return the error of a value in Protocol 2.0."""
+    name, table = item.name, memory.table
+    one_turn = name == "goal_position" and _one_turn(memory)
+    lowest, highest = item.minimum, item.maximum
+    if one_turn:  # or a goal that only the position limits bound: those of Y reach over turns
+        limit = table.items.get("max_position_limit", item)
+        lowest, highest = min(lowest, limit.minimum), max(highest, limit.maximum)
+    elif name == "goal_position":
+        highest = max(round(_TURNS * math.tau / table.rad_per_tick) - 1, highest)
+        lowest = -highest
+    known = next((one.values for one in ACCESS.values.get(name, ()) if one.fit(item, table)), None)
+    taken = lowest <= value <= highest if known is None else value in known
+    if not taken or (name in ACCESS.goals and watchdog_expired(memory)):
+        return ErrorNumber.DATA_RANGE
+    limit_name = ACCESS.limits.get(name, "")
+    if name in ACCESS.limits_of_p and table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
+        limit_name = ACCESS.limits_of_p[name]
+    if limit_name in memory:
+        beyond = abs(value) > memory[limit_name]
+    elif one_turn and "max_position_limit" in memory:
+        beyond = not memory.ticks("min_position_limit") <= value <= memory.ticks("max_position_limit")
+    else:
+        beyond = _outside_angle_limits(memory, item, value)
+    return ErrorNumber.DATA_LIMIT if beyond else 0
+
+
+def _outside_angle_limits(memory: Memory, item: ControlItem, value: int) -> bool:
+    if item.name != "goal_position" or "cw_angle_limit" not in memory:
+        return False
+    free = multi_turn_mode(memory) or wheel_mode(memory)
+    return not free and not memory["cw_angle_limit"] <= value <= memory["ccw_angle_limit"]
+
+
+def _one_turn(memory: Memory) -> bool:
+    """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
+    goal = memory.table.items["goal_position"]
+    has_one = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
+    return has_one or memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
+
+
+def watchdog_expired(memory: Memory) -> bool:
+    """Return whether Bus Watchdog (98) shows that its time ran out: -1, which no host can write."""
+    item = memory.table.items.get("bus_watchdog")
+    return item is not None and memory["bus_watchdog"] > item.maximum
+
+
+def wheel_mode(memory: Memory) -> bool:
+    """Return whether a servo with angle limits turns without end (e-Manual, CW/CCW Angle Limit (6, 8)).
+
+    Both limits are 0, or, where the model has it, Control Mode (11) is 1 (XL-320).
+    """
+    if "control_mode" in memory:
+        return memory["control_mode"] == 1
+    return memory.get("cw_angle_limit") == 0 and memory.get("ccw_angle_limit") == 0
+
+
+def multi_turn_mode(memory: Memory) -> bool:
+    """Return whether a servo of Protocol 1.0 counts turns: both angle limits are 4095 (e-Manual, MX)."""
+    if "multi_turn_offset" not in memory:
+        return False
+    return memory["cw_angle_limit"] == memory["ccw_angle_limit"] == _MULTI_TURN_LIMIT

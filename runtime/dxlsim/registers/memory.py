@@ -1,0 +1,262 @@
+"""The memory of a simulated servo: the control items of its table as bytes and as integers of the wire."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from dxlwire.control_table import ControlItem, ControlTable
+
+_INDIRECT = re.compile(r"indirect_address_(\d+)")
+
+_CELLS_KEPT = 1024
+"""So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
+
+
+class Cells(NamedTuple):
+    """What is in a row of cells."""
+
+    items: tuple[ControlItem, ...]  # Their items; none when a cell belongs to no item
+    names: frozenset[str]
+    whole: bool  # True when they are those items from the first byte to the last
+    touched: bool  # True when one of them belongs to an item
+    direct: bool  # True when none of them is Indirect Data
+    read_only: bool  # True when one of the items is
+    eeprom: bool  # True when one of the items is in the EEPROM area
+    live: tuple[tuple[str, Callable[[], int]], ...]
+    """What shows something else whenever it is looked at, and what it shows now."""
+
+
+class Run(NamedTuple):
+    """Bytes for a row of cells."""
+
+    address: int
+    data: bytes
+    cells: Cells
+    after: dict[str, int]  # The integers of the items that a write touches, as they would be after it
+
+
+class Memory:
+    """Bytes of a control table; `memory[name]` is the integer of the wire, never negative.
+
+    Cells of Indirect Data are those cells whose addresses the Indirect Addresses hold.
+    """
+
+    def __init__(self, table: ControlTable, firmware: int) -> None:
+        self.table = table = table.with_firmware(firmware)
+        self.firmware = firmware
+        self.has_gaps = True
+        """False: where no cell belongs to an item there is nothing to read."""
+        self.size = table.size  # Bytes from address 0 to the end of the last item
+        self._memory = bytearray(self.size)
+        self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
+        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts access the same again and again
+        self._item_at: dict[int, ControlItem] = {
+            address: item
+            for item in table.items.values()
+            for address in range(item.address, item.address + item.size)
+        }
+        self._indirect = _indirect_cells(table)
+        self._places = {item.name: _place(item) for item in table.items.values()}
+        self._watchers: dict[str, list[Callable[[], None]]] = {}
+        self._live: dict[str, Callable[[], int]] = {}
+        self.restore_factory_values()
+
+    def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
+        """Set every item but those of `keep` to its initial value, and those without one to 0."""
+        self.reset(name for name in self.table.items if name not in keep)
+        self["model_number"] = self.table.model_number
+        self["firmware_version"] = self.firmware
+
+    def restore_ram(self) -> None:
+        """Set the items of the RAM area to what they are at power-up; the EEPROM area stays."""
+        self.reset(name for name, item in self.table.items.items() if item.area == "RAM")
+
+    def reset(self, names: Iterable[str]) -> None:
+        """Set some items to their initial values, those of them that the model has."""
+        for name in names:
+            if (item := self.table.items.get(name)) is not None:
+                initial = max(0, item.minimum) if item.access == "RW" else 0
+                self[name] = initial if item.initial is None else item.initial
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def __getitem__(self, name: str) -> int:
+        return self._values[name]
+
+    def __setitem__(self, name: str, wire: int) -> None:
+        start, end, mask, _, _ = self._places[name]
+        wire &= mask
+        if self._values.get(name) == wire:
+            return
+        self._memory[start:end] = wire.to_bytes(end - start, "little")
+        self._values[name] = wire
+        if name in self._watchers:
+            self._notify((name,))
+
+    def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
+        """Let something be done now, and whenever one of some items changes; others may stay the same."""
+        for name in names:
+            self._watchers.setdefault(name, []).append(act)
+        act()
+
+    def _notify(self, names: Iterable[str]) -> None:
+        for act in dict.fromkeys(act for name in names for act in self._watchers.get(name, ())):
+            act()
+
+    def get(self, name: str, otherwise: int = 0) -> int:
+        """Return the integer of an item, or another one when the model has no such item."""
+        return self._values.get(name, otherwise)
+
+    def show(self, name: str, wire: int) -> None:
+        """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
+        if name in self._places:
+            *_, lowest, highest = self._places[name]
+            self[name] = lowest if wire < lowest else min(wire, highest)
+
+    def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
+        """Let items of the model show what functions return: worked out when they are read, not before."""
+        self._live = {name: show for name, show in live.items() if name in self}
+        self._cells_at.clear()
+
+    def show_no_more(self, name: str) -> None:
+        """Let an item keep what it has."""
+        self._live.pop(name, None)
+        self._cells_at.clear()
+
+    def refresh(self) -> None:
+        """Set all live items to what they show now."""
+        for name, show in self._live.items():
+            self.show(name, show())
+
+    def ticks(self, name: str) -> int:
+        """Return the signed number of ticks of an item."""
+        item = self.table.items[name]
+        return item.decode(self.data(name)) if item.encoding == "sign_magnitude" else signed(item, self[name])
+
+    def data(self, name: str) -> bytes:
+        """Return the bytes of an item."""
+        item = self.table.items[name]
+        return bytes(self._memory[item.address : item.address + item.size])
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table as they are now, None where it has none.
+
+        Cells between items are 0, and so is what Indirect Addresses beyond the table lead to [i].
+        """
+        if length < 1 or address + length > self.size:
+            return None
+        cells = self.cells(address, length)
+        if not (cells.touched or self.has_gaps):
+            return None
+        if cells.direct:
+            return self._now(cells, address, length)
+        places = self.places(address, length)
+        return b"".join(
+            self._now(self.cells(at, last - first), at, last - first) for at, first, last in places
+        )
+
+    def _now(self, cells: Cells, address: int, length: int) -> bytes:
+        for name, show in cells.live:
+            wire = show()
+            if wire != self._values[name]:
+                self.show(name, wire)
+        return bytes(self._memory[address : address + length]).ljust(length, b"\0")
+
+    def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
+        """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
+        cells = self.cells(address, len(data))
+        if cells.direct:
+            return (self._run(address, data, cells),)
+        return tuple(
+            self._run(target, data[first:last], self.cells(target, last - first))
+            for target, first, last in self.places(address, len(data))
+        )
+
+    def places(self, address: int, length: int) -> list[tuple[int, int, int]]:
+        """Return where some cells really are: address, and the first and last of them that begin there."""
+        places: list[tuple[int, int, int]] = []
+        for index in range(length):
+            name = self._indirect.get(address + index)
+            target = address + index if name is None else self[name]
+            if places and places[-1][0] + index - places[-1][1] == target:
+                places[-1] = places[-1][0], places[-1][1], index + 1
+            else:
+                places.append((target, index, index + 1))
+        return places
+
+    def cells(self, address: int, length: int) -> Cells:
+        """Return what some cells are; looked up once."""
+        cells = self._cells_at.get((address, length))
+        if cells is None:
+            spanned = range(address, address + length)
+            owned = [item.name for cell in spanned if (item := self._item_at.get(cell)) is not None]
+            names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
+            items = tuple(self.table.items[name] for name in names)
+            whole = bool(items) and sum(item.size for item in items) == length
+            direct = self._indirect.keys().isdisjoint(spanned)
+            cells = Cells(
+                items,
+                frozenset(names),
+                whole=whole,
+                touched=bool(owned),
+                direct=direct,
+                read_only=any(item.access == "R" for item in items),
+                eeprom=any(item.area == "EEPROM" for item in items),
+                live=tuple((name, self._live[name]) for name in dict.fromkeys(owned) if name in self._live),
+            )
+            if len(self._cells_at) >= _CELLS_KEPT:
+                self._cells_at.clear()
+            self._cells_at[address, length] = cells
+        return cells
+
+    def reaches_eeprom(self, address: int, data: bytes) -> bool:
+        """Return whether a write would change the EEPROM area, also through Indirect Data."""
+        return any(run.cells.eeprom for run in self.runs(address, data))
+
+    def _run(self, address: int, data: bytes, cells: Cells) -> Run:
+        items = cells.items
+        start, all_of_them = address, data
+        if items and not cells.whole:  # parts of items stay as they are
+            start, end = items[0].address, items[-1].address + items[-1].size
+            before, behind = self._memory[start:address], self._memory[address + len(data) : end]
+            all_of_them = bytes(before) + data + bytes(behind)
+        after = {
+            item.name: int.from_bytes(
+                all_of_them[item.address - start : item.address - start + item.size], "little"
+            )
+            for item in items
+        }
+        return Run(address, data, cells, after)
+
+    def write(self, run: Run) -> None:
+        """Write bytes that were not refused."""
+        start, end = run.address, run.address + len(run.data)
+        if self._memory[start:end] != run.data:
+            self._memory[start:end] = run.data
+            self._values.update(run.after)
+        if not self._watchers.keys().isdisjoint(run.after):
+            self._notify(run.after)
+
+
+def signed(item: ControlItem, wire: int) -> int:
+    """Return the integer of an item with its sign, where that is two's complement."""
+    return wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
+
+
+def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
+    """Return where an item begins and ends, the mask of its bits, and the range that its bytes hold."""
+    bits = 8 * item.size - item.signed
+    lowest = -1 << bits if item.signed else 0
+    return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1
+
+
+def _indirect_cells(table: ControlTable) -> dict[int, str]:
+    cells = {}
+    for name in table.items:
+        match = _INDIRECT.fullmatch(name)
+        if match and (data := table.items.get(f"indirect_data_{match[1]}")) is not None:
+            cells[data.address] = name
+    return cells

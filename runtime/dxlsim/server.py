@@ -1,0 +1,355 @@
+"""Serving simulated buses in real time: one thread that waits for all lines together."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from dxlrun.channels.heartbeat import ENDLESS_NS, LineProgress, SimulationProgress
+from dxlrun.channels.process import MessageChannel
+from dxlrun.channels.slot import SlotWriter
+from dxlrun.errors import InputError
+from dxlsim.bus.ledger import FAULT, Ledger
+from dxlsim.bus.recorded_bus import RecordedBus
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.device.on_links import fix_to_links
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.script import FaultScript
+from dxlsim.messages import Request, ServoLook, SimulationMessage
+from dxlsim.motion.body import ShaftsShown
+from dxlsim.motion.mechanics import Mechanics, plant_of
+from dxlsim.pseudo_terminal import DeviceLink, PseudoTerminal
+from dxlsim.realtime import PollBudget
+from dxlsim.registers.memory import Memory
+from dxlsim.simulation_plan import SimulationConfig
+
+MOST_BACKLOG_NS = 20_000_000
+"""A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
+
+So it feels the rate of its line, as with an adapter."""
+
+GATHER_NS = 250_000
+"""Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
+hand-over costs the processor, and the host's, more than a reply."""
+
+_WRITTEN = select.EPOLLIN | select.EPOLLET
+"""Reports once what a host has written; without a host a terminal is at its end all the time."""
+
+LONGEST_SLEEP_NS = 10_000_000
+"""Where the host watches the progress: no sleep is longer, so that a longer pause is known for a stall."""
+STALL_NS = 20_000_000
+"""A longer pause between two looks at the clock counts as a stall, in which the process had no core."""
+
+IDLE_NS = 300_000  # So long the mechanics of a few steps may take
+
+_BITS_PER_BYTE = 10  # 8N1
+
+_GOAL_MODES = (3, 4, 5)
+"""Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
+
+
+class Server:
+    """Pumps pseudo-terminals and buses until the control socket ends or SIGTERM comes.
+
+    Raises InputError when a fault of the configuration could never happen, or its bodies cannot be moved,
+    OSError when a terminal or a link cannot be made.
+    """
+
+    def __init__(
+        self,
+        config: SimulationConfig,
+        ledger: Ledger,
+        starter: MessageChannel[Request],
+        shafts: SlotWriter | None = None,
+        progress: SimulationProgress | None = None,
+    ) -> None:
+        """`shafts` takes how the shafts move, for sensors in other processes.
+
+        `progress` takes up to which time each line was served, for a host that waits for this process.
+        """
+        self.start_ns = time.monotonic_ns()
+        self._ledger = ledger
+        self._starter = starter
+        self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies, config.couplings))
+        self._buses = tuple(
+            (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
+            for bus in config.buses
+        )
+        if config.sensed is not None:
+            fix_to_links((one for bus in self._buses for one in bus.devices), self._mechanics, config.sensed)
+        self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
+        self._faults.attach(self._buses, start_ns=self.start_ns)
+        links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
+        self._terminals = tuple(PseudoTerminal(bus, links.get(bus.name)) for bus in self._buses)
+        self._shafts = None if shafts is None else ShaftsShown(self._mechanics, shafts)
+        self._progress = progress
+        self._lines = {
+            terminal: _ServedLine(progress.line(index), terminal.bus)
+            for index, terminal in enumerate(self._terminals)
+            if progress is not None
+        }
+        self._looked_ns = self.start_ns
+        self._polling = PollBudget(self.start_ns)
+        self._stopped = False
+        self._waiting = select.epoll()
+        self._by_descriptor: dict[int, PseudoTerminal] = {}
+        self._held: dict[int, int] = {}
+        """Terminals that are not read before a time, by descriptor."""
+
+    def run(self, granted: str = "") -> None:
+        """Report the ports and what real time was granted, then serve."""
+        self._ledger.on_note = self._report_fault
+        with _wake_on_sigterm() as wake, self._waiting as waiting:
+            waiting.register(wake, select.EPOLLIN)
+            waiting.register(self._starter, select.EPOLLIN)
+            self._plug()
+            self._tell(SimulationMessage(self._ports(), granted))
+            while not self._stopped:
+                self._serve_once(wake.fileno())
+                if self._shafts is not None:
+                    self._shafts.show()
+        for terminal in self._terminals:
+            terminal.close()
+
+    def _look_at_clock(self) -> int:
+        """Return the time, ns; publish a stall before it, which no servo counts as silence of the host."""
+        now_ns = time.monotonic_ns()
+        if self._progress is not None:
+            since_ns, self._looked_ns = self._looked_ns, now_ns
+            if now_ns - since_ns > STALL_NS:
+                self._progress.note_stall(since_ns, now_ns)
+                for bus in self._buses:
+                    bus.excuse(now_ns - since_ns)
+        return now_ns
+
+    def _serve_once(self, wake: int) -> None:
+        now_ns = self._look_at_clock()
+        soonest_ns = self._find_next_delivery()
+        easy_ns = None
+        if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
+            easy_ns = self._work_in_idle_time(now_ns)
+            now_ns = self._look_at_clock()
+        if self._lines:
+            easy_ns = min(easy_ns or ENDLESS_NS, now_ns + LONGEST_SLEEP_NS)
+        ready = self._wait(soonest_ns, easy_ns, now_ns)
+        # What was due before the host wrote goes out first: the host could have read it.
+        now_ns = self._look_at_clock()
+        self._polling.woke(now_ns)
+        if soonest_ns is not None and soonest_ns <= now_ns:
+            for terminal in self._terminals:
+                due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
+                if due_ns is not None and due_ns <= now_ns:
+                    self._deliver(terminal, now_ns)
+        rounds = len(self._terminals)  # a host that drives all buses writes to them in one go
+        while ready:
+            for number, _ in ready:
+                if number in self._by_descriptor:
+                    self._by_descriptor[number].read()
+            now_ns = (
+                self._look_at_clock()
+            )  # no host gets a reply before it wrote, though other lines take long
+            for number, _ in ready:
+                self._read_ready(number, wake, now_ns)
+            rounds -= 1
+            ready = self._waiting.poll(0) if rounds else []  # what is reported is reported once
+        self._ledger.flush_if_due(now_ns)
+
+    def _find_next_delivery(self) -> int | None:
+        """Return when bytes are due to a host next; publish it for each line."""
+        soonest_ns = None
+        for terminal in self._terminals:
+            due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
+            if self._lines:
+                self._lines[terminal].serve(due_ns)
+            if due_ns is not None and (soonest_ns is None or due_ns < soonest_ns):
+                soonest_ns = due_ns
+        return soonest_ns
+
+    def _work_in_idle_time(self, now_ns: int) -> int | None:
+        """Do what is not urgent; return when there is more of it."""
+        self._mechanics.advance(now_ns)
+        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
+        if self._held:
+            for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
+                del self._held[number]
+                self._waiting.register(number, _WRITTEN)
+            times += self._held.values()
+        return min([t_ns for t_ns in times if t_ns is not None], default=None)
+
+    def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
+        poll, polling = self._waiting.poll, self._polling
+        sleep_s = polling.sleep_s(due_ns, now_ns, easy_ns)
+        if sleep_s is None or sleep_s > 0.0:
+            # select keeps to the microsecond, an epoll by itself counts milliseconds
+            select.select((self._waiting,), (), (), sleep_s)
+            if (ready := poll(0)) or due_ns is None:
+                return ready
+            now_ns = time.monotonic_ns()
+            polling.woke(now_ns)
+            if polling.sleep_s(due_ns, now_ns) != 0.0:
+                return ready
+        while not (ready := poll(0)) and due_ns is not None and time.monotonic_ns() < due_ns:
+            pass
+        return ready
+
+    def _deliver(self, terminal: PseudoTerminal, now_ns: int) -> None:
+        terminal.deliver(now_ns, self._lines[terminal].give if self._lines else None)
+        if terminal.follow_adapter():
+            self._plug()
+            self._tell(SimulationMessage(self._ports()))
+
+    def _read_ready(self, number: int, wake: int, now_ns: int) -> None:
+        terminal = self._by_descriptor.get(number)
+        if terminal is not None:
+            self._receive(number, terminal, now_ns)
+        elif number == wake:
+            self._stopped = True
+        elif number == self._starter.fileno():
+            self._answer_requests(now_ns)
+
+    def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
+        bus = terminal.bus
+        due_ns = bus.next_due_ns()
+        if due_ns is not None and due_ns <= now_ns:
+            self._deliver(terminal, now_ns)
+        if not terminal.plugged or terminal.fileno() != number:
+            return
+        count = terminal.receive(now_ns)
+        if count and self._lines:
+            self._lines[terminal].serve(bus.next_delivery_ns(GATHER_NS))
+            self._lines[terminal].take(count, now_ns)
+        if bus.host_free_ns - MOST_BACKLOG_NS > now_ns:
+            self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
+            self._waiting.unregister(number)
+        elif terminal.may_have_more:
+            self._waiting.modify(number, _WRITTEN)  # reports what is there once more
+
+    def _plug(self) -> None:
+        """Wait for the terminals that are there now."""
+        for number in self._by_descriptor:
+            with contextlib.suppress(OSError):  # of a terminal that was unplugged, or is not read for a while
+                self._waiting.unregister(number)
+        self._held.clear()
+        self._by_descriptor = {each.fileno(): each for each in self._terminals if each.plugged}
+        for number in self._by_descriptor:
+            self._waiting.register(number, _WRITTEN)
+
+    def _ports(self) -> dict[str, str]:
+        return {terminal.bus.name: terminal.path for terminal in self._terminals}
+
+    def _report_fault(self, note: str) -> None:
+        if note.startswith(FAULT):
+            self._tell(SimulationMessage(happened=note.removeprefix(FAULT)))
+
+    def _tell(self, message: SimulationMessage) -> None:
+        """Send a message; where the starter does not read it is dropped, never a reason to wait."""
+        if select.select((), (self._starter,), (), 0)[1]:  # there is room for 100 KB and more then
+            self._starter.send(message)
+
+    def _answer_requests(self, now_ns: int) -> None:
+        """Answer the requests of the process that started the simulation."""
+        for request in self._starter.receive():
+            if request.look:
+                looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
+                self._tell(SimulationMessage(servos=looks, lateness_us=lateness_us(self._buses)))
+            if request.fault is not None:
+                self._tell(self._inject(request.fault, now_ns))
+        self._stopped = self._stopped or self._starter.closed
+
+    def _inject(self, text: str, now_ns: int) -> SimulationMessage:
+        try:
+            fault = parse_fault(text)
+            self._faults.add(fault, now_ns)
+        except InputError as error:
+            return SimulationMessage(error=str(error))
+        return SimulationMessage(fault=str(fault))
+
+
+class _ServedLine:
+    """Publishes the progress on one line."""
+
+    __slots__ = ("_bus", "_progress", "_served_ns", "_taken_ns")
+
+    def __init__(self, progress: LineProgress, bus: SimulatedBus) -> None:
+        self._progress = progress
+        self._bus = bus
+        self._taken_ns = 0
+        self._served_ns = -1
+
+    def serve(self, due_ns: int | None) -> None:
+        """Publish when something is due to the host next; None: nothing is."""
+        until_ns = ENDLESS_NS if due_ns is None else due_ns
+        if until_ns != self._served_ns:
+            self._progress.serve(until_ns)
+            self._served_ns = until_ns
+
+    def take(self, count: int, now_ns: int) -> None:
+        """Publish that bytes of the host were taken, though a fault may keep them from the servos.
+
+        To be called after `serve`: a host that sees the bytes as taken relies on when the reply is due.
+        """
+        duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
+        self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
+        self._progress.take(self._taken_ns)
+
+    def give(self, now_ns: int) -> None:
+        """Publish that bytes are handed over to the host now."""
+        self._progress.give(now_ns - self._bus.lateness_ns[-1], now_ns)
+
+
+def _wake_on_sigterm() -> socket.socket:
+    wake, signalled = socket.socketpair()
+    signalled.setblocking(False)
+    signal.signal(signal.SIGTERM, lambda number, frame: None)
+    signal.set_wakeup_fd(signalled.detach())
+    return wake
+
+
+def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
+    """Return each servo of a bus as it is now."""
+    bus.advance(now_ns)
+    return [
+        ServoLook(
+            bus=bus.name,
+            id=servo.servo_id,
+            model=servo.registers.table.model,
+            torque=servo.torque_on,
+            goal=_goal(servo.registers),
+            present=servo.position,
+            temperature=servo.temperature,
+            voltage=servo.voltage,
+            error=servo.registers.get(servo.registers.table.errors.item, servo.counts.last_error),
+            heard=servo.counts.received,
+            answered=servo.counts.replied,
+        )
+        for servo in bus.servos
+    ]
+
+
+def _goal(registers: Memory) -> float | None:
+    if "goal_position" not in registers or registers.get("operating_mode", 3) not in _GOAL_MODES:
+        return None
+    if registers.get("cw_angle_limit", 1) == registers.get("ccw_angle_limit", 1) == 0:
+        return None  # wheel mode (e-Manual, AX-12A, CW/CCW Angle Limit)
+    return registers.ticks("goal_position") * registers.table.rad_per_tick
+
+
+def lateness_us(buses: Sequence[SimulatedBus]) -> dict[str, float]:
+    """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first.
+
+    Quantiles by nearest rank: the smallest value that at least this share does not exceed.
+    """
+    ordered = sorted(late_ns for bus in buses for late_ns in bus.lateness_ns)
+    if not ordered:
+        return {}
+    picked = {
+        "median": (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2,
+        "p99": ordered[-(-len(ordered) * 99 // 100) - 1],
+        "maximum": ordered[-1],
+    }
+    return {name: late_ns / 1000 for name, late_ns in picked.items()}

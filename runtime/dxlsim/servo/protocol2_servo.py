@@ -1,0 +1,357 @@
+"""A simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
+
+The Y series reports errors in Error Code instead, each of which takes the torque away. Not modelled of it:
+the time that switching its torque takes, its brake, and Controller State but for off, running and fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from dxlsim.motion.shaft import Shaft
+from dxlsim.registers.access import ACCESS, OperatingMode, torque_error, watchdog_expired
+from dxlsim.registers.memory import Memory, Run
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.protocol2 import ALERT, ErrorNumber
+from dxlwire.control_table import ControlItem
+
+WATCHDOG_UNIT_NS = 20_000_000
+TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuration (60)
+TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal switches the torque on
+
+
+_LIMITS = frozenset(("pwm_limit", "current_limit"))
+_SPEAKS = (2, 20, 21, 22)
+"""Values of Protocol Type (13) with which a servo obeys Protocol 2.0: without a remote control on the line it
+falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
+
+_HISTORY = 16
+_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Controller State (152) of the Y series
+_CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
+_CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
+_BACK_UP = bytes.fromhex("01 43 54 52 4c")
+_RESTORE = bytes.fromhex("02 43 54 52 4c")
+_CLEARS_SINCE = 42
+"""Firmware of MX (2.0) and X from which on Clear is known, and a reset of everything is not for all."""
+_KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_bus")}
+
+
+class Protocol2Servo(SimulatedServo):
+    """X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
+
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        self._errors = memory.table.errors
+        self._has_error_code = self._errors.has_codes
+        """True for the Y series, which keeps its turns without power, too."""
+        self._backup: dict[str, int] = {}
+        self._shut_down = False
+        self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
+        super().__init__(memory, torque_error, shaft, note)
+        memory.has_gaps = False
+        memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
+
+    def _identify(self) -> None:
+        super()._identify()
+        self._speaks = self.registers.get("protocol_type", 2) in _SPEAKS
+
+    # Instructions
+
+    def _takes_part(self, read: GroupRead) -> bool:
+        first = self.registers.table.fast_sync_read_firmware
+        known = not read.fast or (first is not None and self.registers["firmware_version"] >= first)
+        if not known:
+            self._stays_out(read)
+        return known
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        """Obey what is not reading or writing; an instruction error for what it does not know.
+
+        To its Secondary ID a servo does nothing of it that would change the EEPROM [i].
+        """
+        error: int | None = None
+        match packet.instruction, packet.parameters:
+            case Instruction.REBOOT, b"":
+                self.reboot()
+                error = 0
+            case Instruction.FACTORY_RESET, parameters if len(parameters) == 1:
+                error = self._reset(parameters[0], packet.servo_id)
+            case Instruction.CLEAR, parameters if parameters == _CLEAR_TURNS and self._clears:
+                error = self.clear_turns()
+            case Instruction.CLEAR, parameters if parameters == _CLEAR_ERROR and self._has_error_code:
+                error = self.clear_error()
+            case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _BACK_UP and self.keeps_backup:
+                error = self.back_up()
+            case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE and self.keeps_backup:
+                shadow = packet.servo_id == self.secondary_id
+                error = ErrorNumber.ACCESS if shadow else self.restore_backup()
+        return super()._manage(packet) if error is None else error
+
+    @property
+    def _clears(self) -> bool:
+        """True when it knows Clear: MX (2.0) and X since firmware 42; P and Y [i], not the XL-320."""
+        registers = self.registers
+        of_x = registers.table.items["torque_enable"].address == 64
+        old = of_x and registers["firmware_version"] < _CLEARS_SINCE
+        return "operating_mode" in registers and not old
+
+    def _reset(self, option: int, servo_id: int) -> int:
+        if servo_id == self.secondary_id:
+            return ErrorNumber.ACCESS
+        kept = _KEPT_BY_RESET.get(option)
+        # e-Manual, Factory Reset: a reset of everything "will NOT be activated" for all
+        if kept is None or (option == 0xFF and servo_id == BROADCAST and self._clears):
+            return ErrorNumber.INSTRUCTION
+        self.registers.restore_factory_values(keep=kept)
+        self.reboot()
+        return 0
+
+    # Bus Watchdog: its time begins again with each instruction to the servo; whether those to others count
+    # the manual does not mention [?]
+
+    def _plan_watchdog(self) -> None:
+        units = self._watchdog_units()
+        end_ns = self._received_ns + units * WATCHDOG_UNIT_NS
+        if units and (self._check_ns is None or end_ns < self._check_ns):
+            self._check_ns = end_ns
+            self.shaft.mechanics.call_at(end_ns, lambda: self._check_watchdog(end_ns))
+
+    def _watchdog_units(self) -> int:
+        """Return for how long the Bus Watchdog waits, in its unit; 0 while it does not."""
+        registers = self.registers
+        units = registers.get("bus_watchdog")
+        return units if units and registers.get("torque_enable") and not watchdog_expired(registers) else 0
+
+    def _check_watchdog(self, at_ns: int) -> None:
+        """Stop where the Bus Watchdog's time has run out; else check again when it does."""
+        if at_ns != self._check_ns:
+            return  # its time was made shorter since
+        self._check_ns = None
+        units = self._watchdog_units()
+        if not units or self.shaft.mechanics.grid_ns < self._received_ns + units * WATCHDOG_UNIT_NS:
+            self._plan_watchdog()
+            return
+        self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
+        for name in ACCESS.profile:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
+            if name in self.registers:
+                self._set(name, 0)
+        self._set("bus_watchdog", -1)
+
+    # Protection
+
+    def _refusal(self, run: Run) -> int:
+        """Return the error number of a write, 0 when it is allowed.
+
+        After a shutdown the torque stays off until a reboot: a result fail [i].
+        """
+        torque = self._shut_down and run.after.get("torque_enable")
+        return super()._refusal(run) or (ErrorNumber.RESULT_FAIL if torque else 0)
+
+    def _state(self) -> int:
+        """Return the alert bit while Hardware Error Status or Error Code shows something."""
+        return ALERT if self.registers.get(self._errors.item) else 0
+
+    def protect(self, refused: int = 0) -> None:
+        """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
+        registers = self.registers
+        wrong = self._wrong()
+        if self._has_error_code:
+            self._show_error_code(wrong)
+        latched = registers.get("hardware_error_status") if self._shut_down else 0
+        shown = 0 if self._has_error_code else sum(wrong)
+        registers.show("hardware_error_status", shown | latched)
+        listed = bool(wrong) if self._has_error_code else shown & registers.get("shutdown")
+        if listed and not self._shut_down:
+            self._shut_down = True
+            named = f"error code {registers['error_code']:#04x}" if self._has_error_code else f"{shown:#04x}"
+            self.note(f"servo {self.servo_id}: shutdown, torque off: hardware error status {named}")
+            registers["torque_enable"] = 0
+            self.shaft.plan(("torque_enable",))
+        self._show_controller_state()
+
+    def reboot(self) -> None:
+        """Start again; the servo is deaf until it has."""
+        self.note(f"servo {self.servo_id}: reboot")
+        self.power_up()
+        self._receive_nothing_until(self.shaft.now_ns + self.boot_ns)
+
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""
+        angle = self.shaft.angle
+        super().power_up()
+        if self._has_error_code:
+            self._recount(angle)
+
+    def clear_turns(self) -> int:
+        """Bring Present Position back into one turn; return the error: it must not move.
+
+        The Y series needs the torque off as well, and reboots. The goal is then the position [i].
+        """
+        if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
+            return ErrorNumber.RESULT_FAIL
+        self._recount(self.shaft.within_a_turn(self.shaft.angle))
+        if self._has_error_code:
+            self.reboot()
+        return 0
+
+    def clear_error(self) -> int:
+        """Forget Error Code; return the error: its causes must be over (e-Manual, Y series)."""
+        if self._wrong():
+            return ErrorNumber.RESULT_FAIL
+        self.registers["error_code"] = 0
+        self.registers.reset(f"error_code_history_{number}" for number in range(1, _HISTORY + 1))
+        self._shut_down = False
+        self._show_controller_state()
+        return 0
+
+    @property
+    def keeps_backup(self) -> bool:
+        """True when it knows Control Table Backup: it then has Backup Ready.
+
+        e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready.
+        """
+        return "backup_ready" in self.registers
+
+    def back_up(self) -> int:
+        """Keep EEPROM, gains, profile and indirect addresses; return the error: the torque must be off.
+
+        P keeps no indirect addresses; so does Y [i].
+        """
+        registers = self.registers
+        if registers.get("torque_enable"):
+            return ErrorNumber.RESULT_FAIL
+        self._backup = {
+            name: registers[name] for name, item in registers.table.items.items() if _is_kept(name, item)
+        }
+        registers.show("backup_ready", 1)
+        return 0
+
+    def restore_backup(self) -> int:
+        """Take back the EEPROM that was kept, and reboot; return the error: torque off, and a backup."""
+        registers = self.registers
+        if registers.get("torque_enable") or not self._backup:
+            return ErrorNumber.RESULT_FAIL
+        for name, wire in self._backup.items():
+            if registers.table.items[name].area == "EEPROM":
+                registers[name] = wire
+        self.reboot()
+        return 0
+
+    def _recount(self, angle: float) -> None:
+        self.shaft.recount(angle)
+        self.registers["goal_position"] = self.shaft.position_tick(angle)
+        self.shaft.plan(("goal_position",))
+
+    def _wrong(self) -> tuple[int, ...]:
+        """Return the bits or codes of the errors whose cause is there now."""
+        registers, errors = self.registers, self._errors
+        wrong = [errors.value_of("overload")] if self.overload else []
+        if "max_voltage_limit" in registers:
+            volts = round(self.voltage * 10)
+            if volts < registers["min_voltage_limit"]:
+                wrong.append(errors.value_of("low_voltage", "input_voltage"))
+            elif volts > registers["max_voltage_limit"]:
+                wrong.append(errors.value_of("over_voltage", "input_voltage"))
+        limit = "motor_temperature_limit" if self._has_error_code else "temperature_limit"
+        if round(self.temperature) > registers.get(limit, 255):
+            wrong.append(errors.value_of("motor_overheating", "overheating"))
+        return tuple(wrong)
+
+    def _show_error_code(self, codes: tuple[int, ...]) -> None:
+        """Show the newest error; the same one does not count twice, and the history holds the last 16."""
+        registers = self.registers
+        names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
+        history = [registers[name] for name in names if registers[name]]
+        for code in codes:
+            if code not in history:
+                history.append(code)
+                registers["error_code"] = code
+        for name, code in zip(names, history[-_HISTORY:], strict=False):
+            registers[name] = code
+
+    def _show_controller_state(self) -> None:
+        registers = self.registers
+        state = _RUNNING if registers.get("torque_enable") else _INVERTER_OFF
+        registers.show("controller_state", _FAULT if self._shut_down else state)
+
+    def _start_up(self) -> None:
+        registers = self.registers
+        self._shut_down = False
+        self._started_ns = self._received_ns = self.shaft.now_ns
+        if "torque_limit" in registers and "max_torque" in registers:
+            registers["torque_limit"] = registers["max_torque"]
+        registers.show("backup_ready", bool(self._backup))
+        self._reset_goals()
+        configuration = registers.get("startup_configuration")
+        if configuration & RAM_FROM_BACKUP:
+            for name, wire in self._backup.items():
+                if registers.table.items[name].area == "RAM":
+                    registers[name] = wire
+        if configuration & TORQUE_ON_AT_START:
+            registers["torque_enable"] = 1
+        self.shaft.plan(("torque_enable",))
+
+    def _written(self, names: frozenset[str]) -> None:
+        registers = self.registers
+        if "operating_mode" in names:
+            self._change_mode()
+        elif not _LIMITS.isdisjoint(names):
+            self._reset_goals()
+        if "torque_enable" in names and registers["torque_enable"]:
+            self._find_turn()
+        if "protocol_type" in names and registers["protocol_type"] not in _SPEAKS:
+            self.note(f"servo {self.servo_id} left Protocol 2.0: protocol type {registers['protocol_type']}")
+        by_goal = registers.get("drive_mode") & TORQUE_ON_BY_GOAL
+        if (
+            by_goal
+            and not ACCESS.goals.isdisjoint(names)
+            and "torque_enable" not in names
+            and not self._shut_down
+        ):
+            registers["torque_enable"] = 1
+        if self._has_error_code:
+            self._show_controller_state()
+        super()._written(names)
+
+    def _change_mode(self) -> None:
+        """Begin with another operating mode as in the manual (e-Manual, X series, Operating Mode (11)).
+
+        Gains, profile and the goals that limit are reset; position control knows one turn only.
+        """
+        registers = self.registers
+        registers.reset((*ACCESS.gains, *ACCESS.profile))
+        self._find_turn()
+        registers["goal_position"] = self.shaft.position_tick(self.shaft.angle)
+        registers.show("goal_velocity", 0)
+        self._reset_goals()
+
+    def _find_turn(self) -> None:
+        """Bring Present Position into the turn that position control knows.
+
+        e-Manual, X series, Torque Enable (64): it is reset when mode or torque change.
+        """
+        shaft = self.shaft
+        if self.registers.get("operating_mode") != OperatingMode.POSITION or self._has_error_code:
+            return
+        inside = shaft.within_a_turn(shaft.angle)
+        if abs(inside - shaft.angle) > math.pi:
+            shaft.recount(inside)
+
+    def _reset_goals(self) -> None:
+        """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""
+        registers = self.registers
+        mode = registers.get("operating_mode")
+        for goal, limit, obeyed in (
+            ("goal_pwm", "pwm_limit", OperatingMode.PWM),
+            ("goal_current", "current_limit", OperatingMode.CURRENT),
+        ):
+            if limit in registers:
+                registers.show(goal, 0 if mode == obeyed else registers[limit])
+
+
+def _is_kept(name: str, item: ControlItem) -> bool:
+    """Return whether a backup holds an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
+    if name.startswith("indirect_address_"):
+        return item.area == "RAM"
+    return item.access == "RW" and (item.area == "EEPROM" or name in (*ACCESS.gains, *ACCESS.profile))

@@ -1,0 +1,304 @@
+"""A simulated servo: it receives instructions, replies, moves its shaft, and can be broken.
+
+What both protocols share is here, and the servo of Protocol 1.0; `protocol2_servo` has the instructions of
+the others, and how they protect themselves. Where the e-Manual has no answer, `[i]` marks what was inferred;
+nothing was compared with a real servo yet.
+
+Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is set to another one falls silent),
+what the two shafts of a 2XL or 2XC share, servos that Drive Mode couples, and what firmware decides beyond
+the control table, the fast reads, Clear and Control Table Backup.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+
+from dxlsim.motion.mechanics import SUPPLY_OHM
+from dxlsim.motion.shaft import Shaft
+from dxlsim.registers.access import ACCESS, ErrorOf, lock_error
+from dxlsim.registers.memory import Memory
+from dxlsim.servo.node import SimulatedNode
+from dxlsim.wire.packets import GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.protocol1 import ErrorBit
+
+BOOT_NS = 100_000_000  # How long a servo receives nothing after a reboot; no manual names it [i]
+
+_SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
+
+
+class SimulatedServo(SimulatedNode):
+    """One servo: registers that command a shaft, and show how it moves."""
+
+    kind = "servo"
+
+    def __init__(self, memory: Memory, error_of: ErrorOf, shaft: Shaft, note: Callable[[str], None]) -> None:
+        self.shaft = shaft
+        self.overload = False  # True while the shaft is loaded beyond the torque
+        self.wakes_on_goal = True
+        """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
+        self.boot_ns = BOOT_NS
+        """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
+        self.write_time_ns = 0  # How long it receives nothing after an instruction that writes
+        self._speaks = True  # False when it is set to another protocol
+        self._started_ns = self._received_ns = shaft.now_ns
+        self._registered: tuple[int, bytes] | None = None
+        super().__init__(memory, error_of, note, shaft.now_ns)
+        self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
+        self._voltage = 0.0
+        self.voltage = _supply(memory)
+        shaft.mechanics.watch(shaft.index, self._strained)
+        memory.watch(ACCESS.identity, self._identify)
+
+    def _identify(self) -> None:
+        registers = self.registers
+        self.servo_id = registers["id"]
+        secondary = None if self._secondary_item is None else registers[self._secondary_item]
+        off = secondary is None or secondary > 252 or secondary == self.servo_id
+        self.secondary_id = None if off else secondary
+
+    # What the bus asks
+
+    def advance(self, now_ns: int) -> None:
+        """Bring the shaft and the present registers to a time; going back is ignored."""
+        self.shaft.advance(now_ns)
+        self.registers.refresh()
+
+    def receives(self, now_ns: int) -> bool:
+        """Take an instruction on the line at a time; return whether it reaches the servo."""
+        if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
+            return False
+        self.shaft.advance(now_ns)
+        if self._contacts and not all(contact() for contact in self._contacts):
+            return False
+        self._received_ns = self.shaft.now_ns
+        return True
+
+    def excuse(self, duration_ns: int) -> None:
+        """Leave out of the Bus Watchdog's time for how long this process did not run, ns."""
+        self._received_ns += duration_ns
+
+    # What the protocols do differently
+
+    @abstractmethod
+    def protect(self, refused: int = 0) -> None:
+        """Take the torque away when something is wrong for which Shutdown asks."""
+
+    @abstractmethod
+    def _start_up(self) -> None: ...
+
+    # Instructions that both protocols have
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        match packet.instruction:
+            case Instruction.REG_WRITE if (write := self._codec.write(packet.parameters)) is not None:
+                return self._beyond_shadow(packet.servo_id, *write) or self._register(*write)
+            case Instruction.ACTION if self._registered is not None:
+                return self._act()
+        return super()._manage(packet)
+
+    def _write(self, address: int, data: bytes) -> int:
+        error = super()._write(address, data)
+        if self.write_time_ns and not error:
+            self._receive_nothing_until(max(self._deaf_until_ns, self._received_ns + self.write_time_ns))
+        return error
+
+    def _written(self, names: frozenset[str]) -> None:
+        self.shaft.plan(names)
+
+    def _register(self, address: int, data: bytes) -> int:
+        error = self._refused(self.registers.runs(address, data))
+        if not error:
+            self._keep_registered((address, data))
+        return error
+
+    def _act(self) -> int:
+        if self._registered is None:
+            return 0
+        address, data = self._registered
+        self._keep_registered(None)
+        return self._write(address, data)
+
+    def _keep_registered(self, write: tuple[int, bytes] | None) -> None:
+        self._registered = write
+        for name in ("registered", "registered_instruction"):
+            self.registers.show(name, write is not None)
+
+    def _set(self, name: str, wire: int) -> None:
+        self.registers[name] = wire
+        self.shaft.plan((name,))
+
+    # What time and load do
+
+    def _live_items(self) -> Mapping[str, Callable[[], int]]:
+        return {
+            **self.shaft.live(),
+            "present_temperature": lambda: round(self.temperature),
+            "present_inverter_temperature": lambda: round(self.temperature),
+            "present_motor_temperature": lambda: round(self.temperature),
+            "present_voltage": lambda: self._shown_voltage("present_voltage"),
+            "present_input_voltage": lambda: self._shown_voltage("present_input_voltage"),
+            "realtime_tick": lambda: (self.shaft.now_ns - self._started_ns) // 1_000_000 % 32768,
+        }
+
+    def _shown_voltage(self, name: str) -> int:
+        drawn = abs(self.shaft.duty * self.shaft.current)
+        return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
+
+    def _strained(self) -> None:
+        """It became warmer or colder by a degree, or was overloaded for too long."""
+        if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
+            self.overload = True
+            self.note(f"servo {self.servo_id}: overload, it does not hold its load")
+        self.protect()
+
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, the shaft stays where it is."""
+        self._registered = None
+        self.overload = False
+        self.registers.restore_ram()
+        self.shaft.power_up()
+        self._start_up()
+        self.protect()
+        self.registers.refresh()
+
+    # What tests see and faults do
+
+    @property
+    def position(self) -> float:
+        """Angle of the shaft, rad from raw 0, at the time of `advance` or of the last instruction."""
+        return self.shaft.angle
+
+    @property
+    def velocity(self) -> float:
+        """Speed of the shaft, rad/s, counter-clockwise positive."""
+        return self.shaft.velocity
+
+    @property
+    def torque_on(self) -> bool:
+        """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
+        return self.shaft.torque_on
+
+    @property
+    def voltage(self) -> float:
+        """Voltage of the supply, V; the servo sees less while it draws current."""
+        return self._voltage
+
+    @voltage.setter
+    def voltage(self, volts: float) -> None:
+        self._voltage = volts
+        self.shaft.mechanics.supply(self.shaft.index, volts)
+
+    @property
+    def temperature(self) -> float:
+        """degrees C."""
+        return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
+
+    @temperature.setter
+    def temperature(self, celsius: float) -> None:
+        self.shaft.mechanics.heat(self.shaft.index, celsius)
+
+    def jam(self, on: bool) -> None:
+        """Block the shaft, or free it."""
+        self.shaft.mechanics.jam(self.shaft.index, on)
+        self.note(f"servo {self.servo_id}: shaft {'blocked' if on else 'free'}")
+
+    def reset(self) -> None:
+        """Cut and give back its power: RAM is lost, the shaft stays where it is."""
+        self.note(f"servo {self.servo_id}: power cycle")
+        self.power_up()
+
+    def trigger_overload(self) -> None:
+        """Load the shaft beyond the torque.
+
+        It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
+        """
+        self.overload = True
+        self.note(f"servo {self.servo_id}: overload")
+        self.protect()
+
+    def set_voltage(self, volts: float) -> None:
+        """Supply it with another voltage, V."""
+        self.voltage = volts
+        self.note(f"servo {self.servo_id}: voltage {volts} V")
+        self.protect()
+
+    def set_temperature(self, celsius: float) -> None:
+        """Heat it, degrees C."""
+        self.temperature = celsius
+        self.note(f"servo {self.servo_id}: temperature {celsius} degC")
+        self.protect()
+
+    def turn(self, by: float, duration_ns: int) -> None:
+        """Let a hand turn the shaft by an angle, rad, in a time; it gives way to a servo that has torque."""
+
+        def gives_way(turned: float) -> None:
+            came = f"gives way after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
+            self.note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
+
+        self.shaft.mechanics.turn(self.shaft.index, by, duration_ns, gives_way)
+
+
+class Protocol1Servo(SimulatedServo):
+    """AX, DX, EX, RX, and MX with their first firmware: error bits, Torque Limit 0, and the EEPROM's lock."""
+
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        super().__init__(memory, lock_error, shaft, note)
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        """Return an instruction error also of a bulk read that an AX does not know [i]."""
+        if packet.instruction != Instruction.FACTORY_RESET:
+            return super()._manage(packet)
+        self.registers.restore_factory_values()
+        self.power_up()
+        return 0
+
+    def _takes_part(self, read: GroupRead) -> bool:
+        """Return whether it knows a bulk read: only the MX do, and only for two servos or more."""
+        known = "bulk_read" in self.registers.table.capabilities and len(read.entries) >= 2
+        if not known:
+            self.note(f"servo {self.servo_id} refuses a bulk read of {len(read.entries)}")
+        return known
+
+    # Protection
+
+    def _state(self) -> int:
+        """Return the error bits that last as long as their cause."""
+        registers, errors = self.registers, self.registers.table.errors
+        error = errors.value_of("overload") if self.overload else 0
+        if not registers["min_voltage_limit"] <= round(self.voltage * 10) <= registers["max_voltage_limit"]:
+            error |= errors.value_of("input_voltage")
+        if round(self.temperature) > registers["temperature_limit"]:
+            error |= errors.value_of("overheating")
+        return error
+
+    def protect(self, refused: int = 0) -> None:
+        """Set Torque Limit to 0 when Shutdown (18) lists an error; Torque Enable (24) stays as it is."""
+        error = self._state() | refused
+        if error & self.registers["shutdown"] and self.registers["torque_limit"]:
+            self.note(f"servo {self.servo_id}: shutdown, torque limit 0: {ErrorBit(error)!r}")
+            self._set("torque_limit", 0)
+
+    def _start_up(self) -> None:
+        self._started_ns = self.shaft.now_ns
+        self.registers["torque_limit"] = self.registers["max_torque"]  # e-Manual, Torque Limit (34)
+
+    def _written(self, names: frozenset[str]) -> None:
+        registers = self.registers
+        if "goal_position" in names and self.wakes_on_goal and "torque_enable" not in names:
+            registers["torque_enable"] = 1
+        if "torque_limit" in names and registers["torque_limit"] > 0:
+            self.overload = False
+        super()._written(names)
+
+
+def _supply(memory: Memory) -> float:
+    """Return the voltage at which a servo is tried, V.
+
+    The one that the manual's figures are for; else 12 V, or the middle of its limits.
+    """
+    if memory.table.nominal_voltage:
+        return memory.table.nominal_voltage
+    lowest, highest = memory.get("min_voltage_limit", 0), memory.get("max_voltage_limit", 999)
+    return 12.0 if lowest <= 120 <= highest else (lowest + highest) / 20

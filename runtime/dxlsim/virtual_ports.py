@@ -1,0 +1,107 @@
+"""Ports of simulated buses on virtual time: no process, no terminal, no waiting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun.errors import PortError
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlwire.clock import VirtualClock
+
+
+class VirtualPort:
+    """The host's end of one simulated bus; a Port of the dynamixel package by its form."""
+
+    def __init__(self, clock: VirtualClock, bus: SimulatedBus) -> None:
+        self._clock = clock
+        self._bus = bus
+        self._arrived = bytearray()
+        self._unplugged = bus.times_unplugged
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Hand bytes to the line now; raises PortError when the adapter was unplugged."""
+        self._check()
+        self._bus.receive(data, self._clock.now_ns())
+
+    def read_into(self, buffer: memoryview) -> int:
+        """Copy what has arrived by now; return the number of bytes; raises PortError when unplugged."""
+        self._check()
+        self.collect()
+        size = min(len(buffer), len(self._arrived))
+        buffer[:size] = self._arrived[:size]
+        del self._arrived[:size]
+        return size
+
+    def failure(self, code: int) -> PortError:
+        """Return why a write failed: the adapter was unplugged, there is no other reason."""
+        return PortError(f"the adapter of bus {self._bus.name} is gone")
+
+    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
+        """Return `deadline_ns`: virtual time waits for the servos."""
+        return deadline_ns
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return 0, for the same reason."""
+        return 0
+
+    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
+        """Return 0, for the same reason."""
+        return 0
+
+    def collect(self) -> bool:
+        """Take what has passed the wire by now; return whether something waits, or the adapter is gone."""
+        self._arrived += self._bus.take(self._clock.now_ns())
+        return bool(self._arrived) or self._gone
+
+    def unplug(self) -> None:
+        """Pull the adapter: every later use raises PortError."""
+        self._bus.unplug()
+
+    @property
+    def _gone(self) -> bool:
+        """True after the adapter was pulled, also when it is back: a port does not outlive that."""
+        return self._bus.times_unplugged != self._unplugged
+
+    def _check(self) -> None:
+        if self._gone:
+            raise self.failure(-1)
+
+
+class VirtualPorts:
+    """All simulated lines of a robot, waited for together; a Ports of the dynamixel package by its form."""
+
+    def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
+        self.polling = self.descriptors = None
+        """As on a SerialPorts: on virtual time no wake-up is late, and there are no files."""
+        self._clock = clock
+        self._buses = tuple(buses)
+        self._ports = [VirtualPort(clock, bus) for bus in buses]
+        self._lost: set[int] = set()
+
+    @property
+    def ports(self) -> Sequence[VirtualPort]:
+        """The lines, in the order of the buses."""
+        return self._ports
+
+    def wait(self, deadline_ns: int) -> Sequence[int]:
+        """Let virtual time pass until bytes arrive or `deadline_ns`; return the lines with bytes."""
+        while True:
+            # time passes for the servos of a lost line, too
+            received = [index for index, port in enumerate(self._ports) if port.collect()]
+            ready = [index for index in received if index not in self._lost]
+            now_ns = self._clock.now_ns()
+            if ready or now_ns >= deadline_ns:
+                return ready
+            due = [due_ns for bus in self._buses if (due_ns := bus.next_due_ns()) is not None]
+            self._clock.wait_until(min([deadline_ns, *due]))
+
+    def reopen(self, index: int) -> bool:
+        """Request a lost line again: it is back as soon as its adapter is plugged in."""
+        self._lost.add(index)
+        bus = self._buses[index]
+        bus.advance(self._clock.now_ns())
+        if not bus.plugged:
+            return False
+        self._lost.remove(index)
+        self._ports[index] = VirtualPort(self._clock, bus)
+        return True

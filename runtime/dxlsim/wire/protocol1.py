@@ -1,0 +1,88 @@
+"""Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes."""
+
+from __future__ import annotations
+
+from enum import IntFlag, unique
+
+from dxlsim.wire.packets import (
+    BROADCAST,
+    Codec,
+    GroupRead,
+    Instruction,
+    InstructionPacket,
+    ListedWrites,
+    ReadEntry,
+    sync_writes,
+)
+
+HEADER = b"\xff\xff"
+LONGEST = 4 + 255  # Bytes of the longest packet: header, ID, a length byte of 255 and what it counts
+
+
+@unique
+class ErrorBit(IntFlag):
+    """Error byte of a status packet (e-Manual, Protocol 1.0, "Error")."""
+
+    VOLTAGE = 0x01
+    ANGLE_LIMIT = 0x02
+    OVERHEATING = 0x04
+    RANGE = 0x08
+    CHECKSUM = 0x10
+    OVERLOAD = 0x20
+    INSTRUCTION = 0x40
+
+
+def checksum(body: bytes | bytearray) -> int:
+    """Return the checksum of everything between header and checksum."""
+    return ~sum(body) & 0xFF
+
+
+def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
+    """Return the bytes of a status packet."""
+    body = bytes((servo_id, len(parameters) + 2, error)) + parameters
+    return HEADER + body + bytes((checksum(body),))
+
+
+def group_read(packet: InstructionPacket) -> GroupRead | None:
+    """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
+    if not packet.intact or packet.servo_id != BROADCAST or packet.instruction != Instruction.BULK_READ:
+        return None
+    listed = packet.parameters[1:]
+    if packet.parameters[:1] != b"\x00" or not listed or len(listed) % 3:
+        return None
+    entries: dict[int, ReadEntry] = {}
+    for length, servo_id, address in zip(listed[::3], listed[1::3], listed[2::3], strict=True):
+        entries.setdefault(servo_id, ReadEntry(servo_id, address, length))  # of an ID listed twice the first
+    return GroupRead(packet.instruction, tuple(entries.values()))
+
+
+def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
+    parameters = packet.parameters
+    if packet.instruction != Instruction.SYNC_WRITE or len(parameters) < 2:
+        return None
+    return sync_writes(parameters[2:], *parameters[:2])
+
+
+def _packet(data: bytes, end: int) -> InstructionPacket:
+    intact = data[-1] == checksum(data[2:-1])
+    return InstructionPacket(data[2], data[4], data[5:-1], intact, end, data)
+
+
+CODEC = Codec(
+    header=HEADER,
+    no_id=frozenset((0xFF,)),
+    length_bytes=1,
+    shortest=2,
+    longest_pause_ns=100_000_000,  # e-Manual, Protocol 1.0
+    packet=_packet,
+    status_packet=status_packet,
+    read=lambda parameters: (parameters[0], parameters[1]) if len(parameters) == 2 else None,
+    write=lambda parameters: (parameters[0], parameters[1:]) if len(parameters) >= 2 else None,
+    listed_writes=_listed_writes,
+    group_read=group_read,
+    ping_slot_ns=lambda baud_rate: 0,
+    error=ErrorBit,
+    damaged=ErrorBit.CHECKSUM,
+    unknown=ErrorBit.INSTRUCTION,
+    no_cells=ErrorBit.RANGE,
+)

@@ -1,0 +1,29 @@
+"""Control tables: the places of a servo's control items in its memory, and their units.
+
+`control_table("AX-12A")` is the table of a model, `control_table("MX-28", 2.0)` that of one of its firmwares.
+Each model has a data file in `tables/`.
+"""
+
+from dxlwire.control_table.hardware_errors import Fault as Fault
+from dxlwire.control_table.hardware_errors import HardwareErrors as HardwareErrors
+from dxlwire.control_table.models import add_control_table as add_control_table
+from dxlwire.control_table.models import added_control_tables as added_control_tables
+from dxlwire.control_table.models import all_tables as all_tables
+from dxlwire.control_table.models import control_table as control_table
+from dxlwire.control_table.models import model_names as model_names
+from dxlwire.control_table.models import models_by_number as models_by_number
+from dxlwire.control_table.models import perhaps_meant as perhaps_meant
+from dxlwire.control_table.models import protocols_of as protocols_of
+from dxlwire.control_table.sources import read_control_table as read_control_table
+from dxlwire.control_table.table import CAPABILITIES as CAPABILITIES
+from dxlwire.control_table.table import SIGN_BIT as SIGN_BIT
+from dxlwire.control_table.table import Access as Access
+from dxlwire.control_table.table import Area as Area
+from dxlwire.control_table.table import ControlItem as ControlItem
+from dxlwire.control_table.table import ControlTable as ControlTable
+from dxlwire.control_table.table import EffortUnit as EffortUnit
+from dxlwire.control_table.table import Encoding as Encoding
+from dxlwire.control_table.table import FoundDeviation as FoundDeviation
+from dxlwire.control_table.table import decoded as decoded
+from dxlwire.control_table.table import find_deviations as find_deviations
+from dxlwire.control_table.table import side_by_side as side_by_side

@@ -1,0 +1,251 @@
+"""Control tables of devices: what is on a servo bus and is no servo, such as an IMU or a power board.
+
+A data file of ours or of a plug-in describes one model, in the form of servo models (see AX-12A.toml) with
+`kind = "device"`, and for each item, where they apply: `encoding` may be float32, `offset` (with its unit) is
+added to what the ticks mean, `state` is the name of the state that the item makes (that of the item without
+it), `bit` is the bit of the place that the item is (a button; other items have the others), and `safe` is the
+integer that is written to the item at the end of a run. `cyclic` lists the items that are read each cycle
+where a robot file names none. Model number, firmware version and ID stand where servos have them, unless the
+file says otherwise. Without a `model_number` the device's own is not checked.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import tomllib
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from types import MappingProxyType
+
+from msgspec.structs import replace
+
+from dxlwire.control_table.sources import (
+    Entry,
+    measure,
+    protocol_in,
+    read_item,
+    section,
+    whole,
+    words,
+)
+from dxlwire.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
+from dxlwire.control_table.table import ControlItem, Encoding, Table
+
+WAITS = "waits_in_chain"
+"""Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
+CAPABILITIES: Mapping[str, str] = {
+    **{
+        name: SERVO_CAPABILITIES[name]
+        for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
+    },
+    "broadcast_ping": "a reply to a ping to all IDs",
+    WAITS: "in a sync or bulk read it waits for the status ahead of its own, and obeys nothing meanwhile",
+}
+"""What a device can do beside ping, read and write, in the words of a data file."""
+_SIZES = (1, 2, 4)
+_HIGHEST_ADDRESS = 0xFFFF - 4
+_MODEL_NUMBER = (0, 2)  # Address and size where a model number is read before the model is known
+_IDENTITY: Mapping[float, Mapping[str, Entry]] = {
+    protocol: {
+        "model_number": {"address": 0, "size": 2, "area": "EEPROM", "page": "Model Number (0)"},
+        "firmware_version": {"address": firmware, "size": 1, "area": "EEPROM", "page": "Firmware Version"},
+        "id": {
+            "address": servo_id,
+            "size": 1,
+            "access": "RW",
+            "area": "EEPROM",
+            "maximum": highest,
+            "page": "ID",
+        },
+    }
+    for protocol, firmware, servo_id, highest in ((1.0, 2, 3, 253), (2.0, 6, 7, 252))
+}
+STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
+"""Of a state: `angular_velocity.x`."""
+
+
+class DeviceItem(ControlItem, frozen=True):
+    """One control item of a device, or one bit of one; its value is ticks * scale + offset.
+
+    A float32 has no range: its `minimum` and `maximum` are those of the integer of its bytes.
+    """
+
+    offset: float = 0.0  # SI units at tick 0
+    state: str = ""  # Name of the state that it makes: `angular_velocity.x`
+    safe: int | None = None
+    """Number on the wire that is written at the end of a run; None: nothing is."""
+    bit: int | None = None
+    """Of the item's integer, which other items share; None: all of them. A bit cannot be written alone."""
+
+    def value(self, data: bytes | memoryview) -> float:
+        """Return the value, SI units, of the item's own bytes."""
+        if self.bit is not None:
+            return float(int.from_bytes(data, "little") >> self.bit & 1)
+        return decoded(data, self.encoding) * self.scale + self.offset
+
+
+_KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
+
+
+class DeviceTable(Table[DeviceItem], frozen=True, kw_only=True):
+    """The control items of one model of devices."""
+
+    model_number: int | None
+    """None: it answers any, or one that says nothing, so it is not checked, and no scan knows it."""
+    cyclic: tuple[str, ...]  # Items that are read each cycle where the robot file names none
+    fast_sync_read_firmware: int | None = None
+    """First firmware version with the fast forms; None where the model has none."""
+    text: str = ""  # The data file, for processes that do not read it; empty: one of dxlrun's own
+
+
+def decoded(data: bytes | memoryview, encoding: Encoding) -> float:
+    """Return the number on the wire; an integer where it is no float32."""
+    if encoding == "float32":
+        number: float = struct.unpack("<f", data)[0]
+        return number
+    if encoding == "sign_magnitude":  # bit 10 is the sign, as of servos (e-Manual AX-12A, Present Speed (38))
+        raw = int.from_bytes(data, "little")
+        return -(raw & 0x3FF) if raw & 0x400 else raw & 0x3FF
+    return int.from_bytes(data, "little", signed=encoding == "twos_complement")
+
+
+def is_device_table(text: str) -> bool:
+    """Check whether a data file says that it describes a device."""
+    return tomllib.loads(text).get("kind") == "device"
+
+
+def read_device_table(text: str) -> DeviceTable:
+    """Return the table that the TOML text of a data file describes.
+
+    Raises ValueError (also tomllib.TOMLDecodeError) when it is not one, KeyError when an entry is missing.
+    """
+    return build_device_table(tomllib.loads(text))
+
+
+def build_device_table(data: Entry) -> DeviceTable:
+    """Return the table of a device's entry; raises ValueError and KeyError as `read_device_table`."""
+    if data.get("kind") != "device":
+        raise ValueError('the table of a device has kind = "device"')
+    written = section(data["items"])
+    protocol, firmware = protocol_in(data["protocol"]), data.get("fast_sync_read_firmware")
+    entries = _with_identity(written, protocol)
+    items = sorted(
+        (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
+    )
+    _check_places(items)
+    by_name = {item.name: item for item in items}
+    cyclic = tuple(words(data.get("cyclic", [])))
+    for name in cyclic:
+        if name not in by_name:
+            raise ValueError(f"cyclic: {name} is none of the items")
+    capabilities = frozenset(words(data.get("capabilities", [])))
+    if wrong := capabilities - CAPABILITIES.keys():
+        raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
+    if "model_number" in data and _place(by_name["model_number"]) != _MODEL_NUMBER:
+        raise ValueError("model_number: one that is checked stands at address 0 and has 2 bytes")
+    return DeviceTable(
+        model=str(data["model"]),
+        aliases=tuple(words(data.get("aliases", []))),
+        model_number=whole(data, "model_number") if "model_number" in data else None,
+        protocol=protocol,
+        items=MappingProxyType(by_name),
+        cyclic=cyclic,
+        capabilities=capabilities,
+        baud_rates=MappingProxyType(
+            {
+                int(code): whole({"rate": rate}, "rate")
+                for code, rate in section(data.get("baud_rates", {})).items()
+            }
+        ),
+        fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
+    )
+
+
+def _with_identity(entries: Entry, protocol: float) -> Entry:
+    """Return the items with those that every device has, where its protocol's servos have them.
+
+    e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID.
+    """
+    places = _IDENTITY[protocol]
+    return {**{name: entry for name, entry in places.items() if name not in entries}, **entries}
+
+
+def _check_places(items: Sequence[DeviceItem]) -> None:
+    """Refuse items that overlap, but for different bits of one place; they are in the order of addresses."""
+    for before, item in pairwise(items):
+        if item.address >= before.address + before.size:
+            continue
+        if before.bit is None or item.bit is None or _place(before) != _place(item):
+            raise ValueError(
+                f"{item.name}: address {item.address} lies in {before.name}, and only bits share a place"
+            )
+        if any(each.bit == item.bit for each in items if each is not item and _place(each) == _place(item)):
+            raise ValueError(
+                f"{item.name}: bit {item.bit} of address {item.address} has another name already"
+            )
+
+
+def _place(item: DeviceItem) -> tuple[int, int]:
+    return item.address, item.size
+
+
+def _item(name: str, entry: Entry) -> DeviceItem:
+    if wrong := entry.keys() - _KEYS:
+        raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
+    unit, offset = measure(name, entry, "offset") if "offset" in entry else ("", 0.0)
+    defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
+    ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
+    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, DeviceItem)
+    if item.size not in _SIZES or (item.encoding == "float32" and item.size != 4):
+        raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {item.size}")
+    if item.encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
+        raise ValueError(f"{name}: minimum and maximum are of whole numbers, a float32 has none")
+    lowest, highest = _range(item.encoding, item.size)
+    item = replace(
+        item,
+        minimum=item.minimum if "minimum" in entry else lowest,
+        maximum=item.maximum if "maximum" in entry else highest,
+    )
+    if not lowest <= item.minimum <= item.maximum <= highest:
+        raise ValueError(f"{name}: {item.minimum}..{item.maximum} does not fit into its bytes")
+    if "offset" in entry and unit != item.unit:
+        raise ValueError(f"{name}: its offset is in {unit or 'no unit'}, its tick in {item.unit or 'none'}")
+    _check_item(item)
+    return item
+
+
+def _check_item(item: DeviceItem) -> None:
+    if not 0 <= item.address <= _HIGHEST_ADDRESS:
+        raise ValueError(f"{item.name}: address {item.address} is none; they are 0..{_HIGHEST_ADDRESS}")
+    for key, value in (("initial value", item.initial), ("safe value", item.safe)):
+        if value is not None and not item.minimum <= value <= item.maximum:
+            raise ValueError(f"{item.name}: the {key} {value} lies outside its range")
+    if item.safe is not None and (item.access == "R" or item.area == "EEPROM"):
+        raise ValueError(f"{item.name}: only an item in RAM that can be written has a safe value")
+    if item.encoding == "float32" and (item.initial or item.safe):
+        raise ValueError(f"{item.name}: the only initial and safe value of a float32 is 0")
+    if item.state == "age":
+        raise ValueError(f"{item.name}: a state is not called age, as every device has an age already")
+    if item.scale == 0:
+        raise ValueError(f"{item.name}: a tick of 0 would mean nothing")
+    if not STATE_NAME.fullmatch(item.state):
+        raise ValueError(
+            f"{item.name}: {item.state!r} is no name of a state; start with a letter, and use letters, "
+            "digits and _, such as angular_velocity.x"
+        )
+    if item.bit is None:
+        return
+    if not 0 <= item.bit < 8 * item.size:
+        raise ValueError(f"{item.name}: bit {item.bit} is none of its {8 * item.size} bits")
+    if item.access != "R" or item.unit or item.encoding != "unsigned":
+        raise ValueError(f"{item.name}: a bit is unsigned, has no unit, and cannot be written alone")
+
+
+def _range(encoding: str, size: int) -> tuple[int, int]:
+    if encoding == "float32":
+        return 0, (1 << 32) - 1
+    if encoding == "sign_magnitude":
+        return -0x3FF, 0x3FF
+    bits = 8 * size
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if encoding == "twos_complement" else (0, (1 << bits) - 1)

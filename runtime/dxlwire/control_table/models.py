@@ -1,0 +1,170 @@
+"""All models: those of the data files, and those that plug-ins add."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+
+from dxlrun.errors import suggestion
+from dxlwire.control_table.sources import Listing, listings, read_control_table
+from dxlwire.control_table.table import ControlTable
+
+_ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
+"""Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
+_MOST_MEANT = 4  # More suggestions than this are no help
+_SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
+_TEXTS: dict[str, str] = {}  # Name -> TOML text of the tables that were added
+
+
+def control_table(model: str, protocol: float | None = None) -> ControlTable:
+    """Return the control table of a model or of one of its aliases; `understood` has the rules.
+
+    MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
+    unknown, does not speak the protocol, or speaks both and none was given.
+    """
+    if protocol is not None and (table := _table(model, protocol)) is not None:
+        return table
+    spoken = protocols_of(model)
+    if not spoken:
+        raise LookupError(
+            f"no control table of the model {model!r}; known models: {', '.join(model_names())}"
+        )
+    if protocol is not None and protocol not in spoken:
+        raise LookupError(f"{model} speaks Protocol {spoken[0]}, not Protocol {protocol}")
+    if protocol is None and len(spoken) > 1:
+        raise LookupError(f"{model} exists with Protocol 1.0 and with Protocol 2.0: say which one")
+    listing = understood(model, spoken[0] if protocol is None else protocol)
+    if listing is None:  # protocols_of has just found it
+        raise LookupError(f"no control table of the model {model!r}")
+    return listing.build()
+
+
+def protocols_of(model: str) -> tuple[float, ...]:
+    """Return the protocols of a model, by whatever name it is understood; none: there is no such model."""
+    return tuple(each for each in (1.0, 2.0) if understood(model, each) is not None)
+
+
+def understood(name: str, protocol: float) -> Listing | None:
+    """Return the model of a protocol that a name means, None when there is none or more than one.
+
+    Beside the names of models and their aliases these are understood: other case and punctuation (AX12,
+    xl_320), the product name with its connector (XL430-W250-T or -R), and the series of a model that is the
+    only one in it (XL430, XL-430).
+    """
+    known = _index(protocol)
+    if name in known:
+        return known[name]
+    key = _key(name)
+    names = [(_key(each), listing) for each, listing in known.items()]
+    series = [(_key(each.partition("-")[0]), listing) for each, listing in known.items()]
+    ways = [(key, names)]
+    ways += [(key[:-1], names)] if key.endswith(("T", "R")) else []
+    ways += [(key, series)] if _SERIES.fullmatch(key) else []
+    for part, keys in ways:
+        found = {listing.names[0]: listing for each, listing in keys if each == part}
+        if len(found) == 1:
+            return next(iter(found.values()))
+    return None
+
+
+def _key(name: str) -> str:
+    return "".join(filter(str.isalnum, name.upper()))
+
+
+def model_names(protocol: float | None = None) -> tuple[str, ...]:
+    """Return every name that `control_table` knows (of one protocol if given), aliases too, sorted."""
+    return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
+
+
+def perhaps_meant(name: str, protocol: float | None = None) -> str:
+    """Return a hint for a name that no model of servos has."""
+    return beginning_or_near(name, model_names(protocol))
+
+
+def beginning_or_near(name: str, known: Iterable[str]) -> str:
+    """Return a hint for a name that no model has: those that begin with it, else the nearest ones."""
+    keys = {_key(each): each for each in sorted(known, reverse=True)}
+    key = _key(name)
+    meant = sorted(each for each in keys if key and each.startswith(key))
+    if 0 < len(meant) <= _MOST_MEANT:
+        return f"did you mean {' or '.join(keys[each] for each in meant)}?"
+    return suggestion(name, keys.values(), "`dxlrun models` lists all")
+
+
+def all_tables() -> tuple[ControlTable, ...]:
+    """Return every control table once, by protocol, then model number, then firmware."""
+    tables = [listing.build() for listing in (*_listings(1.0), *_listings(2.0))]
+    return tuple(sorted(tables, key=lambda each: (each.protocol, each.model_number, each.firmware)))
+
+
+def models_by_number(number: int, protocol: float, firmware: float = math.inf) -> tuple[ControlTable, ...]:
+    """Return the tables of a model number that a servo of this protocol answers, newest firmware first.
+
+    It is empty when the number is unknown; it has several when the table depends on the firmware: the first
+    one is that of a servo of this `firmware`.
+    """
+    found = [listing.build() for listing in _listings(protocol) if listing.model_number == number]
+    fitting = [each for each in found if each.firmware <= firmware]
+    return tuple(sorted(fitting, key=lambda each: -each.firmware))
+
+
+def add_control_table(text: str) -> ControlTable:
+    """Add a plug-in's control table, the TOML text of a data file; return it.
+
+    Raises ValueError when the text is no control table, or when one of its names or its number is taken.
+    """
+    try:
+        table = read_control_table(text)
+    except KeyError as error:
+        raise ValueError(f"the entry {error} is missing") from error
+    names = (table.model, *table.aliases)
+    for listing in _listings(table.protocol):
+        if listing.model_number == table.model_number or set(names) & set(listing.names):
+            if listing.build() == table:
+                return table  # a process may load its plug-ins twice
+            raise ValueError(
+                f"{table.model} with model number {table.model_number} has a name or the number of the "
+                f"{listing.names[0]}, which is known already"
+            )
+    _ADDED[table.protocol].append(Listing(names, table.model_number, table.firmware, lambda: table))
+    _TEXTS.update(dict.fromkeys(names, text))
+    return table
+
+
+def added_control_tables(models: Iterable[str]) -> tuple[str, ...]:
+    """Return the texts of the tables that were added for some models; models of our own have none.
+
+    They are for a process that loads no plug-ins itself.
+    """
+    return tuple(dict.fromkeys(_TEXTS[model] for model in models if model in _TEXTS))
+
+
+def _table(name: str, protocol: float) -> ControlTable | None:
+    # no dict is built here: a servo that comes back is looked up while the loop runs
+    listing = _shipped(protocol).get(name)
+    if listing is None:
+        listing = next((each for each in _ADDED.get(protocol, ()) if name in each.names), None)
+    return None if listing is None else listing.build()
+
+
+def _index(protocol: float) -> Mapping[str, Listing]:
+    return {**_shipped(protocol), **{name: each for each in _ADDED.get(protocol, ()) for name in each.names}}
+
+
+def _listings(protocol: float) -> tuple[Listing, ...]:
+    return tuple({listing.names[0]: listing for listing in _index(protocol).values()}.values())
+
+
+@functools.cache
+def _shipped(protocol: float) -> Mapping[str, Listing]:
+    """The models of one protocol by name: those of the other one are not read before they are needed."""
+    found: dict[str, Listing] = {}
+    for listing in listings(protocol):
+        for name in listing.names:
+            if name in found:
+                raise ValueError(f"the model {name!r} is in two control tables")
+            found[name] = listing
+    return MappingProxyType(found)

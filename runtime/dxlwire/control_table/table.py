@@ -1,0 +1,292 @@
+"""A control table: the control items of one model, their places and meanings, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Generic, Literal, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from dxlwire.control_table.deviation import Deviation, Judgement
+from dxlwire.control_table.hardware_errors import HardwareErrors, error_item
+
+Access = Literal["R", "RW"]
+Area = Literal["EEPROM", "RAM"]
+Encoding = Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
+"""`float32`: IEEE 754's binary32, of devices alone; its integer on the wire is that of its four bytes."""
+EffortUnit = Literal["1", "A", "Nm"]
+
+_TITLES = {"id": "ID", "cw": "CW", "ccw": "CCW", "led": "LED", "pwm": "PWM", "shadow": "(Shadow)"}
+"""Words of item names that are not merely capitalized."""
+SIGN_BIT = 10
+"""Direction bit of sign-magnitude items: 0 counter-clockwise, 1 clockwise (e-Manual, Present Speed (38))."""
+_HIGHEST_VOLTAGE = 4 / 3
+"""Times the nominal voltage: 16 V of 12 V (e-Manual XM430-W350, Max Voltage Limit (32)), taken for all models
+[i]. Speed grows as the voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
+
+
+class ControlItem(msgspec.Struct, frozen=True):
+    """One control item: an integer of 1, 2 or 4 bytes, little-endian, and what it means."""
+
+    name: str
+    address: int
+    size: int
+    access: Access
+    area: Area
+    minimum: int
+    """As the e-Manual gives it: of the integer on the wire, where a direction bit counts as a bit; with two's
+    complement of the signed number."""
+    maximum: int
+    initial: int | None
+    """Value of the integer on the wire after a factory reset or at power-up; None: the manual gives none."""
+    encoding: Encoding
+    unit: str
+    """SI unit of `scale`; empty for flags, numbers and steps; `1` for a fraction of the maximum."""
+    scale: float  # SI units per tick
+    page: str  # Section of the manual's page of this model
+    firmware: int = 0  # First firmware version that has the item; 0: every one
+    deviation: Deviation | None = None
+    """Judgement of other values than the factory's; None where the item can only be read."""
+
+    def encode(self, raw: int) -> bytes:
+        """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
+        wire = raw
+        if self.encoding == "sign_magnitude":
+            if abs(raw) >= 1 << SIGN_BIT:
+                raise ValueError(f"{self.name}: {raw} does not fit into {SIGN_BIT} bits and a direction")
+            wire = abs(raw) | (raw < 0) << SIGN_BIT
+        try:
+            return wire.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
+        except OverflowError:
+            raise ValueError(f"{self.name}: {raw} does not fit into {self.size} bytes") from None
+
+    def decode(self, data: bytes | bytearray | memoryview) -> int:
+        """Return the signed number of ticks; raises ValueError when `data` has not `size` bytes."""
+        if len(data) != self.size:
+            raise ValueError(f"{self.name}: {self.size} bytes are needed, {len(data)} were given")
+        wire = int.from_bytes(data, "little", signed=self.encoding == "twos_complement")
+        if self.encoding == "sign_magnitude":
+            magnitude = wire & ((1 << SIGN_BIT) - 1)
+            return -magnitude if wire >> SIGN_BIT & 1 else magnitude
+        return wire
+
+    def value(self, data: bytes | memoryview) -> float:
+        """Return what the item's own bytes mean, SI units."""
+        return self.decode(data) * self.scale
+
+    def integer(self, data: bytes | memoryview) -> int:
+        """Return the integer on the wire that the item's own bytes are, signed where the item is."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    def wire_bytes(self, value: int) -> bytes:
+        """Return the bytes of an integer on the wire, one below 0 in two's complement."""
+        return value.to_bytes(self.size, "little", signed=value < 0)
+
+    @property
+    def title(self) -> str:
+        """The item as the e-Manual writes it: `Torque Enable (24)`."""
+        words = (_TITLES.get(word, word.capitalize()) for word in self.name.split("_"))
+        return f"{' '.join(words)} ({self.address})"
+
+    @property
+    def limited_by(self) -> str:
+        """Name of the item that bounds this one; empty: none does."""
+        return "" if self.deviation is None else self.deviation.limited_by
+
+    @property
+    def signed(self) -> bool:
+        """True when the integer on the wire is in two's complement, so that `minimum` may be below 0."""
+        return self.encoding == "twos_complement"
+
+
+Item = TypeVar("Item", bound=ControlItem)
+
+
+class Table(msgspec.Struct, Generic[Item], frozen=True):
+    """What the control tables of servos and devices have alike."""
+
+    model: str  # The model's own name, also where an alias was given
+    aliases: tuple[str, ...]  # Names of models with the same table
+    protocol: float
+    items: Mapping[str, Item]
+    """By the e-Manual's name in snake_case, in the order of addresses."""
+    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
+    capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
+
+    @property
+    def size(self) -> int:
+        """Number of bytes from address 0 to the end of the last item."""
+        return max(item.address + item.size for item in self.items.values())
+
+    def has_baud_rate(self, rate: int) -> bool:
+        """Whether the model can run at a rate, bit/s; in Protocol 1.0 also by 2,000,000 / (value + 1).
+
+        True where the manual lists no rates (e-Manual, Baud Rate (4)).
+        """
+        if rate in self.baud_rates.values() or not self.baud_rates:
+            return True
+        if self.protocol != 1.0 or rate <= 0:
+            return False
+        value = round(2_000_000 / rate) - 1
+        return 0 <= value <= 254 and abs(2_000_000 / (value + 1) - rate) < 0.03 * rate
+
+    def readable(self, start: int, end: int) -> bool:
+        """Check whether the addresses from `start` up to before `end` all belong to items."""
+        items = self.items.values()
+        known = {address for item in items for address in range(item.address, item.address + item.size)}
+        return known.issuperset(range(start, end))
+
+    def spare(self, end: int, most: int) -> int:
+        """Return how many bytes behind an end can be read too, `most` at most."""
+        return next((count for count in range(most, 0, -1) if self.readable(end, end + count)), 0)
+
+
+class ControlTable(Table[ControlItem], frozen=True, kw_only=True):
+    """The control items of one model, and its exact units.
+
+    The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.
+    """
+
+    model_number: int
+    goal_speed_item: str
+    """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
+    present_speed_item: str
+    effort_item: str  # `present_load`, or `present_current` where the model measures its current
+    rad_per_tick: float
+    min_tick: int
+    """Lowest value of goal and present position; below 0 where the middle of the travel is 0."""
+    max_tick: int  # Highest value of goal and present position
+    rad_s_per_tick: float
+    max_speed_tick: int  # Highest value of a goal speed without its direction
+    effort_per_tick: float  # `effort_unit` per tick of `effort_item`
+    errors: HardwareErrors = HardwareErrors()
+    """Where the model reports hardware errors, and what they mean."""
+    effort_unit: EffortUnit
+    """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
+    max_speed: float  # No-load speed, rad/s, at `nominal_voltage`
+    stall_torque: float  # Nm, at `nominal_voltage`; 0 where the manual gives none
+    fast_sync_read_firmware: int | None = None
+    """First firmware version with the fast forms; None where the model has none."""
+    firmware: int = 0  # First firmware version that has this table; 0: every one
+    gear_ratio: float = 0.0  # Turns of the motor for one of the horn; 0 where the manual gives none
+    stall_current: float = 0.0  # A drawn at `stall_torque`; 0 where the manual gives none
+    nominal_voltage: float = 0.0
+    """V at which `max_speed`, `stall_torque` and `stall_current` hold; 0 where the manual gives none."""
+
+    @property
+    def top_speed(self) -> float:
+        """The highest speed of the servo, rad/s: without load, at the highest voltage that it accepts."""
+        return self.max_speed * _HIGHEST_VOLTAGE
+
+    def with_firmware(self, firmware: int) -> ControlTable:
+        """Return the table that a servo of a firmware version has: without the items that came later."""
+        items = {name: item for name, item in self.items.items() if item.firmware <= firmware}
+        return self if len(items) == len(self.items) else replace(self, items=MappingProxyType(items))
+
+
+CAPABILITIES: Mapping[str, str] = {
+    "bulk_read": "bulk read",
+    "bulk_write": "bulk write",
+    "fast_sync_read": "fast sync read and fast bulk read, from `fast_sync_read_firmware` on",
+    "indirect": "indirect addresses",
+    "hardware_error": "hardware error status or error code, and the alert bit in its replies",
+    "operating_mode": "operating modes chosen by an item instead of by the angle limits",
+    "posvel": "goal speed and goal position stand side by side: one write sets both",
+    "reboot": "the reboot instruction",
+    "state_block": "effort, speed and position stand side by side: one read gets all three",
+    "sync_read": "sync read",
+    "sync_write": "sync write",
+}
+"""What a model can do, in the words of `ControlTable.capabilities`."""
+
+DERIVED = frozenset({"hardware_error", "indirect", "operating_mode", "posvel", "state_block"})
+"""Capabilities that follow from the items; data files do not name them."""
+
+
+def derived_capabilities(
+    items: Mapping[str, ControlItem], goal_speed: str, present_speed: str, effort: str
+) -> frozenset[str]:
+    """Return the capabilities that follow from which items there are and where they stand."""
+    has = {
+        "operating_mode": "operating_mode" in items or "control_mode" in items,
+        "hardware_error": error_item(items) != "",
+        "indirect": "indirect_address_1" in items,
+        "posvel": len(side_by_side((items[goal_speed], items["goal_position"]))) == 1,
+        "state_block": len(side_by_side(items[name] for name in (effort, present_speed, "present_position")))
+        == 1,
+    }
+    return frozenset(name for name, yes in has.items() if yes)
+
+
+def side_by_side(
+    items: Iterable[ControlItem], most_bytes: int | None = None
+) -> tuple[tuple[ControlItem, ...], ...]:
+    """Group items that one read can fetch: each begins where the one before ends, at most so many bytes."""
+    blocks: list[list[ControlItem]] = []
+    for item in sorted(items, key=lambda one: one.address):
+        end = item.address + item.size
+        block = blocks[-1] if blocks else None
+        if (
+            block is not None
+            and block[-1].address + block[-1].size == item.address
+            and (most_bytes is None or end - block[0].address <= most_bytes)
+        ):
+            block.append(item)
+        else:
+            blocks.append([item])
+    return tuple(map(tuple, blocks))
+
+
+def decoded(items: Iterable[ControlItem], start: int, data: bytes | memoryview) -> dict[str, int]:
+    """Return those of some items, by name, that lie whole in the bytes from an address on: signed ticks."""
+    found: dict[str, int] = {}
+    for item in items:
+        at = item.address - start
+        if 0 <= at <= len(data) - item.size:
+            found[item.name] = item.decode(data[at : at + item.size])
+    return found
+
+
+class FoundDeviation(msgspec.Struct, frozen=True):
+    """A value of an item that is not the factory's, and matters."""
+
+    item: ControlItem
+    found: int
+    factory: int
+    judgement: Judgement
+    effect: str  # What the value does: a verb with its object
+    remedy: str
+
+    @property
+    def refused(self) -> bool:
+        """True when the servo gets no torque with this value."""
+        return self.judgement == "refuse"
+
+    @property
+    def text(self) -> str:
+        """Both values, for a message: `PWM Limit (36) = 100 instead of 885`."""
+        return f"{self.item.title} = {self.found} instead of {self.factory}"
+
+
+def find_deviations(items: Iterable[ControlItem], values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
+    """Return which values of a servo are not the factory's and matter, in the order of addresses.
+
+    Items without a value are not judged; neither are those without a factory value, and those that are
+    compared with the plan of a run instead.
+    """
+    found: list[FoundDeviation] = []
+    for item in items:
+        rule, value = item.deviation, values.get(item.name)
+        if item.access == "R" or rule is None or rule.planned or value is None:
+            continue
+        factory = item.initial
+        if factory is None:
+            factory = values.get(item.limited_by)
+            if factory is None or (value and abs(value) >= factory):
+                continue  # the item that bounds it may have been lowered since power-up
+        judgement = rule.judge(value, factory)
+        if judgement != "harmless":
+            found.append(FoundDeviation(item, value, factory, judgement, rule.effect_of(value), rule.remedy))
+    return tuple(found)

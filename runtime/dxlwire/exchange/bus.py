@@ -1,0 +1,638 @@
+"""Bus: one serial line as a transaction machine that never blocks; Lines: all of them, with one wait.
+
+A bus writes an instruction, is fed the bytes that arrive, and is handed the time. `Lines` executes the jobs
+of all buses side by side: the cyclic reads, what is done in idle time, set-up and tools.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias
+
+from dxlrun.channels.packets import PacketKind, PacketSink
+from dxlrun.errors import PortError
+from dxlwire.bus_plan import BusPlan
+from dxlwire.clock import Clock
+from dxlwire.exchange.owed import OwedReplies
+from dxlwire.plan.line import BITS_PER_BYTE, lengthen
+from dxlwire.port.ports import Port, Ports
+from dxlwire.transaction import (
+    BROADCAST_ID,
+    NO_REGISTER,
+    Job,
+    Outcome,
+    Program,
+    ProgramJob,
+    Reply,
+    Result,
+    Status,
+    Transaction,
+)
+from dxlwire.wire.dialect import Dialect, dialect_of
+from dxlwire.wire.receiver import Receiver
+
+NEVER = 1 << 62
+QUIET_BYTES = 20
+"""A line that was silent for so many byte times is silent (docs/reference/protocol.md: drain until it is)."""
+LEAST_QUIET_NS = 200_000
+DRAIN_LIMIT_NS = 5_000_000  # A line that babbles longer than this is not waited for
+PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same for a job that has time
+LOST_LINE_STEP_NS = 200_000  # How often the other lines are looked at while one is lost
+BEAT_NS = 1_000_000  # The longest time between two signs of life, beside one wait
+MOST_LATE_NS = 1_000_000
+"""A reply that is later is an accident, as when this process was not running, and no property of the line."""
+_FORGOTTEN = 6  # With each reply that is less late, 2 ** -6 of a line's lateness is forgotten
+
+FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
+"""What `Bus.words` holds, which the exchange kernel shares: when everything that was sent is off the wire;
+how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost; when the servos
+were last asked, 0: their watchdogs are not armed; how long these wait, 0: there are none."""
+
+_READY, _AWAITING, _RESTING, _DRAINING, _HOLDING = range(5)
+# to look into an Enum takes as long as to pack a packet's record
+_SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
+_INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
+
+_Shape: TypeAlias = tuple[int, int]  # ID and number of parameter bytes of a status packet
+_FAST: _Shape = (BROADCAST_ID, 0)  # Of the one status packet of a fast form, whatever its length
+
+
+class Bus:
+    """Executes transactions on one line; every byte that goes over it is reported to the packet sink.
+
+    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
+    several replies to one instruction each counts by itself, whatever became of the others. After a timeout
+    the line is drained until it is silent. A reply that may answer an older request does not count, see
+    `OwedReplies`.
+    """
+
+    def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
+        self.index = index  # Its number in the log
+        self.plan = plan
+        self.now_ns = clock.now_ns
+        self.failure: PortError | None = None
+        """Why the line is lost; a bus with a failure does nothing more."""
+        self.noise_bytes = 0  # Bytes that belonged to no intact packet, since the start
+        self.unrequested = 0
+        """Packets since the start that no request of this host explains: instructions of another one, and the
+        replies to them."""
+        self.words = array("q", (0, 0, 0, 0, 0))  # Memory that the exchange kernel shares, see `FREE_NS`
+        self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        """What a byte takes on the wire, ns."""
+        self._latency_ns = plan.latency_ns
+        self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
+        self._port = port
+        self._sink = packets
+        self._dialect: Dialect = dialect_of(plan.protocol)
+        self.receiver = Receiver(self._take_packet, self._take_noise, self._dialect)
+        """What it has `pending` is the beginning of a packet, which a new request takes for noise."""
+        cyclic = {
+            (one.servo_id, one.length + more)  # as many as late replies are distinguished by
+            for one in plan.members
+            for more in range(1 + one.spare)
+        }
+        self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
+        self.owed = OwedReplies(clock.now_ns)
+        """Replies that did not arrive in time and may arrive late."""
+        self._written: bytes | bytearray | memoryview = b""  # what was sent last
+        self._job: Job | None = None
+        self._cyclic_job = self._waits = False
+        self._held: Transaction | None = (
+            None  # waits until the replies that are owed cannot be taken for its own
+        )
+        self._held_until_ns = 0
+        self._asked_length = 0  # parameters that the job asked for; a read may bring spare bytes
+        self._before: Transaction | None = None  # the one before the awaited one
+        self._awaited: Transaction | None = None
+        self._reply = Reply(_SENT, 0, b"", 0, 0, False)
+        self._state = _READY
+        self._sent_ns = self._earliest_ns = self._deadline_ns = self._drain_end_ns = 0
+        self._planned_deadline_ns = 0  # Of a reply that is awaited for longer; 0: none is
+        self._last_byte_ns = -NEVER
+        self._open = 0  # a bit for each status that is still awaited
+        self._refused = False
+
+    # The line
+
+    @property
+    def busy(self) -> bool:
+        """True while a job is under way."""
+        return self._job is not None
+
+    @property
+    def late_ns(self) -> int:
+        """How late replies on this line came at worst lately, beside the adapter's latency."""
+        return self.words[LATE_NS]
+
+    def load(self, job: Job, *, cyclic: bool = False, waits: bool = False) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
+
+        Args:
+            job: The transactions to execute.
+            cyclic: The job reads the states of a cycle, and chooses the lengths of its reads itself.
+            waits: The job has time: a transaction is held back while a late reply could be taken for its own.
+        """
+        self.drop()
+        self._cyclic_job, self._waits = cyclic, waits
+        if self.failure is None:
+            self._job = job
+            self._reply.strays = 0
+
+    def drop(self) -> None:
+        """Forget the loaded job; what still comes for it is stray."""
+        self._note_owed()
+        self._job = self._awaited = self._held = None
+        self._state = _READY
+
+    def fail(self, error: PortError) -> None:
+        """Count the line as lost; its job is forgotten."""
+        self.failure = error
+        self.words[LOST] = 1
+        self._job = None
+
+    def retry(self) -> None:
+        """Use the line again, which may be back or was only stuck."""
+        self.failure = None
+        self.words[LOST] = 0
+
+    def renew(self, port: Port) -> None:
+        """Continue on a line that is back in the place of one that was lost; its job is forgotten."""
+        self._port = port
+        self.retry()
+        self.drop()
+
+    def send(self, packet: bytes | bytearray | memoryview) -> None:
+        """Send a prepared packet without a reply, between two jobs; does not wait.
+
+        The next transaction starts when the packet is off the wire. Raises PortError when the line is lost.
+        """
+        if self.failure is None:
+            try:
+                self._write(packet, BROADCAST_ID)
+            except PortError as error:
+                self.fail(error)
+        if self.failure is not None:
+            raise self.failure
+
+    def resume(self, received_ns: int, sent_ns: int, deadline_ns: int) -> None:
+        """Await the replies to the loaded job's next transaction, which the exchange kernel sent.
+
+        `received_ns`: when the replies to the one before came.
+        """
+        if self._job is None or (transaction := self._job.advance(None)) is None:
+            return
+        if self.receiver.pending:
+            self.receiver.flush()
+        self._awaited = transaction
+        self._asked_length = max(one.length for one in transaction.awaited)
+        self._last_byte_ns = max(self._last_byte_ns, received_ns)
+        self._await(transaction, sent_ns)
+        self._deadline_ns = deadline_ns
+
+    def take(self, data: bytes, at_ns: int) -> None:
+        """Take bytes that the exchange kernel received and could not use."""
+        self._last_byte_ns = at_ns
+        self.receiver.feed(data, at_ns)
+        self._skip_headers()
+
+    # Time
+
+    def hear(self) -> int:
+        """Take what the line has, and continue; return when to come back at the latest, as `step` does.
+
+        Called when the line has bytes.
+        """
+        self._receive()
+        return self.step(self.now_ns())
+
+    def step(self, now_ns: int) -> int:
+        """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
+        try:
+            while self._job is not None:
+                if self._state == _READY:
+                    now_ns = self._begin(self._job)
+                elif now_ns < self._deadline_ns:
+                    return self._deadline_ns
+                else:
+                    self._end(now_ns)
+        except PortError as error:
+            self.fail(error)
+        return NEVER
+
+    def _receive(self) -> None:
+        if self.failure is None:
+            try:
+                if self.receiver.read_from(self._port, self.now_ns):
+                    self._last_byte_ns = self.now_ns()
+                    self._skip_headers()
+            except PortError as error:
+                self.fail(error)
+
+    def _begin(self, job: Job) -> int:
+        """Hand the reply to the job and start its next transaction; return the time after that."""
+        reply, done = self._reply, self._awaited
+        if done is not None and reply.outcome is _OK:
+            self._note_lateness(reply.last_ns - self._sent_ns - done.due_ns - self._latency_ns)
+            if not self._cyclic_job:
+                reply.stalled_ns = self._port.late_ns(self.words[FREE_NS], reply.last_ns)
+        self._before = done
+        self._awaited = None
+        transaction = job.advance(None if done is None else reply)
+        if transaction is None:
+            self._job = None
+            return 0
+        reply.strays = 0
+        self._asked_length = max((one.length for one in transaction.awaited), default=0)
+        if transaction.packet and not self._cyclic_job:
+            self._receive()  # what arrived before the request is not its reply
+            self._drain_end_ns = self.now_ns() + PATIENT_DRAIN_LIMIT_NS
+            if self.failure is not None or (self._waits and self._hold_back(transaction)):
+                return self.now_ns()
+            transaction, _ = self.choose(transaction)
+        return self._send_awaited(transaction)
+
+    def choose(self, transaction: Transaction) -> tuple[Transaction, int]:
+        """Return a transaction in the length that no owed reply has, and when it can be sent; 0: at once."""
+        best, best_ns = transaction, self.owed.free_ns(transaction)
+        for more in range(1, transaction.spare + 1):
+            if not best_ns:
+                break
+            longer = lengthen(transaction, more, self._dialect, self.byte_ns)
+            free_ns = self.owed.free_ns(longer)
+            if free_ns < best_ns:
+                best, best_ns = longer, free_ns
+        return best, best_ns
+
+    def _hold_back(self, transaction: Transaction) -> bool:
+        """Hold a transaction back until the line is quiet, and no owed reply can be taken for its own."""
+        if not transaction.awaited:
+            return False
+        now_ns = self.now_ns()
+        _, free_ns = self.choose(transaction)
+        # a reply that comes twice comes at once, so the latency of the adapter does not count
+        quiet_ns = min(self._quiet_at() - self._latency_ns, self._drain_end_ns)
+        until_ns = min(max(free_ns, quiet_ns), now_ns + transaction.patience_ns)
+        if until_ns <= now_ns:
+            return False
+        self._held = transaction
+        self._held_until_ns = now_ns + transaction.patience_ns
+        self._state, self._deadline_ns = _HOLDING, until_ns
+        return True
+
+    def _release_held(self, now_ns: int) -> None:
+        """Send the transaction that was held back, or hold it back again for what arrived meanwhile."""
+        transaction, self._held = self._held, None
+        if transaction is not None and now_ns < self._held_until_ns:
+            patient = self._held_until_ns
+            if self._hold_back(transaction):
+                self._held_until_ns = min(self._held_until_ns, patient)
+                return
+        if transaction is not None:
+            self._state = _READY
+            self._send_awaited(self.choose(transaction)[0])
+
+    def _send_awaited(self, transaction: Transaction) -> int:
+        """Send a transaction and await its replies; return the time after that."""
+        self._awaited = transaction
+        if self.receiver.pending:
+            self.receiver.flush()
+        packet = transaction.packet
+        now_ns = self._write(packet, transaction.servo_id) if packet else self.now_ns()
+        self._await(transaction, self._sent_ns if packet else now_ns)
+        # this process may have stood still before the bytes left
+        self._deadline_ns = max(self._deadline_ns, now_ns + transaction.timeout_ns)
+        if packet and not self._cyclic_job and all(one.address == NO_REGISTER for one in transaction.awaited):
+            self.owed.note_change(transaction, self._sent_ns)
+        return now_ns
+
+    def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
+        """Send a packet; return the time after that."""
+        now_ns, words = self.now_ns, self.words
+        before = now_ns()
+        self._port.write(packet)
+        after = now_ns()
+        self._written = packet
+        self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
+        # a second packet waits in the adapter until the first is off the wire
+        free = words[FREE_NS]
+        start = self._sent_ns = free if free > before else before  # a third of the time of max()
+        words[FREE_NS] = start + len(packet) * self.byte_ns
+        return after
+
+    def _await(self, transaction: Transaction, started_ns: int) -> None:
+        """Await the replies to a transaction whose instruction is on its way."""
+        reply = self._reply
+        reply.parameters = b""
+        reply.error = 0
+        reply.echoed = False
+        self._sent_ns = started_ns
+        reply.sent_ns = started_ns
+        reply.asked_ns = started_ns if self._cyclic_job else self.owed.asked_ns(transaction, started_ns)
+        if transaction.awaited:
+            reply.outcome = _TIMEOUT
+            self._state = _AWAITING
+            self._earliest_ns = started_ns + (len(transaction.packet) + self._dialect.OVERHEAD) * self.byte_ns
+            self._deadline_ns = started_ns + transaction.timeout_ns
+            self._open = (1 << len(transaction.awaited)) - 1
+            self._refused = False
+            self._planned_deadline_ns = 0
+        else:
+            reply.outcome = _SENT
+            self._state = _RESTING
+            self._deadline_ns = started_ns + transaction.due_ns
+
+    def _end(self, now_ns: int) -> None:
+        """Do what is due at a transaction's deadline."""
+        # bytes may have come while this process was not running: look before giving up
+        self._receive()
+        if self._state == _AWAITING:
+            if not self._extend_deadline(now_ns):
+                self._give_up(now_ns)
+        elif self._state == _DRAINING and self._quiet_at() > now_ns:
+            self._deadline_ns = self._quiet_at()
+        elif self._state in (_RESTING, _DRAINING):
+            self.receiver.flush()
+            self._state = _READY
+        elif self._state == _HOLDING:
+            self.receiver.flush()
+            self._release_held(now_ns)
+
+    def _extend_deadline(self, now_ns: int) -> bool:
+        """Await a late reply for longer if the port has a reason to; return whether it has."""
+        self._planned_deadline_ns = self._planned_deadline_ns or self._deadline_ns
+        self._deadline_ns = self._port.extend_deadline(
+            self._planned_deadline_ns, self.words[FREE_NS], self._last_byte_ns, now_ns
+        )
+        return self._deadline_ns > now_ns
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long what is behind the line had no processor between two times, ns."""
+        return self._port.stalled_ns(since_ns, until_ns)
+
+    def _give_up(self, now_ns: int) -> None:
+        """End a transaction of which not every reply came in time."""
+        self.receiver.flush()  # the reply may stand behind a false header
+        if self._state != _AWAITING:
+            return
+        self._note_owed()
+        self._reply.outcome = Outcome.GARBLED if self._reply.strays else _TIMEOUT
+        self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
+        self._deadline_ns = self._quiet_at()
+        self._state = _DRAINING if self._deadline_ns > now_ns else _READY
+
+    def _quiet_at(self) -> int:
+        return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
+
+    def _note_lateness(self, late_ns: int) -> None:
+        """Keep how late replies come: idle time begins nothing that would end as late. As in kernel.c."""
+        kept_ns = self.words[LATE_NS]
+        kept_ns -= (kept_ns >> _FORGOTTEN) + 1
+        self.words[LATE_NS] = max(min(late_ns, MOST_LATE_NS), kept_ns, 0)
+
+    # What arrives: match received packets to the pending request, count the rest as stray
+
+    def _skip_headers(self) -> None:
+        # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        receiver, awaited = self.receiver, self._awaited
+        while awaited is not None and self._state == _AWAITING and receiver.pending >= awaited.widest:
+            receiver.skip_header()
+        if awaited is not None and awaited.tail and awaited.fast and self._state == _AWAITING:
+            firm = awaited.awaited[: -awaited.tail]
+            if firm and receiver.pending >= self._dialect.fast_size(sum(a.length for a in firm), len(firm)):
+                self._await_devices(awaited, self._last_byte_ns)
+
+    def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
+        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are replies
+        used = self._take_fast(data, last_ns) if self._is_fast(data) else 0
+        if used:
+            self._sink.packet(self.index, _STATUS, BROADCAST_ID, first_ns, last_ns, data[:used])
+        if rest := data[used:]:
+            self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, rest)
+            self.noise_bytes += len(rest)
+            self._reply.strays += 1
+
+    def _take_packet(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
+        kind = _STATUS if self._take_reply(packet, last_ns) else self._stray(packet)
+        self._sink.packet(self.index, kind, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+
+    def _take_reply(self, packet: memoryview, last_ns: int) -> bool:
+        if self._is_fast(packet):
+            return self._take_fast(packet, last_ns) > 0
+        status = self._dialect.opened(packet) if self._state == _AWAITING else None
+        if status is None or self._job is None or (place := self._place(status, last_ns)) is None:
+            return False
+        index, refused = place
+        reply = self._reply
+        parameters = bytes(status.parameters[: self._asked_length])
+        reply.error, reply.parameters, reply.last_ns = status.error, parameters, last_ns
+        self._open &= ~(1 << index)
+        if refused:
+            self._refused = True
+        else:
+            self._job.status(index, reply)
+        if not self._open:
+            reply.outcome = Outcome.REFUSED if self._refused else _OK
+            self._state = _READY
+        elif (awaited := self._awaited) is not None and awaited.tail:
+            firm = (1 << len(awaited.awaited) - awaited.tail) - 1
+            if not self._open & firm:
+                self._await_devices(awaited, last_ns)
+        return True
+
+    def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
+        """Await what is open for a moment only: the servos have answered by `last_ns`. As in kernel.c."""
+        self._planned_deadline_ns = 0
+        brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
+        self._deadline_ns = min(self._deadline_ns, brief_ns)
+
+    def _place(self, status: Status, last_ns: int) -> tuple[int, bool] | None:
+        """Return which of the awaited statuses this is, and whether it is a refusal; None: it is none."""
+        servo_id, error, parameters = status
+        length = len(parameters)
+        # an echo, or left over from before, comes sooner than the wire allows
+        if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
+            return None
+        for index, one in enumerate(self._awaited.awaited):
+            if one.servo_id == servo_id and self._open >> index & 1:
+                refused = error != 0 and self._dialect.refused(error, length, one.length)
+                if not refused and length != one.length:
+                    return None
+                any_age = self._cyclic_job or self._awaited.any_age
+                if self.owed.confuses(self._awaited, one, refusal=refused, any_age=any_age):
+                    return None
+                if not self._cyclic_job:  # the kernel, which reads most cycles, does not note it either
+                    self.owed.note_answer(self._awaited, one, self._sent_ns)
+                return index, refused
+        return None
+
+    def _is_fast(self, data: memoryview) -> bool:
+        """Check whether a fast form is awaited, and this looks like its one status, whole or not."""
+        awaited = self._awaited
+        return (
+            awaited is not None
+            and awaited.fast
+            and self._state == _AWAITING
+            and bytes(data[: self._dialect.ID_AT + 1]) == self._dialect.HEADER + bytes((BROADCAST_ID,))
+        )
+
+    def _take_fast(self, data: memoryview, last_ns: int) -> int:
+        """Take what is good of the one status of a fast form; return the number of its bytes."""
+        awaited, job = self._awaited, self._job
+        if awaited is None or job is None:
+            return 0
+        parts, used = _good_parts(self._dialect, awaited, data)
+        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
+            return 0  # sooner than the wire allows: left over from before
+        reply = self._reply
+        for index, part in enumerate(parts):
+            reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
+            self._open &= ~(1 << index)
+            job.status(index, reply)
+        if not self._open:
+            reply.outcome = _OK
+            self._state = _READY
+        return used
+
+    def _note_owed(self) -> None:
+        """Note the replies to a transaction that is given up; they may still come."""
+        awaited = self._awaited
+        if awaited is None:
+            return
+        self._before = awaited
+        if self._state != _AWAITING:
+            return
+        if not awaited.fast:
+            for index in range(len(awaited.awaited)):
+                if self._open >> index & 1:
+                    self.owed.add(awaited, index, self._sent_ns)
+        elif self._open == (1 << len(awaited.awaited)) - 1:
+            self.owed.add(awaited, 0, self._sent_ns)
+
+    def _stray(self, packet: memoryview) -> PacketKind:
+        """Return what an intact packet is that is not awaited, and count it.
+
+        Replies are distinguished by ID and length, so those to another host that reads what this one reads
+        are taken for second ones.
+        """
+        reply, awaited = self._reply, self._awaited
+        if packet == self._written or (awaited is not None and packet == awaited.packet):
+            reply.echoed = True
+            return PacketKind.ECHO
+        status, shape = self._dialect.opened(packet), _FAST
+        if status is not None:
+            fast = status.servo_id == BROADCAST_ID
+            shape = _FAST if fast else (status.servo_id, len(status.parameters))
+            length = len(packet) if fast else shape[1]
+            if self.owed.settle(status.servo_id, length, status.error):
+                if self._state == _HOLDING:  # it may have been what the held transaction waited for
+                    self._deadline_ns = self.now_ns()
+                    self._drain_end_ns = self._deadline_ns + PATIENT_DRAIN_LIMIT_NS
+                return PacketKind.LATE
+        if status is None or self._dialect.instructs(packet):
+            self.unrequested += 1
+            return PacketKind.OTHER_HOST
+        explained = shape in self._cyclic or shape in _shapes(awaited) or shape in _shapes(self._before)
+        self.unrequested += not explained
+        reply.strays += 1
+        return _STATUS
+
+
+def _shapes(transaction: Transaction | None) -> list[_Shape]:
+    return [] if transaction is None else [(one.servo_id, one.length) for one in transaction.awaited]
+
+
+def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
+    """Return what is good of the one status of a fast form that is cut off or spoilt, and its bytes."""
+    if dialect.size_at(data, 0, len(data)) != transaction.widest:
+        return [], 0
+    awaited = transaction.awaited
+    try:
+        parts = dialect.fast_answers(data, [one.length for one in awaited])
+    except ValueError:  # spoilt before its first part
+        return [], 0
+    count = 0
+    while count < len(parts) and parts[count].servo_id == awaited[count].servo_id:
+        count += 1
+    used = dialect.fast_size(sum(one.length for one in awaited[:count]), count) if count else 0
+    return parts[:count], used
+
+
+class Lines:
+    """The serial lines of a robot together: their jobs are executed side by side, by one wait for all."""
+
+    def __init__(
+        self,
+        plans: Sequence[BusPlan],
+        ports: Ports,
+        clock: Clock,
+        packets: PacketSink | Sequence[PacketSink],
+        beat: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`packets`: of all lines, or one for each; `beat` is called at least every BEAT_NS beside a wait."""
+        self.plans = tuple(plans)
+        self.ports = ports
+        self.clock = clock
+        self.beat = beat
+        sinks = packets if isinstance(packets, Sequence) else [packets] * len(self.plans)
+        self.buses = tuple(
+            Bus(index, plan, port, clock, sink)
+            for index, (plan, port, sink) in enumerate(zip(self.plans, ports.ports, sinks, strict=True))
+        )
+
+    @property
+    def failure(self) -> PortError | None:
+        """Why the first line that is lost is; None: all are there."""
+        return next((bus.failure for bus in self.buses if bus.failure is not None), None)
+
+    def clear(self, buses: Iterable[Bus]) -> None:
+        """Take what some lines have before something is asked on them.
+
+        What came before a request must not be taken for its reply, and replies come in the order of requests:
+        one that is too many would shift all that follow.
+        """
+        here = {bus.index: bus for bus in buses if bus.failure is None}
+        for index in self.ports.wait(0):
+            if index in here:
+                here[index].hear()
+
+    def pump(self) -> None:
+        """Execute the jobs of all lines: one wait over all ports, until every job is finished.
+
+        All that can be sent is sent before anything is awaited. Raises nothing: a line that is lost has its
+        `failure`, and the others continue.
+        """
+        buses, clock_ns, wait = self.buses, self.clock.now_ns, self.ports.wait
+        now_ns, beat_ns = clock_ns(), 0
+        deadlines = [bus.step(now_ns) for bus in buses]
+        while (deadline := min(deadlines, default=NEVER)) != NEVER:
+            if now_ns >= beat_ns:
+                self.beat()
+                beat_ns = now_ns + BEAT_NS
+            ready = wait(deadline)
+            heard = not ready
+            for index in ready:
+                bus = buses[index]
+                if bus.failure is None:
+                    heard = True
+                    deadlines[index] = bus.hear()
+            if not heard:
+                # a line that is lost is ready for ever: look at the others now and then instead of waiting
+                self.clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
+                for bus in buses:
+                    bus.hear()
+            now_ns = clock_ns()
+            if now_ns >= deadline or not heard:
+                deadlines = [bus.step(now_ns) for bus in buses]
+
+    def run(self, programs: Sequence[Program[Result]]) -> list[Result | None]:
+        """Run one program a line to its end, blocking, side by side; for set-up and tools, never in the loop.
+
+        Returns what each program returned; None where the line is lost: see the bus' `failure`.
+        """
+        jobs = [ProgramJob(program) for program in programs]
+        for bus, job in zip(self.buses, jobs, strict=True):
+            bus.load(job, waits=True)
+        self.clear(self.buses)
+        self.pump()
+        return [job.result for job in jobs]

@@ -1,0 +1,278 @@
+"""Cyclic reads: the prepared reads of one bus, planned anew after each loss.
+
+Servos that can answer in turn are read by one instruction. A servo that misses its turn is read by itself
+from the next cycle on, until it answers: in Protocol 1.0 a silent servo ends the chain, in 2.0 it may, so it
+must not stay in it. A device that misses its turn leaves at once: it may cost the servos nothing.
+
+A reply that arrives cycles late would look current. A group is therefore read in the length for which no
+reply is owed (`OwedReplies`), or whose owed replies are the oldest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+from msgspec import structs
+from msgspec.structs import replace
+
+from dxlwire.bus_plan import BusPlan
+from dxlwire.exchange.kernel import PlannedRead, Program
+from dxlwire.exchange.owed import OwedReplies
+from dxlwire.exchange.samples import BusSamples
+from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
+from dxlwire.plan.planning import plan_line
+from dxlwire.plan.reads import state_read
+from dxlwire.transaction import Outcome, Reply, Transaction
+
+MOST_CHAINS = 64
+"""Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""
+
+CALM_CYCLES = 2
+"""Cycles of the parser in which every servo answered in order, before the exchange kernel reads again."""
+
+MOST_PROGRAMS = 8
+"""Programs of the kernel are kept: the length of replies changes after a loss, and after that again."""
+
+MOST_BROKEN = 5
+"""Fast reads of a group that stay incomplete, with no complete one among them, before the group is read
+plainly: a servo then answers when it is asked by itself, and not in the shared status."""
+
+
+class Request(msgspec.Struct, frozen=True):
+    """One read of servos of one group, in each length: `patient` awaits late replies, `short` does not."""
+
+    group: int
+    indices: tuple[int, ...]
+    patient: tuple[Transaction, ...]
+    short: tuple[Transaction, ...]
+
+
+class Cycle(msgspec.Struct, frozen=True):
+    """The reads of a cycle."""
+
+    silent: tuple[bool, ...]  # Servos that missed their newest read; each is read by itself
+    queue: tuple[Request, ...]
+    program: Program | None
+    """The same for the kernel; None while a servo is silent, or was a moment ago."""
+
+
+class CyclicReads:
+    """The job that reads the state of every servo of one bus once."""
+
+    def __init__(self, plan: BusPlan, samples: BusSamples, owed: OwedReplies) -> None:
+        self._members = plan.members
+        count, groups = len(self._members), len(plan.groups)
+        self.missed = [0] * count  # Replies in a row that did not arrive
+        self.errors = [0] * count  # Error byte of the newest reply
+        self.garbled = [False] * count
+        """True when the newest loss had bytes, and was the first of its read."""
+        self.away = [False] * count
+        """True for a servo or a device that is lost and not asked any more; see `leave`."""
+        self.apart = [False] * count
+        """True for a device that is read by itself: it answers, but not together with others."""
+        self.fast = list(plan.fast)  # The groups that are read by a fast form; `plain` ends that
+        self.given_up: list[int] = []
+        """Groups whose fast reads stayed incomplete, so that they are read plainly now; to be reported."""
+        self.begun = False  # True from the parser's first read of a cycle to `end`
+        self._plan = plan
+        self.samples = samples
+        self._line = plan_line(plan)
+        self._owed = owed
+        self._planned_at = 0  # version of `owed` that the cycle was planned with
+        self._shape = [0] * groups  # by how many bytes more than its state a group is asked
+        self._lossy: set[int] = set()  # groups that lost a reply in this cycle
+        self._broken = [0] * groups  # incomplete fast reads since the last complete one
+        self._calm = 0  # cycles of the parser in a row without a loss
+        self.cycle = Cycle((), (), None)
+        self._stale = True  # the next cycle is another one
+        self._position = 0  # in its queue
+        self._patient = True
+        self._made: dict[tuple[int, ...], Request] = {}
+        self._programs: dict[tuple[object, ...], Program] = {}
+
+    # Planning
+
+    @property
+    def stale(self) -> bool:
+        """True when the next cycle has to be planned again."""
+        return self._stale or self._planned_at != self._owed.version
+
+    def plan(self) -> Cycle:
+        """Plan the next cycle, before anything of it is asked: as the one before if nothing happened."""
+        if self.stale:
+            self._stale, self._planned_at = False, self._owed.version
+            silent = tuple(map(bool, self.missed))
+            queue = tuple(
+                self._request(number, indices)
+                for number, group in enumerate(self._plan.groups)
+                for indices in _reads(
+                    [index for index in group if not self.away[index]],
+                    [one or apart for one, apart in zip(silent, self.apart, strict=True)],
+                )
+            )
+            for number in range(len(self._shape)):
+                self._choose_length(number, [one for one in queue if one.group == number])
+            program = self._program(queue) if self._calm >= CALM_CYCLES else None
+            self.cycle = Cycle(silent, queue, program)
+        return self.cycle
+
+    def end(self) -> None:
+        """End a cycle in which the parser read, or the line was lost: plan the next by what came of it."""
+        self.begun = False
+        self._stale = True
+        silent = self.cycle.silent
+        for number, members in enumerate(self._plan.groups):
+            if number not in self._lossy and not any(
+                silent[index] and not self.away[index] for index in members
+            ):
+                self._broken[number] = 0  # its fast read was complete
+        self._lossy.clear()
+        for group in self.given_up:
+            self.plain(group)
+        silence = any(missed and not away for missed, away in zip(self.missed, self.away, strict=True))
+        self._calm = 0 if silence or any(self._broken) else self._calm + 1
+
+    def blamed(self, member: int) -> bool:
+        """Check whether a member was asked in this cycle and did not answer, where all before it in its read
+        did: one that is silent may silence those behind it.
+        """
+        for request in self.cycle.queue:
+            if member in request.indices:
+                before = request.indices[: request.indices.index(member)]
+                arrived = self.samples.arrived
+                return not arrived(member) and all(arrived(one) for one in before)
+        return False
+
+    def leave(self, servo: int) -> None:
+        """Ask a servo no more: it is lost, and its silence would cost the others their time."""
+        self.away[servo] = True
+        self._stale = True
+
+    def join(self, servo: int) -> None:
+        """Ask a servo again from the next cycle on, with the others: it was found in order."""
+        self.away[servo] = False
+        self.missed[servo] = 0
+        self._stale = True
+
+    def learn(self, return_delays: Mapping[int, int]) -> None:
+        """Await replies when they are due by the servos' measured return delays, ns by ID."""
+        self._line = replace(self._line, return_delays=dict(return_delays))
+        self._forget()
+
+    def plain(self, group: int) -> None:
+        """Read a group by the form that every firmware knows from the next cycle on."""
+        self.fast[group] = False
+        self._forget()
+
+    def _forget(self) -> None:
+        self._made.clear()
+        self._programs.clear()
+        self._stale = True
+
+    def _request(self, group: int, indices: tuple[int, ...]) -> Request:
+        request = self._made.get(indices)
+        if request is None:
+            if len(self._made) >= MOST_CHAINS:
+                self._made.clear()
+            members = [self._members[index] for index in indices]
+            servos = [one for one in members if one.device < 0]
+            spare = min(one.spare for one in servos or members)
+            fast = self.fast[group] and len(indices) > 1
+            patient = tuple(state_read(self._line, members, more, fast=fast) for more in range(1 + spare))
+            short = patient  # a device is never awaited for long
+            if servos:
+                less_ns = TIMEOUT_MARGIN_NS - SHORT_TIMEOUT_MARGIN_NS
+                short = tuple(structs.replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
+            request = self._made[indices] = Request(group, indices, patient, short)
+        return request
+
+    def _choose_length(self, group: int, requests: Sequence[Request]) -> None:
+        """Read a group in the length whose owed replies are the oldest, best in one that has none.
+
+        One length for all: three silent servos of a group would otherwise ask alike for ever.
+        """
+        count = max((len(one.patient) for one in requests), default=1)
+        first = self._shape[group]
+        self._shape[group] = min(
+            ((first + step) % count for step in range(count)),
+            key=lambda shape: self._owed.newest_ns(one.patient[shape % len(one.patient)] for one in requests),
+        )
+
+    def _program(self, queue: Sequence[Request]) -> Program | None:
+        """Return the reads of a calm cycle for the kernel.
+
+        None where a servo reports more than an alert, or where a late reply to a request between the cycles
+        may look like a state: the parser reads then.
+        """
+        reads = [
+            PlannedRead(
+                self._in_length(one.patient, one.group),
+                one.indices,
+                tuple(self.errors[index] for index in one.indices),
+            )
+            for one in queue
+        ]
+        if any(self._owed.free_ns(one.transaction, any_age=True) for one in reads):
+            return None
+        refusals = 0xFF & ~self._line.dialect.ALERT if self._line.dialect.ALERT else 0
+        if any(error & refusals for read in reads for error in read.errors):
+            return None
+        key = tuple((read.transaction.packet, read.errors) for read in reads)
+        if key not in self._programs:
+            if len(self._programs) >= MOST_PROGRAMS:
+                self._programs.clear()
+            self._programs[key] = Program(self._plan, reads)
+        return self._programs[key]
+
+    def _in_length(self, reads: Sequence[Transaction], group: int) -> Transaction:
+        return reads[self._shape[group] % len(reads)]
+
+    # Reading by the parser
+
+    def begin(self, done: int = 0) -> None:
+        """Begin the parser's part of a cycle, behind the reads that the kernel has done."""
+        if not done:
+            self.samples.clear()
+        self.begun = self._patient = True
+        self._position = done
+
+    def advance(self, reply: Reply | None) -> Transaction | None:
+        """Take what came of a read, return the next one."""
+        queue = self.cycle.queue
+        if reply is not None:
+            if reply.outcome is not Outcome.OK:
+                self._count_loss(queue[self._position], reply.outcome)
+            self._position += 1
+        if self._position == len(queue):
+            return None
+        request = queue[self._position]
+        # the first silence of a cycle has cost its timeout: the others keep their time
+        patient = self._patient and not self.missed[request.indices[0]]
+        return self._in_length(request.patient if patient else request.short, request.group)
+
+    def status(self, index: int, reply: Reply) -> None:
+        """Keep the state of one servo of the current read."""
+        servo = self.cycle.queue[self._position].indices[index]
+        self.samples.take(servo, reply.parameters, reply.last_ns)
+        self.errors[servo] = reply.error
+
+    def _count_loss(self, request: Request, outcome: Outcome) -> None:
+        self._patient = False
+        self._lossy.add(request.group)
+        if request.patient[0].fast:
+            self._broken[request.group] += 1
+            if self._broken[request.group] == MOST_BROKEN:
+                self.given_up.append(request.group)
+        garbled = outcome is not Outcome.TIMEOUT
+        for servo in request.indices:
+            if not self.samples.arrived(servo):
+                self.garbled[servo] = garbled
+                garbled = False  # the bytes are those of the first one; nothing is known of those behind it
+
+
+def _reads(group: Sequence[int], silent: Sequence[bool]) -> list[tuple[int, ...]]:
+    """Group responsive servos into one read; read each unresponsive servo separately."""
+    together = tuple(index for index in group if not silent[index])
+    alone: list[tuple[int, ...]] = [(index,) for index in group if silent[index]]
+    return [together, *alone] if together else alone

@@ -1,0 +1,180 @@
+"""Owed replies: the requests of one line that timed out and whose replies may still arrive.
+
+A status packet carries neither an address nor a sequence number, so a late reply looks like the reply to the
+next request for as many bytes. This is the one rule about that, for cycle, idle time, start-up and tools: a
+status counts only while no reply of its ID and length is owed to another request. A request therefore asks
+for a few bytes more, or is held back, until no such reply is owed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from dxlwire.transaction import BROADCAST_ID, Awaited, Transaction
+
+LEAST_WINDOW_NS = 750_000_000
+"""A reply is owed for at least this time after its request [i]: stalled machines, virtual machines and USB
+adapters delay replies by up to 600 ms."""
+MOST_WINDOW_NS = 1_500_000_000  # Bounds the wait on a line whose replies were seen even later
+SLOW_MEMORY_NS = 60_000_000_000  # A stall such as that of a suspended machine ends; longer waits end with it
+MOST_OWED = 8  # So many late replies to the same repeated request are recognized
+
+Question = int | bytes
+"""Identifies what a request asks for: the address of a read, else the instruction packet."""
+
+
+class _Entry:
+    """The unanswered repetitions of one request to one servo."""
+
+    __slots__ = ("count", "first_ns", "last_ns", "length", "question")
+
+    def __init__(self, length: int, question: Question, sent_ns: int) -> None:
+        self.length = length
+        self.question = question
+        self.count = 0
+        self.first_ns = self.last_ns = sent_ns
+
+
+class _Change(NamedTuple):
+    """The newest instruction to one servo that may have changed registers."""
+
+    packet: bytes
+    first_ns: int  # Start of the first of its repetitions
+    last_ns: int
+
+
+class OwedReplies:
+    """Replies that may still arrive on one line, by servo ID and number of parameter bytes.
+
+    Replies of a fast form have the broadcast ID, and the size of their one packet as length.
+    """
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        """`now_ns` returns the time of the run's clock."""
+        self._now_ns = now_ns
+        self.version = 0  # Increases with each reply that becomes owed
+        self._entries: dict[int, list[_Entry]] = {}
+        self._changes: dict[int, _Change] = {}
+        self._slowest_ns = 0
+        self._slowest_at_ns = 0
+
+    @property
+    def window_ns(self) -> int:
+        """Time after its request for which a reply is owed: more than the slowest reply took lately."""
+        if self._slowest_ns and self._now_ns() - self._slowest_at_ns > SLOW_MEMORY_NS:
+            self._slowest_ns = 0
+        return min(max(LEAST_WINDOW_NS, self._slowest_ns * 5 // 4), MOST_WINDOW_NS)
+
+    def add(self, transaction: Transaction, index: int, sent_ns: int) -> None:
+        """Note that the reply at `index` of a transaction did not arrive in time."""
+        servo_id, length, question = _shapes(transaction)[index]
+        entries = self._entries.setdefault(servo_id, [])
+        entries[:] = [one for one in entries if one.last_ns + self.window_ns > sent_ns]
+        entry = next((one for one in entries if (one.length, one.question) == (length, question)), None)
+        if entry is None:
+            entry = _Entry(length, question, sent_ns)
+            entries.append(entry)
+        entry.count = min(entry.count + 1, MOST_OWED)
+        entry.last_ns = sent_ns
+        self.version += 1
+
+    def settle(self, servo_id: int, length: int, error: int) -> bool:
+        """Charge a status that arrived to the oldest reply that it may be; return whether one was owed."""
+        entries = self._entries.get(servo_id, [])
+        found = next((one for one in entries if one.length == length), None)
+        if found is None:
+            # a refusal has no data, whatever was asked: which request it answers stays open
+            return bool(entries) and length == 0 and error != 0
+        now_ns, window_ns = self._now_ns(), self.window_ns
+        if self._slowest_ns <= (late_ns := now_ns - found.last_ns) < window_ns:
+            self._slowest_ns, self._slowest_at_ns = late_ns, now_ns
+        found.count -= 1
+        if not found.count:
+            entries.remove(found)
+        return True
+
+    def note_answer(self, transaction: Transaction, awaited: Awaited, sent_ns: int) -> None:
+        """Note that a request was answered: a reply that an older one was owed is owed to this one now."""
+        servo_id, length, question = _shape(transaction, awaited)
+        for one in self._entries.get(servo_id, ()):
+            if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns:
+                one.last_ns = sent_ns
+
+    def note_change(self, transaction: Transaction, sent_ns: int) -> None:
+        """Note an instruction that may change registers: older reads are invalid from now on."""
+        before, first_ns = self._changes.get(transaction.servo_id), sent_ns
+        if before is not None and before.packet == transaction.packet:
+            # a retry changes nothing; later the servo may have changed the register itself, as by a reboot
+            first_ns = before.first_ns if sent_ns - before.last_ns < self.window_ns else sent_ns
+        self._changes[transaction.servo_id] = _Change(transaction.packet, first_ns, sent_ns)
+
+    def free_ns(self, transaction: Transaction, *, any_age: bool = False) -> int:
+        """Return when each reply to a transaction will be unambiguous; 0: it is now."""
+        window_ns, free_ns = self.window_ns, 0
+        for servo_id, length, question in _shapes(transaction):
+            for one in self._entries.get(servo_id, ()):
+                if one.length == length and not self._same(servo_id, one, question, any_age=any_age):
+                    free_ns = max(free_ns, one.last_ns + window_ns)
+        return free_ns if free_ns and free_ns > self._now_ns() else 0
+
+    def confuses(self, transaction: Transaction, awaited: Awaited, *, refusal: bool, any_age: bool) -> bool:
+        """Check whether a status that fits an awaited one may be the late reply to another request.
+
+        A refusal has no data, whatever was asked.
+        """
+        servo_id, length, question = _shape(transaction, awaited)
+        if not (entries := self._entries.get(servo_id)):
+            return False
+        now_ns, window_ns = self._now_ns(), self.window_ns
+        return any(
+            (refusal or one.length == length)
+            and one.last_ns + window_ns > now_ns
+            and not self._same(servo_id, one, question, any_age=any_age)
+            for one in entries
+        )
+
+    def asked_ns(self, transaction: Transaction, sent_ns: int) -> int:
+        """Return when the oldest request was sent that the reply to a transaction may answer.
+
+        A late reply to an earlier repetition counts as the reply to this one.
+        """
+        times = [
+            one.first_ns
+            for servo_id, length, question in _shapes(transaction)
+            for one in self._entries.get(servo_id, ())
+            if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns
+        ]
+        return min([sent_ns, *times])
+
+    def newest_ns(self, transactions: Iterable[Transaction]) -> int:
+        """Return when the newest request was sent whose late reply would fit a transaction; 0: none."""
+        times = [
+            one.last_ns
+            for transaction in transactions
+            for servo_id, length, _ in _shapes(transaction)
+            for one in self._entries.get(servo_id, ())
+            if one.length == length
+        ]
+        return max(times, default=0)
+
+    def _same(self, servo_id: int, one: _Entry, question: Question, *, any_age: bool) -> bool:
+        """Check whether a late reply would answer the question as well as a new one.
+
+        `any_age`: also after a write, which makes older readings of registers wrong, but not measured states.
+        """
+        if one.question != question:
+            return False
+        changes = (self._changes.get(each) for each in (servo_id, BROADCAST_ID))
+        return any_age or all(change is None or one.first_ns >= change.first_ns for change in changes)
+
+
+def _shape(transaction: Transaction, awaited: Awaited) -> tuple[int, int, Question]:
+    question = awaited.address if awaited.address >= 0 else transaction.packet
+    return awaited.servo_id, awaited.length, question
+
+
+def _shapes(transaction: Transaction) -> Sequence[tuple[int, int, Question]]:
+    if transaction.fast:
+        return [(BROADCAST_ID, transaction.widest, transaction.packet)]
+    return [_shape(transaction, one) for one in transaction.awaited]

@@ -1,0 +1,82 @@
+"""Devices: which bytes of a device are read each cycle, by how many reads, and where its commands stand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from dxlwire.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
+from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+from dxlwire.plan.line import MOST_SPARE, Line
+
+HIGHEST_FLOAT32 = 3.4028234663852886e38
+MOST_BYTES = 120  # The longest block of one read: a device has a small buffer [i]
+
+
+def device_blocks(
+    line: Line, table: DeviceTable, states: Mapping[str, DeviceItem], first_column: int
+) -> tuple[DeviceBlock, ...]:
+    """Return the reads that get the items of all states in the shortest time, in the order of addresses.
+
+    Bytes between two items are read with them where that is quicker than a read of its own, and where they
+    belong to items. `states`: item of each state, by name, in the order of their columns.
+    """
+    columns = {name: first_column + index for index, name in enumerate(states)}
+    wanted = sorted(states.items(), key=lambda pair: pair[1].address)
+    runs: list[list[tuple[str, DeviceItem]]] = []
+    for name, item in wanted:
+        last = runs[-1] if runs else None
+        if last is not None and _together(line, table, [one for _, one in last], item):
+            last.append((name, item))
+        else:
+            runs.append([(name, item)])
+    return tuple(_block(table, run, columns) for run in runs)
+
+
+def device_command(name: str, item: DeviceItem, column: int) -> DeviceCommand:
+    """Return a command by its item."""
+    most = HIGHEST_FLOAT32 * abs(item.scale)
+    ends = (item.offset - most, item.offset + most)
+    if item.encoding != "float32":
+        values = [tick * item.scale + item.offset for tick in (item.minimum, item.maximum)]
+        ends = (min(values), max(values))
+    return DeviceCommand(
+        name=name,
+        item=item.name,
+        address=item.address,
+        size=item.size,
+        encoding=item.encoding,
+        scale=item.scale,
+        offset=item.offset,
+        lowest=ends[0],
+        highest=ends[1],
+        column=column,
+        safe=None if item.safe is None else item.safe * item.scale + item.offset,
+    )
+
+
+def _together(line: Line, table: DeviceTable, run: Sequence[DeviceItem], item: DeviceItem) -> bool:
+    """Check whether one more item is read with those before it, or by a read of its own."""
+    start, end = run[0].address, max(one.address + one.size for one in run)
+    upto = max(end, item.address + item.size)
+    if upto - start > MOST_BYTES or not table.readable(end, item.address):
+        return False
+    alone = line.read(0, start, end - start).due_ns + line.read(0, item.address, item.size).due_ns
+    return line.read(0, start, upto - start).due_ns <= alone + line.latency_ns
+
+
+def _block(
+    table: DeviceTable, run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]
+) -> DeviceBlock:
+    start = run[0][1].address
+    end = max(item.address + item.size for _, item in run)
+    fields = tuple(
+        DeviceField(
+            state=name,
+            place=Field(item.address - start, item.size, item.encoding, item.bit),
+            scale=item.scale,
+            offset=item.offset,
+            column=columns[name],
+        )
+        for name, item in run
+    )
+    return DeviceBlock(start, end - start, fields, table.spare(end, MOST_SPARE))

@@ -1,0 +1,284 @@
+"""Modes of a model: what selects each, which goals it follows, and in which units; from its control table.
+
+Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320). Protocol
+1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual MX-28,
+CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106. The effort of a position
+is limited by Goal Current (102) in a mode of its own, or in Protocol 1.0 in joint mode by Torque Limit (34)
+(e-Manual AX-12A, Torque Limit (34)): the fraction of the maximum, and never 0, which shows a shutdown.
+
+In wheel mode an AX, RX, DX, EX or XL-320 takes Moving Speed (32) for a fraction of full output and controls
+no speed (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the no-load
+speed, which a loaded servo does not reach [i].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+from msgspec.structs import replace
+
+from dxlwire.bus_plan import (
+    Field,
+    GoalLayout,
+    ModePlan,
+    OwnLimit,
+    RegisterValue,
+    Scale,
+    ServoPlan,
+)
+from dxlwire.control_table import ControlItem, ControlTable
+from dxlwire.modes import Mode
+
+_CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
+"""Operating Mode (11)"""
+_WHEEL, _JOINT = 1, 2  # Control Mode (11) of the XL-320
+_EXTENDED_TURNS = 256
+"""Reach of extended position control to either side (e-Manual XM430-W350, Goal Position (116): 1,048,575)."""
+_MULTI_TURN_TICKS = 28_672
+"""Reach of multi-turn mode to either side (e-Manual MX-28, Goal Position (30))."""
+_FULL = 1023
+"""Moving Speed (32) at full output in wheel mode, and the most of Goal Torque (71), without the direction."""
+_ADDRESS_OF_P = 512
+"""Torque Enable stands there on P and PRO(A), which have no current-based position control."""
+
+
+LACKS: Mapping[Mode, str] = MappingProxyType(
+    {
+        Mode.POSITION: "has no mode that counts turns, so no position of a continuous joint",
+        Mode.VELOCITY: "has no mode that turns at a speed",
+        Mode.EFFORT: "has no mode that follows a torque or a current",
+        Mode.PWM: "has no mode that follows a PWM",
+        Mode.EFFORT_POSITION: "has no position control with a limit of the effort",
+    }
+)
+"""Why a model cannot be in a mode."""
+
+
+def position_reach(table: ControlTable, continuous: bool) -> tuple[int, int]:
+    """Return the lowest and highest goal position, ticks; of a `continuous` joint over many turns."""
+    if continuous and _EXTENDED in operating_modes(table):
+        turns = round(_EXTENDED_TURNS * math.tau / table.rad_per_tick) - 1
+        return -turns, turns
+    if continuous and "multi_turn_offset" in table.items:
+        return -_MULTI_TURN_TICKS, _MULTI_TURN_TICKS
+    return table.min_tick, table.max_tick
+
+
+def mode_plans(
+    table: ControlTable, lower_tick: int, upper_tick: int, continuous: bool
+) -> tuple[ModePlan, ...]:
+    """Return the modes in which a model can be.
+
+    `lower_tick`, `upper_tick`: what the joint's limits allow as a goal position, within `position_reach`. A
+    model that cannot count turns has no position control for a `continuous` joint.
+    """
+    ends = (lower_tick, upper_tick)
+    if "operating_mode" in table.items:
+        return tuple(_by_operating_mode(table, ends, continuous))
+    return tuple(_by_angle_limits(table, ends, continuous))
+
+
+def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
+    """Return the mode that a servo's registers select, UNKNOWN where the plan has none for them.
+
+    Where two modes are selected alike, as velocity and PWM in wheel mode, that of the start goes first.
+    """
+    for plan in sorted(servo.modes, key=lambda plan: plan.mode != servo.start_mode):
+        if in_mode(plan, found):
+            return plan.mode
+    return Mode.UNKNOWN
+
+
+def model_modes(table: ControlTable, continuous: bool) -> tuple[Mode, ...]:
+    """Return the modes that a model has."""
+    return tuple(plan.mode for plan in mode_plans(table, table.min_tick, table.max_tick, continuous))
+
+
+def controls_speed(table: ControlTable) -> bool:
+    """Check whether a model keeps a speed that it is given; in wheel mode only MX do."""
+    return "operating_mode" in table.items or "resolution_divider" in table.items
+
+
+def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
+    """Check whether registers, by name, select a mode; any angle limits in their order are joint mode.
+
+    In no order are those of a servo whose mode was half changed: one was written, and the other was not.
+    """
+    values = {register.name: register.value for register in wanted.operating}
+    low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
+    if any(found.get(name) != value for name, value in values.items()):
+        return False
+    if low is not None and low != high:
+        return found.get("cw_angle_limit", 0) < found.get("ccw_angle_limit", 0)
+    return low is None or found.get("cw_angle_limit") == found.get("ccw_angle_limit") == low
+
+
+def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
+    """Return where a servo keeps the limits beyond which it refuses a goal, in ticks of the goal."""
+    places: list[tuple[Literal["speed", "effort", "pwm"], str]] = [
+        ("speed", "velocity_limit"),
+        ("effort", "current_limit"),
+        ("pwm", "pwm_limit"),
+    ]
+    if limits_torque(table) or "goal_torque" in table.items:
+        places.append(("effort", "max_torque" if "max_torque" in table.items else "torque_limit"))
+    return tuple(
+        OwnLimit(of, item.name, item.address, item.size)
+        for of, name in places
+        if (item := table.items.get(name)) is not None
+    )
+
+
+def limits_torque(table: ControlTable) -> bool:
+    """Check whether Torque Limit (34) limits the effort of positions: Protocol 1.0."""
+    return table.protocol == 1.0 and "torque_limit" in table.items
+
+
+def position_layout(table: ControlTable) -> GoalLayout:
+    """Return the block of goal position and, when it stands beside it, of the speed toward it."""
+    position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
+    start = min(position.address, speed.address)
+    if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
+        return GoalLayout(position.address, position.size, position=field(position, position.address))
+    length = position.size + speed.size
+    return GoalLayout(start, length, position=field(position, start), speed=field(speed, start))
+
+
+def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
+    """Return the modes of a model with Operating Mode (e-Manual, section of that name, by model)."""
+    items, listed = table.items, operating_modes(table)
+    effort = "goal_current" if "goal_current" in items else "goal_torque"  # PRO; it counts current as well
+    current = _scale(table, effort, _effort_of_ampere(table))
+    to_goal = Scale(table.rad_s_per_tick, table.max_speed_tick)
+    plain = ModePlan(Mode.UNKNOWN, (), (), *ends, table.rad_s_per_tick)
+    found: list[ModePlan] = []
+
+    def add(number: int, change: ModePlan) -> None:
+        found.append(replace(change, operating=(_value(table, "operating_mode", number),)))
+
+    position = replace(plain, mode=Mode.POSITION, goals=(position_layout(table),), speed=to_goal)
+    limited = position
+    if _CURRENT_BASED in listed:
+        # the effort first: a position without its limit would be pursued with the limit of before
+        goals = (_alone(items[effort], "effort"), *position.goals)
+        limited = replace(position, goals=goals, effort=current)
+    if not continuous and _POSITION in listed:
+        add(_POSITION, position)
+    elif not continuous:
+        add(_CURRENT_BASED, limited)
+    elif _EXTENDED in listed:
+        add(_EXTENDED, position)
+    if _VELOCITY in listed:
+        layout, speed = _alone(items["goal_velocity"], "speed"), _scale(table, "goal_velocity")
+        add(_VELOCITY, replace(plain, mode=Mode.VELOCITY, goals=(layout,), speed=speed))
+    if _CURRENT in listed:
+        layout = _alone(items[effort], "effort")
+        add(_CURRENT, replace(plain, mode=Mode.EFFORT, goals=(layout,), effort=current))
+        if _CURRENT_BASED in listed and not continuous:
+            add(_CURRENT_BASED, replace(limited, mode=Mode.EFFORT_POSITION))
+    if _PWM in listed:
+        layout, scale = _alone(items["goal_pwm"], "pwm"), _scale(table, "goal_pwm")
+        add(_PWM, replace(plain, mode=Mode.PWM, goals=(layout,), pwm=scale))
+    return found
+
+
+def operating_modes(table: ControlTable) -> tuple[int, ...]:
+    """Return the values of Operating Mode that a model knows, if it has one (e-Manual, by model)."""
+    item = table.items.get("operating_mode")
+    if item is None:
+        return ()
+    ends = {
+        (_VELOCITY, _POSITION): (_VELOCITY, _POSITION),  # L42-10-S300-R
+        (_CURRENT, _POSITION): (_CURRENT, _VELOCITY, _POSITION),  # Y
+        (_CURRENT, _EXTENDED): (_CURRENT, _VELOCITY, _POSITION, _EXTENDED),  # PRO
+        (_CURRENT, _CURRENT_BASED): (_CURRENT, _CURRENT_BASED),  # RH-P12-RN, RH-P12-RN(A)
+    }
+    if (listed := ends.get((item.minimum, item.maximum))) is not None:
+        return listed
+    if table.items["torque_enable"].address == _ADDRESS_OF_P:
+        return _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _PWM
+    if "goal_current" in table.items:
+        return _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM
+    return _VELOCITY, _POSITION, _EXTENDED, _PWM
+
+
+def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
+    """Return the modes of a model whose angle limits, or Control Mode, choose between joint and wheel."""
+    items = table.items
+    many = continuous and "multi_turn_offset" in items
+    controlled = controls_speed(table)
+    wheel_unit = table.rad_s_per_tick if controlled else table.max_speed / _FULL
+    plain = ModePlan(Mode.UNKNOWN, (), (), *ends, table.rad_s_per_tick)
+    wheel = replace(plain, operating=_selected(table, (0, 0)), present_rad_s_per_tick=wheel_unit)
+    found: list[ModePlan] = []
+    if many or not continuous:
+        limits = (table.max_tick, table.max_tick) if many else ends
+        to_goal, layout = Scale(table.rad_s_per_tick, table.max_speed_tick), position_layout(table)
+        if many:
+            # turns below 0 are in two's complement (e-Manual MX-28, Goal Position (30), Multi-turn Mode)
+            layout = replace(layout, position=replace(layout.leading, encoding="twos_complement"))
+        goals = (layout,)
+        joint = replace(plain, mode=Mode.POSITION, operating=_selected(table, limits), goals=goals)
+        found.append(replace(joint, speed=to_goal))
+        if limits_torque(table) and not many:
+            limit = (_alone(items["torque_limit"], "effort"), *goals)
+            limited = replace(found[0], mode=Mode.EFFORT_POSITION, goals=limit)
+            found.append(replace(limited, effort=Scale(1 / _FULL, _FULL)))
+    goals = (_alone(items["moving_speed"], "speed"),)
+    speed = Scale(wheel_unit, table.max_speed_tick)
+    found.append(replace(wheel, mode=Mode.VELOCITY, goals=goals, speed=speed))
+    if not controlled:
+        goals = (_alone(items["moving_speed"], "pwm"),)
+        found.append(replace(wheel, mode=Mode.PWM, goals=goals, pwm=Scale(1 / _FULL, _FULL)))
+    if "goal_torque" in items:
+        enabled = (_value(table, "torque_ctrl_mode_enable", 1),)
+        goals, torque = (_alone(items["goal_torque"], "effort"),), Scale(1 / _FULL, _FULL)
+        found.append(replace(plain, mode=Mode.EFFORT, operating=enabled, goals=goals, effort=torque))
+    return found
+
+
+def _selected(table: ControlTable, limits: tuple[int, int]) -> tuple[RegisterValue, ...]:
+    """Return what chooses joint mode within limits, or wheel mode: both 0."""
+    if "control_mode" in table.items:
+        return (_value(table, "control_mode", _JOINT if any(limits) else _WHEEL),)
+    chosen = [
+        _value(table, name, limit)
+        for name, limit in zip(("cw_angle_limit", "ccw_angle_limit"), limits, strict=True)
+    ]
+    if "torque_ctrl_mode_enable" in table.items:
+        chosen.append(_value(table, "torque_ctrl_mode_enable", 0))
+    return tuple(chosen)
+
+
+def _effort_of_ampere(table: ControlTable) -> float:
+    scale = table.items[table.effort_item].scale
+    return table.effort_per_tick / scale if table.effort_item == "present_current" else 1.0
+
+
+def _alone(item: ControlItem, of: Literal["speed", "effort", "pwm"]) -> GoalLayout:
+    place = field(item, item.address)
+    return GoalLayout(
+        item.address,
+        item.size,
+        speed=place if of == "speed" else None,
+        effort=place if of == "effort" else None,
+        pwm=place if of == "pwm" else None,
+    )
+
+
+def _scale(table: ControlTable, name: str, factor: float = 1.0) -> Scale | None:
+    item = table.items.get(name)
+    return None if item is None else Scale(item.scale * factor, item.maximum)
+
+
+def _value(table: ControlTable, name: str, value: int) -> RegisterValue:
+    item = table.items[name]
+    return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
+
+
+def field(item: ControlItem, start: int) -> Field:
+    """Return where an item stands in a block that begins at an address."""
+    return Field(item.address - start, item.size, item.encoding)

@@ -1,0 +1,154 @@
+"""Reads: what is read together on a bus, and by which instructions; the cheapest way is taken.
+
+One instruction saves its own bytes and an adapter's latency for each servo that it asks beside the first one,
+and a fast form saves seven bytes of each reply and the return delays of all but the first (protocol.md, Time
+budget). Indirect addresses are no way: of each model in the control tables the state stands in one block
+without a byte between its items, so there is nothing that they could leave out.
+
+Devices answer behind the servos of their read, so that one that is silent leaves the servos' replies as they
+are; of a device with several blocks each is in another read, as no instruction names an ID twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence, Set
+from types import MappingProxyType
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from dxlwire.bus_plan import Budget, Member, ServoPlan
+from dxlwire.control_table import ControlTable
+from dxlwire.plan.line import TIMEOUT_MARGIN_NS, Line
+from dxlwire.transaction import Transaction
+
+CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
+"""Protocol -> the capability by which several servos of one layout answer one instruction in turn."""
+TEMPERATURES = ("present_temperature", "present_motor_temperature")
+VOLTAGES = ("present_voltage", "present_input_voltage")  # Names of the item in the control tables
+TOGETHER = "bulk_read"  # The capability by which servos of different layouts do
+FAST = "fast_sync_read"  # The capability by which they answer with one status packet
+
+
+class Reads(NamedTuple):
+    """Which servos and devices of a bus are read together, and how."""
+
+    groups: tuple[tuple[int, ...], ...]  # Indices of members; a group of one is read by itself
+    fast: tuple[bool, ...]  # Which groups are to be read by a fast form
+    chosen: tuple[Transaction, ...]  # The read of each group in that form
+    plain: tuple[Transaction, ...]  # The read of each group in the form that every firmware knows
+
+
+def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:
+    """Return the one read of several members, servos first, each `more` bytes longer where it has as many.
+
+    Its devices are awaited for a moment only, once the servos have answered.
+    """
+    read = line.read_many(
+        [(one.servo_id, one.address, one.length + min(more, one.spare)) for one in members], fast=fast
+    )
+    devices = sum(one.device >= 0 for one in members)
+    if not devices:
+        return read
+    brief_ns = read.timeout_ns - TIMEOUT_MARGIN_NS + line.device_margin_ns
+    timeout_ns = brief_ns if devices == len(members) else read.timeout_ns
+    return replace(
+        read,
+        timeout_ns=timeout_ns,
+        tail=devices,
+        tail_timeout_ns=brief_ns,
+        tail_margin_ns=line.device_margin_ns,
+    )
+
+
+def servo_read(line: Line, servo: ServoPlan) -> Transaction:
+    """Return the read of one servo's state."""
+    state = servo.state
+    return line.read(servo.servo_id, state.address, state.length, state.spare)
+
+
+def slow_items(table: ControlTable) -> tuple[str, ...]:
+    """Return the items that are read between the cycles where the robot file names none."""
+    return tuple(name for name in table.items if name in TEMPERATURES or name in VOLTAGES)
+
+
+def choose_reads(
+    line: Line, members: Sequence[Member], able: Sequence[Set[str]], goals: Sequence[bytes]
+) -> Reads:
+    """Return the cheapest way to read the servos and devices of a bus; of equal ones the simplest.
+
+    `able`: capabilities of each member; `goals`: the packets that are written each cycle. Raises ValueError
+    when they do not fit one instruction.
+    """
+
+    def laid(groups: Sequence[Sequence[int]], fast: Sequence[bool]) -> tuple[Transaction, ...]:
+        return tuple(
+            state_read(line, [members[index] for index in group], fast=form)
+            for group, form in zip(groups, fast, strict=True)
+        )
+
+    ways = [
+        Reads(groups, fast, laid(groups, fast), laid(groups, [False] * len(groups)))
+        for groups, fast in _partitions(line, members, able)
+    ]
+    receivable = [way for way in ways if all(read.widest <= line.dialect.LONGEST for read in way.chosen)]
+    return min(receivable, key=lambda way: read_budget(line, way.chosen, goals).total_ns)
+
+
+def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]) -> Budget:
+    """Return the cost of one cycle: a sync write has no reply, so no latency counts (protocol.md)."""
+    request_bytes = sum(len(read.packet) for read in reads) + sum(map(len, goals))
+    reply_bytes = delays = 0
+    for read in reads:
+        lengths = [one.length for one in read.awaited]
+        reply_bytes += read.widest if read.fast else sum(lengths) + line.dialect.OVERHEAD * len(lengths)
+        delays += 1 if read.fast else len(lengths)
+    return Budget(
+        request_bytes=request_bytes,
+        reply_bytes=reply_bytes,
+        wire_ns=line.wire_ns(request_bytes + reply_bytes),
+        return_delay_ns=delays * line.return_delay_ns,
+        latency_ns=len(reads) * line.latency_ns,
+        goal_bytes=sum(map(len, goals)),
+    )
+
+
+def _partitions(
+    line: Line, members: Sequence[Member], able: Sequence[Set[str]]
+) -> list[tuple[tuple[tuple[int, ...], ...], tuple[bool, ...]]]:
+    """Return what could be read together, and which groups by a fast form; the simplest first."""
+    chain = CHAIN[line.dialect.PROTOCOL]
+    alone: list[Hashable] = list(range(len(members)))
+    alike: list[Hashable] = [
+        (one.address, one.length, one.spare, one.block) if chain in able[index] else index
+        for index, one in enumerate(members)
+    ]
+    together: list[Hashable] = [
+        (TOGETHER, one.block) if TOGETHER in able[index] else alike[index]
+        for index, one in enumerate(members)
+    ]
+    found = []
+    for keys in (alone, alike, together):
+        groups = _grouped(keys)
+        found.append((groups, tuple(False for _ in groups)))
+    for keys in (alike, together):
+        groups = _grouped([(key, FAST in able[index]) for index, key in enumerate(keys)])
+        found.append((groups, tuple(len(group) > 1 and FAST in able[group[0]] for group in groups)))
+    return found
+
+
+def _grouped(keys: Sequence[Hashable]) -> tuple[tuple[int, ...], ...]:
+    groups: dict[Hashable, list[int]] = {}
+    for index, key in enumerate(keys):
+        groups.setdefault(key, []).append(index)
+    return tuple(tuple(group) for group in groups.values())
+
+
+def read_by(protocol: float, members: Sequence[Member], reads: Reads) -> str:
+    """Return what the e-Manual calls the instructions of reads: `fast sync read + read`."""
+    names: dict[str, None] = {}
+    for group, fast in zip(reads.groups, reads.fast, strict=True):
+        blocks = {(members[index].address, members[index].length) for index in group}
+        many = "bulk read" if protocol == 1.0 or len(blocks) > 1 else "sync read"
+        names["read" if len(group) == 1 else f"fast {many}" if fast else many] = None
+    return " + ".join(names)

@@ -1,0 +1,99 @@
+"""Retries and longer timeouts of programs that have time: start-up, return, tools."""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec.structs import replace
+
+from dxlwire.bus_plan import BusPlan
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
+from dxlwire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlwire.wire.dialect import dialect_of
+
+ATTEMPTS = 3
+LONGER_NS = 240_000_000
+"""Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
+MOST_SILENCE_NS = 960_000_000
+"""Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
+
+
+class ReplyTimes(msgspec.Struct):
+    """Lateness of the replies on one bus, as `extend_timeouts` observes it."""
+
+    late_ns: list[int] = []
+    """Time after the one due by the wire, without that in which simulated servos had no processor; of each
+    reply that can answer one request only."""
+    missing: int = 0
+    """Requests without a reply before their extended timeout."""
+
+
+def setup_line(plan: BusPlan) -> Line:
+    """Return the line before the servos' return delays are known: the longest is assumed."""
+    delay_ns = max(plan.return_delay_ns, LONGEST_RETURN_DELAY_NS)
+    return Line(plan.baud_rate, plan.latency_ns, delay_ns, dialect_of(plan.protocol))
+
+
+def retry(transaction: Transaction) -> Program[Reply]:
+    """Repeat a transaction until it is answered, at most ATTEMPTS times; return the last reply."""
+    reply = yield transaction
+    for _ in range(ATTEMPTS - 1):
+        if reply.answered:
+            break
+        reply = yield transaction
+    return reply
+
+
+def pause(duration_ns: int) -> Program[None]:
+    """Let a moment pass, and take what still comes."""
+    yield listen(duration_ns)
+
+
+def limit_patience(
+    program: Program[Result], patience_ns: int = 0, *, any_age: bool = False
+) -> Program[Result]:
+    """Run a program whose transactions are not held back for late replies for longer than a time, ns.
+
+    Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request
+    is then charged to the older one, as replies come in the order of their requests. With `any_age` a reply
+    to an older read of the same registers counts instead: servos with armed watchdogs would stop during the
+    timeout of a reply that was charged.
+    """
+    try:
+        request = next(program)
+        while True:
+            reply = yield replace(
+                request, patience_ns=min(request.patience_ns, patience_ns), any_age=any_age or request.any_age
+            )
+            request = program.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
+
+
+def extend_timeouts(
+    program: Program[Result], most_ns: int = LONGER_NS, times: ReplyTimes | None = None
+) -> Program[Result]:
+    """Run a program of one bus with longer timeouts, as long as few replies are lost.
+
+    A servo that answers late costs what it takes; a bus without any servo is reported within about two
+    seconds. `times` collects how late replies came.
+    """
+    left_ns = MOST_SILENCE_NS
+    try:
+        request = next(program)
+        while True:
+            longer_ns = min(most_ns, left_ns) if request.awaited else 0
+            reply = (
+                yield replace(request, timeout_ns=request.timeout_ns + longer_ns) if longer_ns else request
+            )
+            certain = reply.answered and reply.asked_ns == reply.sent_ns
+            if times is not None and request.awaited and certain:
+                times.late_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)
+            if times is not None and reply.outcome == Outcome.TIMEOUT:
+                times.missing += 1
+            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
+                left_ns -= longer_ns
+            request = program.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result

@@ -1,0 +1,99 @@
+"""Remedies for late and missing replies: what a person is asked to do, decided in one place.
+
+Start-up, the cycle, tools, the end of a run and the analysis of a log use it. A machine that was too busy
+comes first; of simulated servos no part is to be checked; a cause is named by direct evidence alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from dxlrun.errors import counted
+from dxlrun.plan.machine_load import MachineLoad
+from dxlwire.port.latency_timer import SYSTEM, fix, is_simulated, is_timer, latency_timer
+
+CHECK = "check its cable and power"
+INJECTED = "look at the faults that were injected into the simulation"
+_IDLE = MachineLoad()
+
+
+def choose_remedy(port: str, hardware: str, *, simulated: str = INJECTED, load: MachineLoad = _IDLE) -> str:
+    """Return the remedy for late or missing replies on a bus, imperative and without its full stop.
+
+    Args:
+        port: The bus' port, as in the robot file.
+        hardware: Remedy where servos are real and the machine was idle, such as "check its cable and power".
+        simulated: Remedy where they are simulated and the machine was idle.
+        load: Load of the machine at that time, as far as it is known.
+
+    Example:
+        >>> choose_remedy("sim", "check its cable and power")
+        'look at the faults that were injected into the simulation'
+    """
+    if load.too_busy:
+        return free_machine((port,))
+    return simulated if is_simulated(port) else hardware
+
+
+def free_machine(ports: Iterable[str]) -> str:
+    """Return the remedy for a machine that was too busy for a robot with these ports, as `choose_remedy`."""
+    virtual = ", or use --virtual" if any(map(is_simulated, ports)) else ""
+    return f"end other programs{virtual}"
+
+
+def late_replies(
+    bus: str, port: str, extra_ns: float, planned_ns: float, load: MachineLoad = _IDLE
+) -> tuple[str, str]:
+    """Return a sentence about replies that usually come later than planned, and what shortens that.
+
+    Both are without their full stops; the second is empty where nothing is known. What looks like the latency
+    timer of an FTDI adapter as it is shipped is named, unless the bus is simulated or the machine was too
+    busy.
+
+    Args:
+        bus: Name of the bus.
+        port: Its port, as in the robot file.
+        extra_ns: Time by which replies come later than wire and return delay need.
+        planned_ns: Time that was planned for the adapter.
+        load: Load of the machine at that time, as far as it is known.
+    """
+    observed = (
+        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and "
+        f"{planned_ns / 1e6:g} ms were planned for the adapter"
+    )
+    if load.too_busy:
+        return observed, choose_remedy(port, "", load=load)
+    if not is_timer(extra_ns) or is_simulated(port):
+        return observed, ""
+    name = Path(port).name
+    device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
+    command = fix(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
+    return f"{observed}: that is a latency timer of 16 ms", f"`{command}` shortens it"
+
+
+def describe_late_start(
+    bus: str, port: str, late_ns: Sequence[int], planned_ns: int, system: Path = SYSTEM
+) -> str:
+    """Return the sentence about late replies at the start, without its full stop.
+
+    It reports what was observed. The adapter's latency timer is named where the kernel shows that it is
+    longer than planned.
+
+    Args:
+        bus: Name of the bus.
+        port: Its port, as in the robot file.
+        late_ns: Time by which each reply came later than wire and return delay need.
+        planned_ns: Time that was planned for the adapter.
+        system: Where the kernel shows its devices, for tests.
+    """
+    late = [each for each in late_ns if each > planned_ns]
+    total, most_ms = counted(len(late_ns), "reply", "replies"), max(late, default=0) / 1e6
+    observed = (
+        f"{len(late)} of {total} on bus {bus} came up to {most_ms:.0f} ms later than the wire needs, and "
+        f"{planned_ns / 1e6:g} ms were planned for the adapter"
+    )
+    timer = None if is_simulated(port) else latency_timer(port, system)
+    if timer is None or timer.found_ms * 1_000_000 <= planned_ns:
+        return observed
+    return f"{observed}; its latency timer is {timer.found_ms} ms: `{timer.fix}` shortens it"

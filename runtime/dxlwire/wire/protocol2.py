@@ -1,0 +1,297 @@
+"""Protocol 2.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
+
+Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". Instruction `FF FF FD 00 ID LENL LENH INST P.. CRCL CRCH`;
+a status is one with INST 55 and the error byte before its parameters. LEN counts everything behind itself.
+From INST to the last parameter `FF FF FD` goes over the line as `FF FF FD FD` (byte stuffing). The CRC covers
+everything before it, stuffing included: CRC-16 of polynomial 8005, not reflected, from 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from enum import IntEnum, unique
+
+from fastcrc import crc16
+
+from dxlwire.transaction import BROADCAST_ID, Status
+
+Bytes = bytes | bytearray | memoryview
+
+PROTOCOL = 2.0
+HEADER = b"\xff\xff\xfd\x00"
+OVERHEAD = 11  # Bytes of a status packet beside its parameters, without stuffing
+LONGEST = 2048
+"""Bytes of the longest packet that a receiver waits for; a header that announces more is a false one.
+
+The protocol allows 65,542. No servo answers with more than a control table (about 1,000 bytes), or 140
+servos' states in a fast form, and a false header may not hold the line back for longer.
+"""
+CHECKSUM = 2  # Bytes of the CRC, the last ones of a packet
+ID_AT = 4  # Where a packet has its ID, of the servo that is addressed or answers
+HIGHEST_ID = 0xFC
+PING_LENGTH = 3  # Parameters of the answer to a ping: model number (2), firmware version (1)
+MOST_GOAL_BYTES = 1024
+"""Parameters of a sync write behind address and length: stuffed, they still fit a batch of the log."""
+STATUS = 0x55
+ALERT = 0x80  # Bit of the error byte: read `ControlTable.errors`; it comes with good data
+_MOST_PARAMETERS = 0xFFFF - 3
+_PATTERN = b"\xff\xff\xfd"
+_STUFFED = b"\xff\xff\xfd\xfd"
+_BACKUP = b"\x43\x54\x52\x4c"
+
+
+@unique
+class Instruction(IntEnum):
+    """What a host can ask (e-Manual, "Instruction")."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    CONTROL_TABLE_BACKUP = 0x20
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+@unique
+class ErrorNumber(IntEnum):
+    """Bits 0..6 of the error byte: why the servo did not do what the instruction asked."""
+
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    RANGE = 4
+    LENGTH = 5
+    LIMIT = 6
+    ACCESS = 7
+
+
+@unique
+class Reset(IntEnum):
+    """What a factory reset keeps."""
+
+    ALL = 0xFF
+    KEEP_ID = 0x01
+    KEEP_ID_AND_BAUD_RATE = 0x02
+
+
+_NUMBERS: Mapping[int, str] = {
+    ErrorNumber.RESULT_FAIL: "result fail: the servo could not do what the instruction asks",
+    ErrorNumber.INSTRUCTION: "instruction error: an undefined instruction, or action without reg write",
+    ErrorNumber.CRC: "CRC error: the CRC of the instruction packet was wrong",
+    ErrorNumber.RANGE: "data range error: a written value is out of the range of the control table",
+    ErrorNumber.LENGTH: "data length error: fewer bytes than the item has",
+    ErrorNumber.LIMIT: "data limit error: a written value is beyond a limit that the servo is set to",
+    ErrorNumber.ACCESS: "access error: the address cannot be written or read, or EEPROM while torque is on",
+}
+
+
+def describe_error(error: int) -> str:
+    """Return the e-Manual's words for an error byte; `no error` for 0."""
+    words = []
+    if error & ALERT:
+        words.append("alert: the servo has a hardware error")
+    if number := error & ~ALERT:
+        words.append(_NUMBERS.get(number, f"error number {number}, which Protocol 2.0 does not define"))
+    return "; ".join(words) or "no error"
+
+
+def refused(error: int, length: int, awaited: int) -> bool:
+    """Check whether a status of `length` parameters, where `awaited` were due, is a refusal.
+
+    An error number is one; an error reply to a read has no data. The alert bit alone is not.
+    """
+    return error & ~ALERT != 0 and length in (0, awaited)
+
+
+def crc(data: Bytes) -> int:
+    """Return the CRC over a packet without its last two bytes (e-Manual, "CRC Calculation")."""
+    return crc16.umts(data)
+
+
+def stuffed(body: bytes) -> bytes:
+    """Return the bytes from INST to the last parameter as they go over the line."""
+    return body.replace(_PATTERN, _STUFFED)
+
+
+def unstuffed(body: bytes) -> bytes:
+    """Return the bytes from INST to the last parameter without stuffing; the inverse of `stuffed`."""
+    return body.replace(_STUFFED, _PATTERN)
+
+
+def widest(length: int) -> int:
+    """Return the most bytes that a status of `length` parameters has on the line: each third one stuffed."""
+    return OVERHEAD + length + (length + 2) // 3
+
+
+def size_at(buffer: Bytes, start: int, end: int) -> int:
+    """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 a false header."""
+    known = end - start
+    if known > 4 and buffer[start + 4] in (0xFD, 0xFF):
+        return -1
+    if known < 7:
+        return 0
+    length = buffer[start + 5] | buffer[start + 6] << 8
+    return length + 7 if 3 <= length <= LONGEST - 7 else -1
+
+
+def intact(packet: memoryview) -> bool:
+    """Check whether the CRC of a whole packet is right."""
+    return crc16.umts(packet[:-2]) == packet[-2] | packet[-1] << 8
+
+
+def opened(packet: memoryview) -> Status | None:
+    """Take an intact packet apart; None when it is no status, as an echoed instruction is.
+
+    The status of a fast form (from the broadcast ID) is not stuffed: `fast_answers` reads its parameters.
+    """
+    if packet[7] != STATUS or len(packet) < OVERHEAD:
+        return None
+    body = bytes(packet[7:-2])
+    if packet[4] != BROADCAST_ID:
+        body = unstuffed(body)
+    return Status(packet[4], body[1], body[2:])
+
+
+def instructs(packet: memoryview) -> bool:
+    """Check whether an intact packet is a host's instruction: any but a status."""
+    return packet[7] != STATUS
+
+
+def fast_size(length: int, count: int) -> int:
+    """Return the bytes of the one status of a fast form: `length` bytes of data of `count` servos.
+
+    Each part has an error byte, an ID and a CRC beside its data (e-Manual, "Fast Sync Read (0x8A)").
+    """
+    return 8 + length + 4 * count
+
+
+def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
+    """Return the servos' parts of the status of a fast form, in their order.
+
+    `lengths`: bytes of data of each servo, as they were asked for. Each part's CRC covers everything since
+    the first FF; the list ends before the first part that is cut off or whose CRC is wrong, so what came
+    before an absent servo can still be used. Raises ValueError when it is no status of a fast form.
+    """
+    data = bytes(packet)
+    if len(data) < 8 or data[:4] != HEADER or data[4] != BROADCAST_ID or data[7] != STATUS:
+        raise ValueError(f"no status of a fast form: {data.hex(' ')}")
+    found: list[Status] = []
+    start = 8
+    for length in lengths:
+        end = start + 2 + length
+        if len(data) < end + 2 or _tail(data[:end]) != data[end : end + 2]:
+            break
+        found.append(Status(data[start + 1], data[start], data[start + 2 : end]))
+        start = end + 2
+    return found
+
+
+def _tail(data: bytes) -> bytes:
+    return crc16.umts(data).to_bytes(2, "little")
+
+
+def _packet(address: int, body: bytes) -> bytes:
+    if len(body) > _MOST_PARAMETERS + 1:
+        raise ValueError(f"{len(body) - 1} parameter bytes do not fit one packet, {_MOST_PARAMETERS} do")
+    data = HEADER + bytes((address,)) + _word(len(body) + 2) + body
+    return data + _tail(data)
+
+
+def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """Return any instruction packet.
+
+    Raises ValueError when `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
+    """
+    if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
+        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
+    return _packet(servo_id, stuffed(bytes((instruction,)) + parameters))
+
+
+def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
+    """Return the status packet that a servo would send; raises ValueError when the parameters do not fit."""
+    return _packet(servo_id, stuffed(bytes((STATUS, error)) + parameters))
+
+
+def ping(servo_id: int = BROADCAST_ID) -> bytes:
+    """Return the packet that asks for model number and firmware version."""
+    return instruction_packet(servo_id, Instruction.PING)
+
+
+def read(servo_id: int, address: int, length: int) -> bytes:
+    """Return the packet that asks for `length` bytes of the control table from `address` on."""
+    return instruction_packet(servo_id, Instruction.READ, _word(address) + _word(length))
+
+
+def write(servo_id: int, address: int, data: bytes) -> bytes:
+    """Return the packet that writes `data` into the control table from `address` on."""
+    return instruction_packet(servo_id, Instruction.WRITE, _word(address) + data)
+
+
+def factory_reset(servo_id: int, what: Reset) -> bytes:
+    """Return the packet that sets the control table to its factory values."""
+    return instruction_packet(servo_id, Instruction.FACTORY_RESET, bytes((what,)))
+
+
+def reboot(servo_id: int) -> bytes:
+    """Return the packet that restarts the servo; RAM returns to its defaults."""
+    return instruction_packet(servo_id, Instruction.REBOOT)
+
+
+def back_up(servo_id: int) -> bytes:
+    """Return the packet that stores the control table in the servo's backup; refused while torque is on."""
+    return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x01" + _BACKUP)
+
+
+def restore(servo_id: int) -> bytes:
+    """Return the packet that takes the EEPROM back from the backup; the servo reboots after it."""
+    return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x02" + _BACKUP)
+
+
+def sync_read(address: int, length: int, servo_ids: Iterable[int], *, fast: bool = False) -> bytes:
+    """Return the packet that asks servos for the same bytes; `fast`: answered by one status of all."""
+    instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    parameters = _word(address) + _word(length) + bytes(servo_ids)
+    return instruction_packet(BROADCAST_ID, instruction, parameters)
+
+
+def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -> bytes:
+    """Return the packet that asks servos for different bytes, each as (ID, address, length)."""
+    instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
+    parameters = b"".join(
+        bytes((servo_id,)) + _word(address) + _word(length) for servo_id, address, length in requests
+    )
+    return instruction_packet(BROADCAST_ID, instruction, parameters)
+
+
+def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
+    """Return the one packet that asks several servos, each by (ID, address, length); they answer in turn."""
+    _, address, length = requests[0]
+    if all(request[1:] == (address, length) for request in requests):
+        return sync_read(address, length, (servo_id for servo_id, _, _ in requests), fast=fast)
+    return bulk_read(requests, fast=fast)
+
+
+def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
+    """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
+
+    Raises ValueError when a servo's data is not `length` bytes long.
+    """
+    for servo_id, chunk in data.items():
+        if len(chunk) != length:
+            raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes where {length} are announced")
+    records = b"".join(bytes((servo_id,)) + chunk for servo_id, chunk in data.items())
+    parameters = _word(address) + _word(length) + records
+    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, parameters)
+
+
+def _word(value: int) -> bytes:
+    return value.to_bytes(2, "little")

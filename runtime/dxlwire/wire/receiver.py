@@ -1,0 +1,138 @@
+"""Receiver: bytes of one serial line in, intact packets of its protocol out; finds its way through noise.
+
+One preallocated buffer, no growth. Each byte leaves it exactly once: inside an intact packet, or as noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dxlwire.port.ports import Port
+from dxlwire.wire.dialect import Dialect
+
+Taker = Callable[[memoryview, int, int], None]
+"""Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
+
+The view is only good during the call.
+"""
+
+_GOOD_READ = 765  # Bytes that one read may bring beside an unfinished packet
+
+
+class Receiver:
+    """Takes packets out of a stream; decides on a header only when its whole packet is there.
+
+    A false header in noise can announce up to the protocol's longest packet and so hold back what follows
+    it; `flush` ends that when a deadline has passed.
+    """
+
+    def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
+        header = dialect.HEADER
+        self._header = header
+        self._beginnings = tuple(header[:count] for count in range(len(header) - 1, 0, -1))
+        self._size_at = dialect.size_at
+        self._intact = dialect.intact
+        self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
+        self._view = memoryview(self._buffer)
+        self.pending = 0  # Number of bytes that are neither packet nor noise yet
+        self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
+        self._times: list[int] = []
+        self._packet = packet
+        self._noise = noise
+
+    def read_from(self, port: Port, now_ns: Callable[[], int]) -> int:
+        """Take what the port has, deliver what became whole; return the number of bytes taken.
+
+        Raises PortError when the adapter is gone.
+        """
+        count = port.read_into(self._view[self.pending :] if self.pending else self._view)
+        if count:
+            self._accept(count, now_ns())
+        return count
+
+    def feed(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that arrived at `now_ns`, deliver what became whole."""
+        start = 0
+        while start < len(data):
+            chunk = data[start : start + min(_GOOD_READ, len(self._view) - self.pending)]
+            self._view[self.pending : self.pending + len(chunk)] = chunk
+            start += len(chunk)
+            self._accept(len(chunk), now_ns)
+
+    def skip_header(self) -> None:
+        """Give up the header that is being waited for, as false; what follows it gets its chance."""
+        if self.pending:
+            self._forget(self._scan(1))
+
+    def flush(self) -> None:
+        """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
+        while self.pending:
+            if self._buffer.startswith(self._header, 0, self.pending):
+                self._forget(self._scan(1))
+            else:
+                self._emit(self._noise, 0, self.pending)
+                self._forget(self.pending)
+
+    def _accept(self, count: int, at_ns: int) -> None:
+        self.pending += count
+        self._ends.append(self.pending)
+        self._times.append(at_ns)
+        self._forget(self._scan(0))
+
+    def _emit(self, taker: Taker, start: int, stop: int) -> None:
+        times = self._times
+        if len(times) == 1:
+            taker(self._view[start:stop], times[0], times[0])
+            return
+        ends = self._ends
+        first = next(i for i, end in enumerate(ends) if end > start)
+        last = next(i for i, end in enumerate(ends) if end >= stop)
+        taker(self._view[start:stop], times[first], times[last])
+
+    def _scan(self, search: int) -> int:
+        """Deliver what is whole, looking for headers from `search` on; return the start of what is not."""
+        buffer, end = self._buffer, self.pending
+        done = 0  # everything before it was delivered
+        while True:
+            start = buffer.find(self._header, search, end)
+            if start < 0:
+                start = self._beginning(search)
+                break
+            size = self._size_at(buffer, start, end)
+            stop = start + size
+            if size < 0:
+                search = start + 1
+                continue
+            if size == 0 or stop > end:
+                break
+            if not self._intact(self._view[start:stop]):
+                search = start + 1
+                continue
+            if start > done:
+                self._emit(self._noise, done, start)
+            self._emit(self._packet, start, stop)
+            done = search = stop
+        if start > done:
+            self._emit(self._noise, done, start)
+        return start
+
+    def _beginning(self, search: int) -> int:
+        """Return where the last bytes may be the beginning of a header; their end when they cannot."""
+        for beginning in self._beginnings:
+            if self._buffer.endswith(beginning, search, self.pending):
+                return self.pending - len(beginning)
+        return self.pending
+
+    def _forget(self, count: int) -> None:
+        if count == self.pending:
+            self.pending = 0
+            self._ends.clear()
+            self._times.clear()
+        elif count:
+            rest = self.pending - count
+            self._buffer[:rest] = self._buffer[count : self.pending]
+            while self._ends[0] <= count:
+                del self._ends[0], self._times[0]
+            for i, end in enumerate(self._ends):
+                self._ends[i] = end - count
+            self.pending = rest
