@@ -169,6 +169,35 @@ def test_no_folder_of_the_package_is_crowded() -> None:
     assert len(rooms) > 20
 
 
+def described_by(folder: Path) -> str:
+    """Return the docstring of a package; of another folder its README, or the nearest one above it."""
+    if (folder / "__init__.py").exists():
+        return ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
+    above = [folder, *folder.parents[: len(folder.relative_to(ROOT).parts) - 2]]
+    return next((path.read_text() for one in above if (path := one / "README.md").exists()), "")
+
+
+def test_each_folder_says_what_belongs_there_and_what_does_not() -> None:
+    """The first sentence says what belongs there, and the second what does not, or where it is."""
+    made = {"__pycache__", "build", "node_modules", "logs"}
+    files = [path.relative_to(ROOT) for base in ("runtime", "plugins") for path in (ROOT / base).rglob("*.*")]
+    files = [path for path in files if path.suffix != ".so" and not made & set(path.parts)]
+    folders = {
+        folder for path in files for folder in path.parents if folder.parts and (ROOT / path).is_file()
+    }
+    texts = {folder: described_by(ROOT / folder) for folder in sorted(folders)}
+    sentences = {str(folder): len(re.findall(r"\.(?=\s|$)", text)) for folder, text in texts.items()}
+    assert [name for name, count in sentences.items() if count < 2] == []
+    assert len(sentences) > 70
+
+
+def test_the_readmes_of_both_levels_name_every_package() -> None:
+    for base in (RUNTIME, ROOT / "plugins"):
+        named = set(re.findall(r"`(\w+)`", (base / "README.md").read_text()))
+        packages = {one.name for one in base.iterdir() if one.is_dir() and any(one.rglob("*.py"))}
+        assert packages - named == set()
+
+
 def imports() -> dict[str, set[str]]:
     """Return which of our modules each module imports: also in functions, and for type checking only."""
     modules: dict[str, Path] = {}

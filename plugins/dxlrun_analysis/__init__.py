@@ -1,1 +1,5 @@
-"""Analysis of a log: latency, traffic, tracking; numbers, and a verdict in words."""
+"""Analysis of logs: figures, a verdict with its reasons, and tables of what happened in a run.
+
+Each folder is one subject: cycles, servos, joints, causes, conduct, and what is made of them. Reading a log
+is not here but in the core (`dxlrun.log`); experiments that produce logs are in `dxlrun_lab`.
+"""

@@ -1,1 +1,5 @@
-"""The standard controllers of dxlrun."""
+"""Standard controllers of dxlrun, and its standard sensors.
+
+They import the public package `dxlrun` alone, like the plug-in of any author. Limits of joints are not theirs
+to keep: the gate of the loop does that.
+"""

@@ -1,1 +1,4 @@
-"""A running robot in Foxglove, Lichtblick, and what else speaks their protocol."""
+"""Server for Foxglove and Lichtblick: a running robot over their WebSocket protocol.
+
+Logs need no server, because both programs open MCAP files.
+"""

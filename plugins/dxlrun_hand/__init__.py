@@ -1,1 +1,4 @@
-"""By hand: servos that get their addresses, joints that are measured, motions that are shown to the robot."""
+"""Work at the robot, by hand: set servos up, calibrate joints, teach motions.
+
+Each is a dialogue that asks before it writes. Commands without a dialogue belong in the core's `cli/tools`.
+"""

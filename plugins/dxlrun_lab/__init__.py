@@ -1,1 +1,4 @@
-"""Experiments: measure the machine, the loop and the servos; one package an experiment."""
+"""Experiments: measurements of the machine, the loop and the servos, one package each.
+
+Statistics of any log belong in `dxlrun_analysis`.
+"""

@@ -1,4 +1,5 @@
 """Dynamixel servos on their serial lines: control tables, packets, ports, and the exchange of a cycle.
 
-It knows nothing of robots, of logs or of YAML.
+It is a library below the runtime and knows nothing of robots, logs or YAML. What a robot makes of servos
+belongs in `dxlrun.dynamixel`.
 """

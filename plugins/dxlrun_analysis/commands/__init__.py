@@ -1,1 +1,4 @@
-"""Commands for logs: what they say, what they become."""
+"""Commands that read logs: `analyze`, `export`, `logs`.
+
+They parse options and print. What they print is computed in the other packages.
+"""

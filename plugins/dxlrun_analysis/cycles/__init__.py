@@ -1,1 +1,4 @@
-"""The cycles of a log: when they began, how long their steps took, why they were late."""
+"""Cycles of a log: wake-up times, durations of their steps, the worst of them.
+
+Why a cycle was late belongs in `causes`.
+"""

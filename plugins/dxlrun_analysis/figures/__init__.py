@@ -1,1 +1,4 @@
-"""Figures by matplotlib, as SVG, for the pages of experiments."""
+"""Static figures for the pages of experiments, drawn by matplotlib as SVG.
+
+Interactive plots of a run's report belong in `page`.
+"""

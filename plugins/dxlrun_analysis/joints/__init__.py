@@ -1,1 +1,4 @@
-"""Joints in a log: how they followed what was sent."""
+"""Joints of a log: tracking error, delay, movement, health, and goals that they missed.
+
+Servos and their packets belong in `servos`.
+"""

@@ -1,1 +1,4 @@
-"""What a measurement of latency says: its log, its statistics, its page."""
+"""Evaluation of a latency measurement: statistics, tables, page.
+
+The measurement itself is in `dxlrun_lab.latency`.
+"""

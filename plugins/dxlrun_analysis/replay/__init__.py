@@ -1,4 +1,7 @@
-"""Replay: the controllers of a log run again on the inputs in it, and must command the same."""
+"""Replay: the controllers of a log, run again on its inputs, and a comparison of their commands.
+
+Playing a recorded motion on a robot is not a replay and belongs in `playback`.
+"""
 
 from dxlrun_analysis.replay.changes import Setting
 from dxlrun_analysis.replay.comparison import JointDifferences

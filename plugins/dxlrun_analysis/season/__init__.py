@@ -1,1 +1,4 @@
-"""Two logs and many: what differs between runs, and the logs of a season as tables."""
+"""Many logs: the runs of a season as tables, in a folder or an object store, and queries on them.
+
+The analysis of one log belongs in the packages next to this one.
+"""

@@ -1,1 +1,4 @@
-"""Laws: what controllers compute, on arrays of joints, without a robot."""
+"""Control laws as functions of arrays: PID, splines, odometry, gravity, learning, orientation filter.
+
+A law knows neither robots nor controllers. Parameters, commands and messages belong to the controllers.
+"""

@@ -1,1 +1,4 @@
-"""Controllers that turn what devices and sensors measure into states, messages and decisions."""
+"""Controllers that turn states of devices and sensors into messages, states and decisions.
+
+Drivers that produce these states belong in `sensors`.
+"""

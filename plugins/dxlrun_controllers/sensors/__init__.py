@@ -1,1 +1,4 @@
-"""The standard sensors, offered as any package offers some."""
+"""Standard sensors, each run in a process of its own.
+
+What controllers make of their samples belongs in `sensing`.
+"""

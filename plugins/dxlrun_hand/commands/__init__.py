@@ -1,1 +1,4 @@
-"""The commands with a dialogue at the terminal; each imports what it needs when it is used."""
+"""Commands with a dialogue at the terminal: `setup`, `calibrate`, `teach`.
+
+They parse options and start the dialogue, which the package above has.
+"""

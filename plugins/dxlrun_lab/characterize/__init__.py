@@ -1,1 +1,4 @@
-"""What a servo can do, measured: response, speed, dead band, the rate and the gaps between commands."""
+"""Characterization of a servo: response, speed, dead band, rates, and gaps between commands.
+
+A model of the servo, fitted to a run, belongs in `identify`.
+"""

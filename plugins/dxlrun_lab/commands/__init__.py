@@ -1,1 +1,4 @@
-"""Commands that measure (bench, latency, experiment, characterize, identify) or play a log again."""
+"""Commands that measure, or play a log: `bench`, `latency`, `characterize`, `identify` and others.
+
+They parse options and print. The procedures are in the package of each experiment.
+"""

@@ -1,1 +1,4 @@
-"""An experiment on a robot: a client of a run that plays tables of goals and gets back what was recorded."""
+"""Guided experiments: a client of a run that plays tables of goals and collects what was recorded.
+
+What is measured, and in which order, belongs in the package of the experiment.
+"""

@@ -1,1 +1,4 @@
-"""`dxlrun identify`: the model of a servo and its load from a run, with intervals, and its motor file."""
+"""Identification: the model of a servo and its load from a run, with confidence intervals, as a motor file.
+
+Single figures of a servo, measured without a model, belong in `characterize`.
+"""

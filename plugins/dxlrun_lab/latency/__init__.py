@@ -1,1 +1,4 @@
-"""The wake-up latency of this machine, measured as the loop waits: the thesis' rt_test, `dxlrun latency`."""
+"""Measurement of the machine's wake-up latency, with the wait of the loop (`rt_test` of the thesis).
+
+Its evaluation and page are in `dxlrun_analysis.latency`.
+"""

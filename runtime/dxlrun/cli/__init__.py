@@ -1,4 +1,7 @@
-"""The command line: parses, prints, returns exit codes; everything else is done by the rooms below."""
+"""Command line: parses words, calls a room below, prints the result, returns the exit code.
+
+Decisions belong in the rooms below. Importing this package loads neither numpy nor pydantic.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,5 @@
-"""What a plug-in sees: controllers, sensors, the hooks; and the hardware that the loop drives."""
+"""Contract: base classes of controllers and sensors, the hooks, and the interface of the loop's hardware.
+
+Implementations do not belong here: controllers are in plugins/dxlrun_controllers, the hardware is in
+`dynamixel`.
+"""

@@ -1,1 +1,4 @@
-"""Dynamixel: servos and devices on their buses, from bytes on the wire to states and goals of joints."""
+"""Dynamixel: the servos and devices of a robot, from states and goals of joints down to transactions.
+
+Packets, ports and control tables are a library of their own, `dxlwire`.
+"""

@@ -1,1 +1,4 @@
-"""The log: topics and messages, the writer and its process, the reader."""
+"""Log: topics and messages, the recorder's process, the writer, the reader.
+
+What a log means belongs in `dxlrun_analysis`.
+"""

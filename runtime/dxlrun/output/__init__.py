@@ -1,1 +1,4 @@
-"""Output: tables and lines as data, and what renders them for terminals, programs and HTML pages."""
+"""Output: tables, lines and graphs as data, and their form as text, JSON and HTML.
+
+Which rows a table has belongs in the room that knows them.
+"""

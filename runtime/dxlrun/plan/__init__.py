@@ -1,1 +1,5 @@
-"""Frozen records that leave the compiler: robot, buses, loop, policies, mechanics, simulation, recording."""
+"""Plan: frozen structs that leave the compiler, for loop, mechanics, policies and recording.
+
+They are data and have no logic. How a plan is made belongs in `compile`; the part of a bus is
+in `dxlwire`.
+"""

@@ -1,1 +1,4 @@
-"""Steering from outside: the gateway's process beside a run, and the client that talks to it."""
+"""Remote access: the gateway, a process next to the loop, and the Python client that talks to it.
+
+Commands at the terminal belong in `cli/steering`. Decisions of the loop belong in `control`.
+"""

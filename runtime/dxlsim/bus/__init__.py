@@ -1,1 +1,4 @@
-"""Bus: one simulated line and its adapter, what passes on it and when, and its ledger."""
+"""Bus: one simulated line and its adapter, the bytes on it and their times, and the ledger of them.
+
+What a servo answers belongs in `servo`.
+"""

@@ -1,1 +1,4 @@
-"""Simulated devices: what is on a simulated line and is no servo."""
+"""Simulated devices: units on a simulated line that are not servos.
+
+Their memory is that of servos (`registers`).
+"""

@@ -1,1 +1,4 @@
-"""Motion: motors, gains, loads and bodies of simulated servos."""
+"""Motion: motors, gains, loads and bodies of simulated servos.
+
+Instructions and registers do not belong here.
+"""

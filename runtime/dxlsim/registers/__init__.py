@@ -1,1 +1,4 @@
-"""Registers: the memory of a simulated servo or device, and which writes it refuses."""
+"""Registers: the memory of a simulated servo or device, and which writes it refuses.
+
+Names, addresses and units come from the control tables.
+"""

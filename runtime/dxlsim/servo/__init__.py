@@ -1,1 +1,4 @@
-"""Servo: instructions and protection of a simulated servo."""
+"""Servo: instructions and protection of a simulated servo.
+
+How its shaft moves belongs in `motion`.
+"""

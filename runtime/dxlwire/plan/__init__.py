@@ -1,1 +1,4 @@
-"""Plan: what each cycle sends and awaits on a bus, when it is due, what it costs."""
+"""Bus plan: transactions of each cycle, their due times and cost, and the retries at set-up.
+
+Executing a plan belongs in `exchange`.
+"""

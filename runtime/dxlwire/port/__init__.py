@@ -1,1 +1,4 @@
-"""Port: serial lines, opened, locked and opened again."""
+"""Serial ports: opened, locked, reopened, with the latency timer of their adapter.
+
+Packets do not belong here: a port carries bytes.
+"""

@@ -1,1 +1,4 @@
-"""Wire: packets of both protocols and bytes, without I/O."""
+"""Packets of both protocols as bytes, and the receiver that finds packets in noise.
+
+Nothing here does I/O or knows control tables.
+"""

@@ -1,4 +1,7 @@
-"""A running robot, or a log, on a page in the browser; what dxlrun finds here by its entry point."""
+"""Page in the browser that shows a running robot or a log, offered to dxlrun by its entry point.
+
+Its scripts are in `page/`, next to `src/`. Reports of a log belong in `dxlrun_analysis`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A controller for dxlrun that leads joints to their goals gently."""
+"""A controller for dxlrun that leads joints to their goals gently.
+
+It imports only the public package `dxlrun`.
+"""
 
 from dxlrun_easing.controller import Easing, PositionsCommand
 

@@ -1,4 +1,7 @@
-"""Phidget Spatial IMUs as sensors of dxlrun. Not tried on hardware."""
+"""Phidget Spatial IMUs as sensors of dxlrun. Not tried on hardware.
+
+Controllers that use their states are part of dxlrun: `imu_sensor_broadcaster`, `fall_reflex`.
+"""
 
 from dxlrun_phidget.spatial import PhidgetSpatial, PhidgetSpatialParameters
 

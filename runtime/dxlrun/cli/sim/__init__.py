@@ -1,1 +1,4 @@
-"""`dxlrun sim`: simulated servos for other programs."""
+"""`dxlrun sim`: simulated servos for other programs, on pseudo-terminals.
+
+The servos themselves are in `dxlsim`.
+"""

@@ -1,1 +1,4 @@
-"""Joints: bus, model, limits, registers and motors of each, checked and made ready."""
+"""Compilation of joints: bus, model, limits, registers and motor of each.
+
+What joints are used for (controllers, motions, policies) is compiled in the package above.
+"""

@@ -1,1 +1,4 @@
-"""Sensors: measure beside the buses, each in a process of its own, and never let the loop wait."""
+"""Sensors in a run: what plug-ins offer, samples in shared slots, and their states in the cycle's record.
+
+Devices on a servo bus are not sensors: they are read with the servos.
+"""

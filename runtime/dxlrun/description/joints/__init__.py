@@ -1,1 +1,4 @@
-"""Joints in a robot file, and what moves them: mechanics, servos, and motors by files of their own."""
+"""Forms of joints, groups, mechanics, servos and motor files.
+
+How a joint is moved on a bus is decided in `compile/joints`.
+"""

@@ -1,1 +1,4 @@
-"""What is on a bus and is no servo: checked at the start, read each cycle, lost and found, commanded."""
+"""Devices: units on a bus that are not servos: checked at start, read each cycle, commanded.
+
+Sensors with a line of their own belong in `control/sensors`.
+"""

@@ -1,1 +1,4 @@
-"""Mechanics: joints that need several servos, as one hardware of joints in front of the servos'."""
+"""Mechanics: joints that several servos move, as one hardware of joints in front of that of servos.
+
+Above this package only joints are known, below it only servos.
+"""

@@ -1,1 +1,4 @@
-"""Tools: scan a port, change one servo, back it up."""
+"""Tools on a port that no run uses: scan, change one servo, back it up.
+
+Options and tables of these commands belong in `cli/tools`.
+"""

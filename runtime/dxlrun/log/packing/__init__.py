@@ -1,1 +1,4 @@
-"""How records of a run become messages of a log, field by field."""
+"""Packing of a run's records as messages of the log, field by field.
+
+The schemas of these messages are in `log/schemas.py`.
+"""

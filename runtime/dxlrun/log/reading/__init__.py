@@ -1,1 +1,4 @@
-"""What lies between the bytes of a log and its reader: files, chunks, slices of a run, columns of topics."""
+"""Reading of a log below its reader: chunks, topics, slices of a run, columns.
+
+Files are opened by `log/reader.py`. What is computed from columns belongs to its caller.
+"""

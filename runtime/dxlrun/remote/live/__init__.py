@@ -1,1 +1,4 @@
-"""What a running robot shows: the states of its newest cycle, and streams of messages."""
+"""Live data of a running robot: states of its newest cycle, and streams of messages.
+
+Requests with a single reply belong in `requests`.
+"""

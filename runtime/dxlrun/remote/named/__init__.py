@@ -1,1 +1,4 @@
-"""What clients name: joints, their registers, commands of joints and devices, a controller's parameters."""
+"""Names in requests, looked up: joints, registers, commands, parameters of controllers.
+
+Routes and replies belong in `requests`.
+"""

@@ -1,1 +1,4 @@
-"""Beyond one computer: certificates, roles and one commander, connections, files of robots and requests."""
+"""Access from other computers: certificates, roles, one commander at a time, files of known robots.
+
+On the same computer a Unix socket is used, and nothing here.
+"""
