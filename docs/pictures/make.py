@@ -31,7 +31,7 @@ from PIL import Image, ImageChops  # comes with bokeh
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from drawn import cycle, fall, processes  # noqa: E402  # beside this file
+from drawn import cycle, fall, key, motion, processes  # noqa: E402  # beside this file
 from terminal import printed, terminal  # noqa: E402
 
 RUN = ("robots/bioloid_torso.yaml", "--play", "robots/motions/three_parts.yaml")
@@ -237,9 +237,10 @@ class Maker:
         printed((*RUN, "--virtual", "--duration", "3"), self.place)
         (self.into / "cycle.svg").write_text(cycle(self._log))
 
-    def processes(self) -> None:
-        """Draw the processes of a run."""
-        (self.into / "processes.svg").write_text(processes())
+    def drawings(self) -> None:
+        """Draw the processes of a run, and the two walks of architecture.md."""
+        for draw in (processes, motion, key):
+            (self.into / f"{draw.__name__}.svg").write_text(draw())
 
     @property
     def _log(self) -> Path:
@@ -307,7 +308,7 @@ MADE: dict[str, Callable[[Maker], None]] = {
     "lost": Maker.lost,
     "fall": Maker.fall,
     "cycle": Maker.cycle,
-    "processes": Maker.processes,
+    "drawings": Maker.drawings,
     "characterize": Maker.characterize,
     "arm_report": Maker.arm_report,
     "watch": Maker.watch,

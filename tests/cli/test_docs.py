@@ -28,6 +28,8 @@ from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
 from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.description.joints.joints import Joint
+from dxlrun.description.reading import read_robot
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Served
@@ -368,10 +370,11 @@ def test_a_name_that_a_file_lacks_is_noticed(tmp_path: Path) -> None:
 
 def test_architecture_md_has_every_room() -> None:
     page = PAGES["architecture.md"]
-    rooms = set(re.findall(r"`([\w/]+(?:/|\.py))`", page[page.index("## Rooms") : page.index("## The plan")]))
+    rooms = set(re.findall(r"`([\w/]+(?:/|\.py))`", page[page.index("## Rooms") :]))
     for root, folder in (("", "dxlsim/"), ("", "dxlwire/"), ("dxlrun", ""), ("dxlrun", "dynamixel/")):
-        entries = (ROOT / "runtime" / root / folder).iterdir()
-        names = {f"{folder}{one.name}" + "/" * one.is_dir() for one in entries if "__" not in one.name}
+        entries = [one for one in (ROOT / "runtime" / root / folder).iterdir() if "__" not in one.name]
+        entries = [one for one in entries if one.is_file() or any(one.rglob("*.py"))]
+        names = {f"{folder}{one.name}" + "/" * one.is_dir() for one in entries}
         assert {name for name in names if name.endswith((".py", "/"))} - rooms == set()
 
 
@@ -385,12 +388,12 @@ def test_architecture_md_names_what_the_code_has() -> None:
             assert re.search(rf"\b{word}\b", code), name
 
 
-def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Path) -> None:
+def test_architecture_md_its_motion_has_these_bytes_and_this_row(dxlrun: Dxlrun, tmp_path: Path) -> None:
     """The command goes the page's way, without the sockets: tests/cli/test_steer.py has those."""
     page = PAGES["architecture.md"]
     (line,) = commands("architecture.md")
     _, _, controller, kind, *words = shlex.split(line)
-    command, request, reply = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
+    command, request, reply, _ = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
     plan = plan_of(ROOT / "robots/bioloid_torso.yaml")
     preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
     (head,) = (one for one in plan.loop.controllers if one.name == controller)
@@ -398,7 +401,7 @@ def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Pat
     prepared = preparation.command(head, kind, body, units=True)
     assert (len(prepared.data), prepared.beyond) == (32, ())
     log = tmp_path / "torso.mcap"
-    robot = simulated_robot(ROOT / "robots/bioloid_torso.yaml", duration_s=2.5, log=log)
+    robot = simulated_robot(ROOT / "robots/bioloid_torso.yaml", duration_s=4.0, log=log)
     sent = Command(1, controller, kind, prepared.data, "a reader")
     robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(sent))
     robot.run()
@@ -417,6 +420,26 @@ def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Pat
     assert f"{cycle['velocity'][row]:.2f} rad/s" in page
     assert cycle["effort"][row] == -195 / 1023
     assert cycle["valid"][row]
+    report = dxlrun("analyze", str(log)).out
+    printed = [line.split() for line in report.splitlines()]
+    shown = [line.split() for line in page.splitlines() if line.startswith(("joint  ", "head_yaw_joint  "))]
+    assert len(shown) == 2
+    assert all(row in printed for row in shown)
+
+
+def test_architecture_md_its_key_becomes_these_bytes() -> None:
+    page = PAGES["architecture.md"]
+    packet = bytes.fromhex(re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE)[-1])
+    (entry,) = re.findall(
+        r"`elbow_flex: \{id: (\d+), model: \S+, registers: \{position_p_gain: (\d+)\}\}`", page
+    )
+    described = read_robot(ROOT / "robots/koch.yaml", {}).robot.joints["elbow_flex"]
+    assert isinstance(described, Joint)
+    assert (described.id, described.registers["position_p_gain"]) == tuple(map(int, entry))
+    robot = simulated_robot(ROOT / "robots/koch.yaml", duration_s=0.1)
+    robot.run()
+    written = [one.data for one in robot.ledger.entries if one.direction == "in"]
+    assert written.count(packet) == 1
 
 
 def test_failures_md_names_events_and_keys_that_exist() -> None:
