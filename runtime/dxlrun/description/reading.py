@@ -11,10 +11,10 @@ from msgspec.structs import replace
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks, refusal
 from dxlrun.description.including import KEY, Source, merged, read_sources
-from dxlrun.description.joints.groups import moved, with_groups
+from dxlrun.description.joints.groups import with_groups
 from dxlrun.description.joints.joints import misfits
 from dxlrun.description.mistakes.foreign import kind_of_data
-from dxlrun.description.mistakes.words import sections_meant
+from dxlrun.description.mistakes.words import misplaced_sections
 from dxlrun.description.problems import path_text, read_form
 from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem, told_once
@@ -57,14 +57,16 @@ def read_robot(
     declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = merged(source.grown(run.fill) for source in sources)
+    grown = replace(grown, problems=(*run.problems, *grown.problems))
     for replacement in replacements:
         grown = _with(grown, replacement)
-    grown = with_groups(_with_own_sections(grown))
+    _refuse_misplaced_sections(grown)
+    grown = with_groups(grown)
     wrong = [
         Problem(grown.marks.value(*at), what, fix) for at, what, fix in misfits(grown.data.get("joints"))
     ]
     data = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
-    grown = replace(grown, data=data, problems=(*run.problems, *grown.problems, *wrong))
+    grown = replace(grown, data=data, problems=(*grown.problems, *wrong))
     try:
         robot = read_form(grown, Robot)
     except InputError as error:
@@ -94,32 +96,15 @@ def _refuse_other_files(source: Source) -> None:
             raise refusal(marks.key(key), problem, fix.format(path=source.path))
 
 
-def _with_own_sections(grown: Grown) -> Grown:
-    """Return a document whose sections are at its top, by our names; where one was not, is a problem."""
+def _refuse_misplaced_sections(grown: Grown) -> None:
+    """Raise InputError for sections of another name or place: their contents stay unchecked."""
     own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
-    data, problems = dict(grown.data), [*grown.problems]
-    moves: dict[KeyPath, list[KeyPath]] = {}
-    said: set[str] = set()
-    for path, name, fix in sections_meant(Robot, own):
-        *above, key = path
-        inside = data[above[0]] if above else data
-        assert isinstance(inside, dict)  # noqa: S101 (it has the key)
-        value = inside[key]
-        if above:
-            data[above[0]] = {each: item for each, item in inside.items() if each != key}
-        else:
-            del data[key]
-        data[name] = value
-        moves[path] = [(name,)]
-        if fix not in said:
-            said.add(fix)
-            where = path_text(tuple(above))
-            problems.append(Problem(grown.marks.key(*path), f"{where} has an unknown key {key!r}", fix))
-    if not moves:
-        return grown
-    emptied = {key for path in moves if len(path) > 1 and not data.get(key := str(path[0]), True)}
-    data = {key: value for key, value in data.items() if key not in emptied or key in Robot.model_fields}
-    return replace(moved(grown, moves), data=data, problems=tuple(problems))
+    problems: dict[str, Problem] = {}
+    for path, fix in misplaced_sections(Robot, own):
+        what = f"{path_text(path[:-1])} has an unknown key {path[-1]!r}"
+        problems.setdefault(fix, Problem(grown.marks.key(*path), what, fix))
+    if problems:
+        raise InputError(_in_order([*grown.problems, *problems.values()]))
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:

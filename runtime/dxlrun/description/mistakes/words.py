@@ -236,34 +236,26 @@ class Context:
         return f"it belongs into `{where}`: write `{written}` there"
 
 
-def sections_meant(
+def misplaced_sections(
     root: type[BaseModel], data: Mapping[str, object]
-) -> Iterator[tuple[tuple[str, ...], str, str]]:
-    """Yield the sections of a file that have another name in it, or are not at its top.
-
-    Each as the path where it is, the name of the section, and how to fix it.
-    """
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the path of each section that has another name in a file, or is not at its top, and the fix."""
     context = Context(root, root, (), [*root.model_fields], [*data], {})
-    found = set(data)
     for key, value in data.items():
         inner = value if isinstance(value, dict) else {}
-        own = [name for name in inner if name in root.model_fields]
+        own = [name for name in inner if name in root.model_fields and name not in data]
         if key not in root.model_fields and len(own) > 1:
-            for name in own:
-                if name not in found:
-                    found.add(name)
-                    yield (key, name), name, f"take `{key}:` out, and write what is in it without indentation"
+            fix = f"take `{key}:` out, and write what is in it without indentation"
+            yield from (((key, name), fix) for name in own)
             continue
         for name in own if entries_of(root, key) is not None else ():
-            if name not in found and not may_be_entry(root, key, inner[name]):
-                found.add(name)
-                yield (key, name), name, f"`{name}` is a section of the file: write it without indentation"
+            if not may_be_entry(root, key, inner[name]):
+                yield (key, name), f"`{name}` is a section of the file: write it without indentation"
         meaning = None if key in root.model_fields else context.meaning(key)
         if meaning is None or not isinstance(value, dict | list) or section_of(root, value):
             continue
-        if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in found:
-            found.add(meaning.place[0])
-            yield (key,), meaning.place[0], f"it is called `{meaning.place[0]}` here: rename it"
+        if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in data:
+            yield (key,), f"it is called `{meaning.place[0]}` here: rename it"
 
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
