@@ -35,12 +35,8 @@ FOREIGN = [
     ("a.json", '{"controllers": {"bus": {}}, "motorgroups": {}, "motors": {}}', "a configuration of pypot"),
     ("a.urdf", '<?xml version="1.0"?>\n<robot name="x"/>', "a URDF, which describes a body and no servos"),
     ("a.urdf", '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="x"/>', "by `xacro a.urdf > a.urdf`"),
-    ("a.xml", '<mujoco model="x"/>', "a model of a simulator"),
     ("a.mtn", "type=motion\nversion=1.01\npage_begin\nname=march\n", "a motion file of RoboPlus"),
-    ("a.yaml", "[ control info ]\ncontrol_cycle = 8", "a .robot file of ROBOTIS-Framework"),
     ("a.yaml", "pan: {ID: 1, Return_Delay_Time: 0}\ntilt: {ID: 2}", "dynamixel_workbench"),
-    ("a.yaml", "rosbag2_bagfile_information: {version: 5}", "the index of a ROS 2 bag"),
-    ("a.yaml", "joint_limits: {pan: {max_velocity: 2.0}}", "joint limits of MoveIt"),
     ("a.py", "# pan and tilt\nimport numpy as np\n", "a program in Python"),
     (
         "a.bag",
@@ -48,7 +44,6 @@ FOREIGN = [
         "a ROS 1 bag; `rosbags-convert --src a.bag --dst a --dst-storage mcap`",
     ),
     ("a.db3", "SQLite format 3\0x", "a ROS 2 bag in SQLite"),
-    ("a.parquet", "PAR1", "a Parquet file"),
 ]
 
 

@@ -23,10 +23,6 @@ _MAGIC: Mapping[bytes, Kind] = {
     ),
     b"#ROSBAG V": ("this is a ROS 1 bag", _ROSBAGS),
     b"SQLite format 3\0": ("this is a ROS 2 bag in SQLite, or another data base", _ROSBAGS),
-    b"\x89HDF\r\n": ("this is a HDF5 file: data of another program", _DRAFT),
-    b"PAR1": ("this is a Parquet file: data, such as a data set of LeRobot", _DRAFT),
-    b"PK\x03\x04": ("this is a zip archive", "unpack it, and give the file that is meant"),
-    b"\x1f\x8b": ("this is a file compressed by gzip", "unpack it by `gunzip {path}`"),
 }
 LONGEST_MAGIC = max(map(len, _MAGIC))
 """Bytes that `kind_of_bytes` needs."""
@@ -54,19 +50,7 @@ _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
             "name it in a robot file: `model: {urdf: {name}}`; " + _DRAFT,
         ),
     ),
-    (
-        re.compile(r"\s*(<\?xml.*?\?>)?\s*(<!--.*?-->\s*)*<(mujoco|sdf)\b", re.S),
-        ("this is a model of a simulator, which describes a body and no servos", _DRAFT),
-    ),
     (re.compile(r"\s*<(\?xml|[A-Za-z])"), ("this is XML", f"give a robot file, which is YAML; {_DRAFT}")),
-    (
-        re.compile(r"\s*\[\s*(control|port|device) info\s*\]"),
-        ("this is a .robot file of ROBOTIS-Framework", _DRAFT),
-    ),
-    (
-        re.compile(r"(?:\s*[#;].*\n)*\s*(\[[\w. \"-]+\]\s*\n\s*[\w-]+\s*[=:]|[\w.-]+ *= *\S)"),
-        ("this is TOML, or an INI file", f"write a robot file, which is YAML: `key: value`; {_DRAFT}"),
-    ),
     (
         re.compile(
             r"(?:\s*#.*\n)*\s*(from [\w.]+ import |import [\w.]+\s*(as \w+)?\s*$|def \w+\(|\"\"\")", re.M
@@ -109,11 +93,6 @@ def _kinds(data: Mapping[str, object]) -> Iterator[Kind]:
         )
     elif not {"buses", "joints"} & data.keys() and _has_ros_type(data, 4):
         yield "this is a parameter file of ROS", f"{_DRAFT}; docs/how-to/ros2.md has how both work together"
-    if "rosbag2_bagfile_information" in data:
-        yield (
-            "this is the index of a ROS 2 bag",
-            "`dxlrun replay DIRECTORY --on ROBOT.yaml` plays its directory",
-        )
     if {"motorgroups", "motors"} <= data.keys():
         yield (
             "this is a configuration of pypot",
@@ -126,12 +105,8 @@ def _kinds(data: Mapping[str, object]) -> Iterator[Kind]:
             "this is a calibration of LeRobot",
             f"{_DRAFT}, and `dxlrun calibrate robot.yaml` measures its joints",
         )
-    if "codebase_version" in data and "features" in data:
-        yield "this is the description of a data set of LeRobot", _DRAFT
     if values and all("ID" in value for value in values):
         yield "this is a configuration of ROBOTIS' dynamixel_workbench", _DRAFT
-    if "joint_limits" in data:
-        yield "this has the joint limits of MoveIt", "write them into a robot file, as `limits` of each joint"
 
 
 def _has_key(value: object, key: str, levels: int) -> bool:
@@ -174,16 +149,10 @@ def _lerobot(data: Mapping[str, object]) -> str | None:
 _ROS_TYPE = re.compile(r"[a-z0-9_]+(?:/|::)([A-Z]\w*)")
 _ROS_TYPES: Mapping[str, str] = {
     "forward_command_controller": "joint_group_position_controller",
-    "multi_interface_forward_command_controller": "joint_group_position_controller",
     "gripper_action_controller": "gripper_controller",
-    "parallel_gripper_action_controller": "gripper_controller",
-    "gripper_command_controller": "gripper_controller",
-    "scaled_joint_trajectory_controller": "joint_trajectory_controller",
     "joint_state_controller": "joint_state_broadcaster",
     "joint_velocity_controller": "joint_group_velocity_controller",
     "joint_effort_controller": "joint_group_effort_controller",
-    "force_torque_sensor_broadcaster": "sensor_broadcaster",
-    "range_sensor_broadcaster": "sensor_broadcaster",
 }
 """Types of ros2_control and ros_control with another name than ours; theirs are written as ours are."""
 

@@ -22,8 +22,8 @@ _LIST_WITH_UNIT = re.compile(rf"([\[(])([^\[\](){{}}]*)[\])]\s*({_UNIT})(?=\s*(?
 _RANGE = re.compile(
     rf"[\[(]?\s*({_NUMBER})\s*({_UNIT})?\s*(?:,|;|\.\.+|to\b|\s)\s*({_NUMBER})\s*({_UNIT})?\s*[\])]?\s*({_UNIT})?"
 )
+_MISSING_COLON = re.compile(r"^ *[A-Za-z][\w-]*( )[{\[]")
 _BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
-_PLUS_MINUS = re.compile(rf"(?:±|\+/?-)\s*({_NUMBER})\s*({_UNIT})?")
 
 
 class _OpenQuoteError(Exception):
@@ -42,16 +42,12 @@ class _Bracket(NamedTuple):
 def explain_syntax(text: str, file: str) -> list[Problem]:
     """Return what is wrong with a text that is not YAML, as far as it is one of the mistakes known here."""
     lines = text.splitlines()
-    return [*_units_behind_lists(lines, file), *_wrong_signs(lines, file)] or _open_brackets(lines, file)
+    return [*_units_behind_lists(lines, file), *_missing_colons(lines, file)] or _open_brackets(lines, file)
 
 
 def list_text(text: str) -> str:
     """Return a range as a list: `[-90 deg, 90 deg]` for `-90..90 deg`; empty: the text is not a range."""
-    text = text.strip()
-    if match := _PLUS_MINUS.fullmatch(text):
-        unit = f" {_unit(match[2])}" if match[2] else ""
-        return f"[-{match[1]}{unit}, {match[1]}{unit}]"
-    match = _RANGE.fullmatch(text)
+    match = _RANGE.fullmatch(text.strip())
     if match is None:
         return ""
     unit = match[5] or match[4] or match[2]
@@ -79,23 +75,11 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
             )
 
 
-_SIGNS: tuple[tuple[re.Pattern[str], str, str], ...] = (
-    (
-        re.compile(r"[:,-] +(\()\s*[\w-]+: "),
-        "a mapping is not written in ( )",
-        "write { before it and } behind it",
-    ),
-    (re.compile(r"[{,][^{},]*(;) *[\w-]+:"), "a ; does not separate keys", "write a comma"),
-    (re.compile(r"^ *[A-Za-z][\w-]*( )[{\[]"), "a colon is missing before this", "write `key: value`"),
-)
-"""Signs that are written in place of others: where they are, what is wrong, and how to fix it."""
-
-
-def _wrong_signs(lines: list[str], file: str) -> Iterator[Problem]:
+def _missing_colons(lines: list[str], file: str) -> Iterator[Problem]:
     for number, line in enumerate(lines, 1):
-        for pattern, what, fix in _SIGNS:
-            if match := pattern.search(line.partition(" #")[0]):
-                yield Problem(Mark(file, number, match.start(1) + 1), what, fix)
+        if match := _MISSING_COLON.search(line):
+            mark = Mark(file, number, match.start(1) + 1)
+            yield Problem(mark, "a colon is missing before this", "write `key: value`")
 
 
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:

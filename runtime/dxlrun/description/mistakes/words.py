@@ -203,8 +203,6 @@ class Context:
             fix = f"{how}: `{word}: {rest}`"
         elif not self.path and isinstance(value, str) and value.startswith(("/dev/", "COM")):
             fix = f"it belongs to a bus: `buses: {{main: {{port: {value}, ...}}}}`"
-        elif key in ("unit", "units"):
-            fix = f"take it out: the unit is written at each value, such as 90 {_yaml(value)}"
         elif key == "name" and named:
             fix = named
         elif folded(key) in _REMARKS and not near(key, self.known):
@@ -357,21 +355,11 @@ def _rate(value: object, example: str) -> _Written:
     return (f"{1 / seconds:.6g}", "") if seconds > 0 else None
 
 
-def _simulated(value: object, example: str) -> _Written:
-    return ("sim", "") if value is True else (example, "")
-
-
-def _real_time(value: object, example: str) -> _Written:
-    return ("round_robin" if value is True else "other", "")
-
-
 _CONVERSIONS: Mapping[str, Callable[[object, str], _Written]] = {
     "direction": _direction,
     "inverted": _inverted,
     "drive_mode": _drive_mode,
     "pair": _pair,
     "period": _rate,
-    "simulated": _simulated,
-    "real_time": _real_time,
     "torque": _on_or_off,
 }
