@@ -202,7 +202,7 @@ def _without_output(tokens: Sequence[str]) -> list[str]:
     return [token for token in tokens if token not in ("--json", "--debug")]
 
 
-_OF_ROBOT = ("robot", "file", "robot-file", "config", "yaml", "input", "f", "c", "r", "i")
+_OF_ROBOT = ("robot", "file", "config", "f")
 """Options of other programs for what is written without one here."""
 
 
@@ -228,18 +228,8 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
     return ""
 
 
-_OPTION_WORDS = {
-    "duration": "time seconds timeout for t length",
-    "play": "motion motions animation",
-    "virtual": "sim simulate simulation dry-run fake",
-    "no-record": "no-log nolog norecord",
-    "output": "out o to",
-}
-"""Options of other programs, by ours."""
-
-
 def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequence[str]) -> str:
-    """Return a command line in which unknown options are what they stand for; empty: it is not known."""
+    """Return a command line with values in place of unknown options; empty: their place is not known."""
     known = error.argument_collection
     places = {place.name.lower() for place in known if place.field_info.is_positional}
     options = {name for each in known for name in each.names}
@@ -253,17 +243,9 @@ def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequ
         if option == name or option in options:
             words.append(f"{option}{sign}{value}")
             continue
-        if verbs.new_words(verb, option, ""):
-            if not sign and rest and rest[0][:1] != "-":
-                value = rest.pop(0)
-            words += verbs.new_words(verb, option, value)
-            continue
-        ours = next((f"--{our}" for our, theirs in _OPTION_WORDS.items() if name in theirs.split()), "")
-        if not sign and rest and rest[0][:1] != "-" and ours != "--virtual":
+        if not sign and rest and rest[0][:1] != "-":
             value = rest.pop(0)
-        if ours in options:
-            words += [ours, value] if value else [ours]
-        elif value and name in _OF_ROBOT:
+        if value and name in _OF_ROBOT:
             first.append(value)
         elif value and name in places:
             words.append(value)
@@ -299,9 +281,10 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
         long = [name for name in names if names[name].startswith("--")]
         letter = option.lstrip("-") if len(option.lstrip("-")) == 1 else ""
         short = [name for name in long if letter and name.startswith(letter)]
-        if new := verbs.new_words(error.command_chain or (), option, ""):
-            what = f"{option} is {new[0]} now"
-        elif meant := near(option.lstrip("-"), long) or short:
+        verb = " ".join(error.command_chain or ())
+        if new := verbs.RENAMED.get(verb, {}).get(option):
+            return f"{option} is {new} now; {fix}"
+        if meant := near(option.lstrip("-"), long) or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
     if line := _right_form(error, tokens):
         fix = f"write `{line}`"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
@@ -71,28 +71,21 @@ _PACKAGES = {
 
 
 _OTHER_WORDS = {
-    "": "run start launch exec execute go up robot",
-    "check": "validate lint verify test info",
-    "list": "ls ps status robots",
-    "stop": "kill quit exit end shutdown down",
-    "sim": "simulate simulator simulation emulate",
-    "scan": "ping discover find detect search ports probe",
-    "doctor": "diagnose troubleshoot env",
-    "analyze": "analyse report plot stats inspect",
-    "logs": "log history",
-    "watch": "monitor top state states",
-    "send": "move goto command cmd",
+    "": "run start launch",
+    "check": "validate lint",
+    "list": "ls ps status",
+    "stop": "kill",
+    "sim": "simulate",
+    "scan": "ping discover",
+    "analyze": "report plot",
+    "watch": "monitor top",
+    "send": "move",
     "torque on": "enable",
-    "torque off": "disable limp relax release",
+    "torque off": "disable relax",
     "set": "write",
     "get": "read",
-    "examples": "init new create example",
-    "plugins": "types controllers plugin",
-    "models": "servos model",
-    "parameters": "params param parameter",
-    "calibrate": "calibration home",
+    "examples": "init new",
     "teach": "record",
-    "help": "man usage",
 }
 """Words of other programs, by the verb of ours that does this; without one: `dxlrun ROBOT.yaml`."""
 
@@ -103,20 +96,14 @@ def verb_for(word: str) -> str | None:
 
 
 RENAMED: Mapping[str, Mapping[str, str]] = {
-    "foxglove": {"--port": "--listen :VALUE"},
-    "frames": {"--in": "--relative-to VALUE"},
-    "keys": {"--to": "--output VALUE"},
-    "servo": {"--keep": "--except VALUE"},
-    "teach": {"--speed": "--velocity VALUE"},
-    "view": {"--port": "--listen :VALUE"},
+    "foxglove": {"--port": "--listen :PORT"},
+    "frames": {"--in": "--relative-to"},
+    "keys": {"--to": "--output"},
+    "servo": {"--keep": "--except"},
+    "teach": {"--speed": "--velocity"},
+    "view": {"--port": "--listen :PORT"},
 }
-"""By verb and option of an earlier version: the words that mean the same now."""
-
-
-def new_words(verb: Sequence[str], option: str, value: str) -> list[str]:
-    """Return the words that replace a renamed option and its value; empty: it was not renamed."""
-    words = RENAMED.get(" ".join(verb), {}).get(option, "").split()
-    return [word.replace("VALUE", value or "VALUE") for word in words]
+"""By verb and option of an earlier version: what is written now."""
 
 
 def is_verb(word: str) -> bool:
