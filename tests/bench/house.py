@@ -11,7 +11,7 @@ feature commits, the imported names, the files and the functions.
 - **A room** is `dxlwire`, `dxlsim`, a package or a module of `dxlrun`, one feature of `dxlrun/features`, or a
   package in `plugins/`.
 - **A feature commit** adds at least 40 product lines and removes at most a third of what it adds. Renamed
-  files do not count. The last 40 of them are shown.
+  files and commits of docstrings (`NO_FEATURES`) do not count. The last 40 of them are shown.
 - **A name from inside** is imported by a package from a module of dxlrun, dxlwire or dxlsim that is not a
   face. The faces are `dxlrun` and `dxlrun.tooling`, and `dxlwire` and `dxlsim` themselves. A name is
   counted once a package (`in each file`: once a file), also inside functions and for type checking.
@@ -37,6 +37,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 CODE = (".py", ".pyi", ".c", ".h")
 LAST = 40
+NO_FEATURES = ("packages: describe what belongs in each folder and what does not",)
+"""Subjects of commits that add as many lines as a feature, but only docstrings."""
 LIBRARIES = ("dxlrun", "dxlwire", "dxlsim")
 FACES = ("dxlrun", "dxlrun.tooling", "dxlwire", "dxlsim")
 
@@ -148,7 +150,7 @@ def feature_commits(commit: str) -> Iterator[FeatureCommit]:
         changes = [line.split("\t", 2) for line in lines if line.strip()]
         counted = [each for each in changes if is_product(each[2]) and "=>" not in each[2] and each[0] != "-"]
         added, removed = (sum(int(each[column]) for each in counted) for column in (0, 1))
-        if added >= 40 and added >= 3 * removed:
+        if added >= 40 and added >= 3 * removed and not subject.endswith(NO_FEATURES):
             yield FeatureCommit(subject, added, removed, frozenset(each[2] for each in counted))
 
 
