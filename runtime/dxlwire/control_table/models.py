@@ -8,9 +8,9 @@ import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from dxlrun.errors import suggestion
 from dxlwire.control_table.sources import Listing, listings, read_control_table
 from dxlwire.control_table.table import ControlTable
+from dxlwire.errors import suggestion
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TypeAlias
 
 from dxlrun.channels.packets import PacketKind, PacketSink
-from dxlrun.errors import PortError
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import Clock
+from dxlwire.errors import PortError
 from dxlwire.exchange.owed import OwedReplies
 from dxlwire.plan.line import BITS_PER_BYTE, lengthen
 from dxlwire.port.ports import Port, Ports

@@ -22,8 +22,8 @@ from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Commands, Floats
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.channels.shared_memory import array_of
-from dxlrun.errors import PortError
 from dxlwire.bus_plan import BusPlan, Field
+from dxlwire.errors import PortError
 from dxlwire.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.goals import GoalArrays, SyncWrite

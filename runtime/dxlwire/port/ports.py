@@ -13,7 +13,7 @@ from typing import Protocol
 import msgspec
 
 from dxlrun.channels.heartbeat import LineProgress
-from dxlrun.errors import PortError
+from dxlwire.errors import PortError
 
 # found at once, some dozen times a cycle
 _write, _now_ns = os.write, time.monotonic_ns

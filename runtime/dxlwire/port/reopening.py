@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
-from dxlrun.errors import PortError
+from dxlwire.errors import PortError
 from dxlwire.port.latency_timer import SYSTEM, shorten
 from dxlwire.port.ports import put_in_place, set_aside
 from dxlwire.port.serial_open import let_go, open_serial, rate_remark

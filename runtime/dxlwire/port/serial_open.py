@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from dxlrun.errors import PortError
 from dxlrun.process_table import robot_of
+from dxlwire.errors import PortError
 from dxlwire.port.adapters import serial_devices
 from dxlwire.port.latency_timer import is_simulated
 from dxlwire.port.rights import command_for_access

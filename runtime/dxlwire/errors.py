@@ -1,0 +1,152 @@
+"""The root of all exceptions, the errors of files and of serial lines, and words that their messages share.
+
+```
+Exception
+└── DxlError                       every error that is raised on purpose; exit code 1
+    ├── InputError (ValueError)    a file or an argument is wrong; exit code 2
+    └── PortError (OSError)        a serial line cannot be opened, or is gone
+```
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Mark:
+    """A place in a file that a person can jump to; line and column count from 1."""
+
+    file: str
+    line: int = 1
+    column: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong with an input: where, what, and how to fix it."""
+
+    mark: Mark
+    what: str
+    fix: str
+    severity: Literal["error", "warning"] = "error"
+
+    def __str__(self) -> str:
+        kind = "" if self.severity == "error" else "warning: "
+        return f"{self.mark}: {kind}{self.what}; {self.fix}"
+
+
+class DxlError(Exception):
+    """Base of every error that is raised on purpose, here and in the packages that build on dxlwire.
+
+    A command line exits with `exit_code`.
+    """
+
+    exit_code = 1
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The message, line by line, and the notes that were added to it."""
+        return (*str(self).splitlines(), *getattr(self, "__notes__", ()))
+
+
+class InputError(DxlError, ValueError):
+    """A file or an argument is wrong; `problems` has all that were found, in file order."""
+
+    exit_code = 2
+
+    def __init__(self, problems: Sequence[Problem] | str) -> None:
+        self.problems: tuple[Problem, ...] = () if isinstance(problems, str) else tuple(problems)
+        text = problems if isinstance(problems, str) else "\n".join(str(problem) for problem in problems)
+        super().__init__(text)
+
+
+class PortError(DxlError, OSError):
+    """A serial line cannot be opened, is in use by another program, or is gone."""
+
+
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
+_SIDES = {"l": "left", "r": "right", "f": "front", "back": "rear", "hind": "rear", "top": "upper"}
+_SIDES |= {side: side for side in ("left", "right", "front", "rear", "upper", "lower", "inner", "outer")}
+"""Words that tell one limb from another, as numbers do."""
+_MOST_NEAR = 3
+"""Names that are equally near; more are no help."""
+
+
+def near(name: str, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the known names that are a slip away: of two letters at most, or with the same words.
+
+    The same words are those in another order, or with one more or less beside two that are the same. A name
+    of another side or with another number is never meant: it is another limb.
+    """
+    wanted = _folded(name)
+    most = 0 if len(wanted) < 3 else 1 if len(wanted) < 5 else 2
+    found: dict[int, list[str]] = {}
+    for each in dict.fromkeys(known):
+        steps = 0 if _folded(each) == wanted else _edits(wanted, _folded(each), most)
+        if steps > most and _alike(_words(name), _words(each)):
+            steps = most
+        if steps <= most and not _other_limb(_words(name), _words(each)):
+            found.setdefault(steps, []).append(each)
+    nearest = found[min(found)] if found else []
+    return tuple(nearest) if len(nearest) <= _MOST_NEAR else ()
+
+
+def _folded(name: str) -> str:
+    return name.lower().replace("-", "_")
+
+
+def _words(name: str) -> list[str]:
+    return [word.lower() for word in _WORD.findall(name)]
+
+
+def _alike(words: list[str], others: list[str]) -> bool:
+    """Return whether they are the same in another order, or one has one word more than the other's two."""
+    few, many = sorted((sorted(words), sorted(others)), key=len)
+    left = list(many)
+    for word in few:
+        if word in left:
+            left.remove(word)
+    return len(few) >= 2 and len(left) == len(many) - len(few) <= 1
+
+
+def _other_limb(words: list[str], others: list[str]) -> bool:
+    """Return whether both have words of a side, or both have numbers, and not the same ones."""
+    sides = [sorted(_SIDES[word] for word in each if word in _SIDES) for each in (words, others)]
+    numbers = [sorted("".join(filter(str.isdigit, each))) for each in (words, others)]
+    return any(all(each) and each[0] != each[1] for each in (sides, numbers))
+
+
+def _edits(one: str, other: str, most: int) -> int:
+    """Return how many letters are added, left out, changed or swapped with the next; or more than `most`."""
+    if abs(len(one) - len(other)) > most:
+        return most + 1
+    before: list[int] = []
+    row = list(range(len(other) + 1))
+    for i, letter in enumerate(one, 1):
+        above, before, row = before, row, [i]
+        for j, its in enumerate(other, 1):
+            steps = min(before[j] + 1, row[-1] + 1, before[j - 1] + (letter != its))
+            if i > 1 and j > 1 and (letter, one[i - 2]) == (other[j - 2], its):
+                steps = min(steps, above[j - 2] + 1)
+            row.append(steps)
+    return row[-1]
+
+
+def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return how to fix an unknown name: a near one, `otherwise`, or all that there are."""
+    known = sorted(set(known))
+    if meant := near(name, known):
+        return f"did you mean {' or '.join(meant)}?"
+    return otherwise or (f"known: {', '.join(known)}" if known else "there is none")
+
+
+def counted(number: int, one: str, many: str) -> str:
+    """Return `1 period`, `2 periods`: one form for exactly one, the other for all else, zero included."""
+    return f"{number} {one if number == 1 else many}"
