@@ -3,8 +3,6 @@
 from dxlrun.channels.cycle import Commands as Commands
 from dxlrun.channels.cycle import Floats as Floats
 from dxlrun.channels.cycle import States as States
-from dxlrun.contract.body import Body as Body
-from dxlrun.contract.body import LinkMotion as LinkMotion
 from dxlrun.contract.controller import LIVE as LIVE
 from dxlrun.contract.controller import CommandModel as CommandModel
 from dxlrun.contract.controller import Context as Context
@@ -26,9 +24,6 @@ from dxlrun.contract.sensor import Sensor as Sensor
 from dxlrun.contract.sensor import SensorContext as SensorContext
 from dxlrun.description.form import Mistake as Mistake
 from dxlrun.description.form import ParametersModel as ParametersModel
-from dxlrun.description.joints.motor import MotorLoad as MotorLoad
-from dxlrun.description.joints.motor import MotorModel as MotorModel
-from dxlrun.description.joints.motor import Stribeck as Stribeck
 from dxlrun.description.joints.servo import ServoModel as ServoModel
 from dxlrun.description.joints.turns import nearest_turn as nearest_turn
 from dxlrun.description.units import Angle as Angle
@@ -69,4 +64,9 @@ from dxlrun.remote.live.listening import TopicMessage as TopicMessage
 from dxlrun.remote.requests.replies import GoalState as GoalState
 from dxlrun.remote.requests.replies import TopicState as TopicState
 from dxlrun.remote.sockets import running as running
+from dxlsim.motion.link_motion import Body as Body
+from dxlsim.motion.link_motion import LinkMotion as LinkMotion
+from dxlsim.motor_model import MotorLoad as MotorLoad
+from dxlsim.motor_model import MotorModel as MotorModel
+from dxlsim.motor_model import Stribeck as Stribeck
 from dxlwire.port.serial_open import open_serial as open_serial

@@ -9,7 +9,7 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.description.joints.motor import MotorModel
+from dxlsim.motor_model import MotorModel
 
 
 class Load(msgspec.Struct, frozen=True):

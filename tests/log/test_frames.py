@@ -22,7 +22,6 @@ from rosbags.typesys import Stores, get_typestore
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.ring import RecordKind
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
-from dxlrun.description.frames.urdf import read_urdf
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.frame_messages import FrameMessages
@@ -30,6 +29,7 @@ from dxlrun.log.reader import open_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, read_log
+from dxlsim.geometry.urdf import read_urdf
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "urdf/bioloid_torso.urdf"

@@ -11,10 +11,10 @@ import pytest
 
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
-from dxlrun.contract.body import Shafts
 from dxlrun.run.sensor_process import RemoteBody
 from dxlsim.motion.body import SensedBody, ShaftsShown, SimulatedBody
 from dxlsim.motion.control_law import LIMP
+from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.mechanics import STEP_NS, Mechanics
 from dxlsim.motion.motor import Motor
 from dxlsim.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint

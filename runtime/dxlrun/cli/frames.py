@@ -14,9 +14,9 @@ from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import Frame, FrameTree
     from dxlrun.plan.robot_plan import Plan
+    from dxlsim.geometry.transform import Transform
 
 _Positions = Annotated[
     tuple[str, ...], Parameter(name="--at", negative=(), show_default=False, consume_multiple=True)

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.description.frames.urdf import Urdf
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import SensorPlan
+from dxlsim.geometry.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
+from dxlsim.geometry.urdf import Urdf
 
 _ALIKE_RAD = math.radians(1.0)  # Between two orientations that are meant to be one. [i]
 

@@ -14,9 +14,9 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import SIMULATED, Bus
-from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.errors import InputError, suggestion
 from dxlrun.plan.robot_plan import Plan, SimulationPlan
+from dxlsim.motor_model import MotorLoad
 from dxlsim.simulation_plan import (
     NO_LOAD,
     WHOLE_REPLIES,

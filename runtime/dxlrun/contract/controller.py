@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict
 
 from dxlrun.channels.cycle import Commands, Floats, States
 from dxlrun.description.form import ParametersModel
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import ControllerFault
+from dxlsim.motor_model import MotorModel
 from dxlwire.modes import CommandName
 
 

@@ -9,8 +9,8 @@ from typing import ClassVar, Generic, TypeVar
 import msgspec
 
 from dxlrun.channels.slot import Floats
-from dxlrun.contract.body import Body
 from dxlrun.description.form import ParametersModel
+from dxlsim.motion.link_motion import Body
 
 P = TypeVar("P", bound=ParametersModel)
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
 from dxlrun.plan.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
+from dxlsim.motor_model import MotorModel
 from dxlwire.modes import Mode
 
 if TYPE_CHECKING:

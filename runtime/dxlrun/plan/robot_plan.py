@@ -7,11 +7,11 @@ from typing import Literal
 import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
+from dxlsim.motor_model import MotorModel
 from dxlsim.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
 from dxlwire.bus_plan import BusPlan, ServoPlan
 

@@ -34,10 +34,10 @@ from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Req
 from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, address_of, sockets
 
 if TYPE_CHECKING:
-    from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import FrameTree
     from dxlrun.log.schemas import LogHeader
     from dxlrun.remote.live.states import RobotStates
+    from dxlsim.geometry.transform import Transform
 
 LEASE_S = 0.2
 _STOP_S = 30.0
@@ -147,7 +147,7 @@ class RemoteRobot:
         """
         if self._frames is None:
             from dxlrun.description.frames.tree import FramesPlan, FrameTree  # most clients ask for none
-            from dxlrun.description.frames.urdf import read_urdf
+            from dxlsim.geometry.urdf import read_urdf
 
             found = self._ask(requests.FRAMES)
             if found.urdf is None:

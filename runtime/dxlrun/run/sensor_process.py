@@ -20,12 +20,12 @@ from dxlrun.channels import process
 from dxlrun.channels.process import Failed, MessageChannel, Ready
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
-from dxlrun.contract.body import LinkMotion, Shafts
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import PlugInError
 from dxlrun.plan.loop_plan import SensorPlan
 from dxlsim.motion.body import SimulatedBody
+from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.simulation_plan import SensedBodies
 
 END_S = 1.0

@@ -9,7 +9,7 @@ from random import Random
 
 import msgspec
 
-from dxlrun.description.frames.transform import (
+from dxlsim.geometry.transform import (
     NO_TURN,
     Quaternion,
     Transform,

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from dxlrun.contract.body import LinkMotion, Shafts
-from dxlrun.description.frames.transform import rotated
 from dxlsim.device.measured import STANDARD_GRAVITY, Measured
 from dxlsim.device.simulated_device import SimulatedDevice
+from dxlsim.geometry.transform import rotated
 from dxlsim.motion.body import SimulatedBody
+from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.simulation_plan import SensedBodies
 

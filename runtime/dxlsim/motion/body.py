@@ -14,9 +14,8 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.slot import SlotWriter
-from dxlrun.contract.body import Floats, LinkMotion, Shafts
-from dxlrun.description.frames import urdf as frames
-from dxlrun.description.frames.transform import (
+from dxlsim.geometry import urdf as frames
+from dxlsim.geometry.transform import (
     NO_TURN,
     Quaternion,
     Vector,
@@ -27,7 +26,8 @@ from dxlrun.description.frames.transform import (
     rotated,
     turn,
 )
-from dxlrun.description.frames.urdf import read_urdf
+from dxlsim.geometry.urdf import read_urdf
+from dxlsim.motion.link_motion import Floats, LinkMotion, Shafts
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.simulation_plan import SensedBodies
 

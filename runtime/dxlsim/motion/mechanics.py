@@ -17,9 +17,9 @@ from importlib.metadata import entry_points
 import msgspec
 import numpy as np
 
-from dxlrun.contract.body import Shafts
 from dxlsim.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
 from dxlsim.motion.coupled_joints import joints_without_bodies
+from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, PlantMaker
 from dxlsim.simulation_plan import Coupling, Load, UrdfBodies

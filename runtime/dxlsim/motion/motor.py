@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.description.joints.motor import MotorModel, Stribeck
+from dxlsim.motor_model import MotorModel, Stribeck
 from dxlwire.control_table import ControlTable
 
 STALL_POWER_W = 20.0

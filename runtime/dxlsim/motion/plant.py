@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.description.joints.motor import Stribeck
 from dxlsim.motion.motor import Motor
+from dxlsim.motor_model import Stribeck
 from dxlsim.simulation_plan import Load
 
 Floats = NDArray[np.float64]

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dxlrun.description.frames.transform import Quaternion, Transform, from_rpy, near, unit
 from dxlrun.description.frames.tree import FrameTree
-from dxlrun.description.frames.urdf import Urdf, read_urdf
 from dxlrun.errors import InputError
+from dxlsim.geometry.transform import Quaternion, Transform, from_rpy, near, unit
+from dxlsim.geometry.urdf import Urdf, read_urdf
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 POSES = int(os.environ.get("DXLRUN_POSES", "10"))

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.description.frames.tree import FrameTree
-from dxlrun.description.frames.urdf import Mimic, UrdfLimits, read_urdf
 from dxlrun.errors import InputError
+from dxlsim.geometry.urdf import Mimic, UrdfLimits, read_urdf
 
 ARM = """\
 <robot name="arm">

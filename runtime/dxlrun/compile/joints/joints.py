@@ -23,10 +23,10 @@ from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.joints import Joint, JointEntry
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.units import plain
 from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import ControlTable
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes

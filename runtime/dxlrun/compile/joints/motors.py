@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import Problems, RobotFile
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.errors import InputError, Mark
+from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import ControlTable
 

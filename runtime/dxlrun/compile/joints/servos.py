@@ -14,9 +14,9 @@ from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.devices import Device
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import Mark, suggestion
+from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans

@@ -16,8 +16,8 @@ from dxlrun.compile.joints.limits import Interval, limits_of, speed_unit
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import read_text
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
-from dxlrun.description.frames.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
 from dxlrun.errors import InputError, suggestion
+from dxlsim.geometry.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
 
 
 class CompiledUrdf(msgspec.Struct, frozen=True):

@@ -27,10 +27,10 @@ from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.single_files import class_in_file, file_of, publisher_of
 from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
+from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import add_control_table
 from dxlwire.control_table.device_table import is_device_table
 from dxlwire.control_table.devices import add_device_table

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from dxlrun.channels.slot import Floats, SlotState, SlotWriter
-from dxlrun.contract.body import Body
 from dxlrun.contract.sensor import Sensor, SensorContext
 from dxlrun.plan.loop_plan import SensorPlan
+from dxlsim.motion.link_motion import Body
 
 _NUMBER = re.compile(r"\[Errno -?\d+\] ")
 REOPEN_NS = 1_000_000_000

@@ -13,7 +13,8 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.description.frames.transform import (
+from dxlrun.errors import InputError, Mark, Problem, suggestion
+from dxlsim.geometry.transform import (
     NO_TURN,
     Quaternion,
     Transform,
@@ -23,8 +24,7 @@ from dxlrun.description.frames.transform import (
     turn,
     unit,
 )
-from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
-from dxlrun.errors import InputError, Mark, Problem, suggestion
+from dxlsim.geometry.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
 
 ODOM = "odom"  # The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)
 _ABOVE_ODOM = ("world", "map", ODOM)

@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, create_model
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, key, refuse
-from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.problems import read_form
 from dxlrun.description.units import (
     Angle,
@@ -27,6 +26,7 @@ from dxlrun.description.units import (
     Voltage,
 )
 from dxlrun.errors import Mark
+from dxlsim.motor_model import MotorModel
 
 _ESSENTIAL = ("voltage", "torque_constant", "resistance", "inertia")
 """Keys without any of which a file is something else."""

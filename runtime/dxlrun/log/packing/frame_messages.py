@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlrun.description.frames.transform import Quaternion, Transform, near
 from dxlrun.description.frames.tree import Frame, FramesPlan, FrameTree
 from dxlrun.log.schemas import FRAMES, LogHeader
 from dxlrun.messages.cdr import Codec
+from dxlsim.geometry.transform import Quaternion, Transform, near
 
 Stamp = tuple[int, int]
 """Seconds since 1970 and the nanoseconds behind them."""

@@ -6,7 +6,7 @@ Felt at the horn, in SI. With the duty u (part of the supply's voltage U at the 
     (inertia + load.inertia) * dw/dt = torque - friction - load.gravity * sin(angle - load.gravity_angle)
 
 (M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models identified by Iterative Learning
-Control", RoboCup 2013, section 3). Friction is that of `simulation/motion/motor.py`, where its source is. In
+Control", RoboCup 2013, section 3). Friction is that of `dxlsim/motion/motor.py`, where its source is. In
 position control u = position_gain * p_gain * (goal - angle).
 """
 

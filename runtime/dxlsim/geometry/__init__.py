@@ -1,0 +1,1 @@
+"""Geometry: rigid transforms, and the reader of URDF files. No other module of dxlsim is imported here."""
