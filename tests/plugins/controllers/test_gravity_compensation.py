@@ -237,6 +237,7 @@ def refused(tmp_path: Path) -> Callable[..., list[str]]:
     return refused
 
 
+LIMITS = "{position: [-110 deg, 110 deg], velocity: 2 rad/s}\n"
 JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 
 
@@ -249,7 +250,7 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
         (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "where it is fixed"),
         (("urdf", '"elbow" type="revolute"', '"elbow" type="prismatic"'), "elbow", "the URDF to turn elbow"),
         (
-            ("yaml", "reference: 180 deg\n", "reference: 180 deg\n    travel_per_turn: 20 mm\n"),
+            ("yaml", LIMITS, "{position: [0 mm, 5 mm], velocity: 5 mm/s}\n    travel_per_turn: 20 mm\n"),
             "shoulder",
             "needs the URDF to slide shoulder, where it is revolute",
         ),
