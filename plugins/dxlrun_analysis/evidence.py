@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.remedies import choose_remedy, free_machine
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
 from dxlrun_analysis.finding import HURTS, Finding, Rank
@@ -22,7 +23,6 @@ from dxlrun_analysis.lost import invalid_joints, severe_of
 from dxlrun_analysis.rules import RULES, Needs
 from dxlrun_analysis.servos.other_host import SPOILS
 from dxlrun_analysis.tally import RealTime, RunTotals
-from dxlwire.port.remedies import choose_remedy, free_machine
 
 _REPLIES = (
     *("power_lost", "another_host", "late_replies", "broken_replies", "slow_servo", "noise", "lossy_servo"),

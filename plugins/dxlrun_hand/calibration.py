@@ -17,6 +17,7 @@ from dxlrun.compile.joints.servos import servo_travel
 from dxlrun.description.document import KeyPath
 from dxlrun.description.reading import Replacement
 from dxlrun.description.units import distance_text
+from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -25,7 +26,6 @@ from dxlrun_hand.dialogue import Dialogue
 from dxlrun_hand.robot_text import RobotText
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import ControlTable
-from dxlwire.port.remedies import CHECK, choose_remedy
 
 LEAST_WAY = math.radians(5.0)
 """Of the servo between both ends: less may be a hand that slipped."""

@@ -8,6 +8,8 @@ from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.robot import compile_robot
 from dxlrun.description.reading import Description
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.registers import compare, merged
@@ -19,9 +21,7 @@ from dxlrun_hand.dialogue import Dialogue, yes
 from dxlrun_hand.lines import BusLines
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import ControlTable, control_table, models_by_number
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.retry import extend_timeouts, retry
-from dxlwire.port.remedies import choose_remedy
 from dxlwire.transaction import Outcome, Program
 
 SKIP = ("s", "skip")

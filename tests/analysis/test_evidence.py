@@ -10,6 +10,7 @@ from msgspec import structs
 from tests.analysis.judged import BUSY, REAL, SIMULATED, accusing, lost, on_bus, plan, totals
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.remedies import INJECTED
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.latency import Latency, Periods
@@ -19,7 +20,6 @@ from dxlrun_analysis.plan import LoggedPlan, LoggedServo
 from dxlrun_analysis.rules import RULES, Needs
 from dxlrun_analysis.tally import RealTime
 from dxlrun_analysis.verdict import judge
-from dxlwire.port.remedies import INJECTED
 
 LACKING: dict[str, tuple[Needs, dict[str, Any]]] = {
     "nothing": (Needs.NOTHING, {}),

@@ -3,11 +3,11 @@
 import pytest
 from tests.kit.rigs import make_x
 
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.registers import settle
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import control_table, decoded
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Outcome, Reply
 
 PLAN = make_x((11,))

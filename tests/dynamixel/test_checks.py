@@ -8,11 +8,11 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.checks import CHECKS, inspect, survey
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import control_table
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.planning import plan_line
 from dxlwire.transaction import Outcome, Reply
 

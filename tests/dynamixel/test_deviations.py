@@ -12,6 +12,7 @@ from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.compile.joints.registers import register_value
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
@@ -28,7 +29,6 @@ from dxlwire.control_table import (
 from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
 from dxlwire.exchange.bus import Lines
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.planning import Wiring, bus_plan, position_layout
 
 TABLES = all_tables()

@@ -6,17 +6,17 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.errors import PortError, StartUpError
-from dxlrun.plan.machine_load import MachineLoad
-from dxlrun.testing import VirtualRobot, plan_of
-from dxlwire.port.latency_timer import latency_timer, shorten
-from dxlwire.port.remedies import (
+from dxlrun.dynamixel.remedies import (
     CHECK,
     INJECTED,
     choose_remedy,
     describe_late_start,
     late_replies,
 )
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.plan.machine_load import MachineLoad
+from dxlrun.testing import VirtualRobot, plan_of
+from dxlwire.port.latency_timer import latency_timer, shorten
 from dxlwire.port.reopening import KeptLines, Wanted
 from dxlwire.port.serial_open import open_serial
 

@@ -7,6 +7,7 @@ from tests.kit.rigs import make_plan, make_rig, make_x
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketLog
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach, reach
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
@@ -14,7 +15,6 @@ from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import all_tables, control_table
 from dxlwire.exchange.bus import Lines
-from dxlwire.plan.findings import Findings
 
 
 def register(table, name, value):

@@ -9,8 +9,9 @@ from msgspec.json import Decoder
 
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.errors import PortError
+from dxlrun.run.line_reopener import LineReopener
 from dxlwire.port.ports import SerialPort, SerialPorts
-from dxlwire.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
+from dxlwire.port.reopening import KeptLines, Wanted, lasting_name
 
 PATIENCE_S = 60.0
 
@@ -113,7 +114,7 @@ def test_whoever_asks_gets_the_line_in_the_place_of_the_old_one(adapters, kept):
     keeper = MessageChannel(theirs, Decoder(LineLost))
     ports = SerialPorts(
         [SerialPort(os.dup(one), "a line") for one in kept.descriptors],
-        LinesAgain(MessageChannel(ours, Decoder(LineReturned))),
+        LineReopener(MessageChannel(ours, Decoder(LineReturned))),
     )
     adapters[0].unplug()
     assert not ports.reopen(0)

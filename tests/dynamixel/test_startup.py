@@ -7,12 +7,12 @@ from tests.kit.line_faults import corrupt_next, delay_next, disturb_replies, tru
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.remedies import INJECTED
 from dxlrun.dynamixel.servo.checks import _silence
 from dxlrun.errors import PortError, StartUpError
 from dxlsim.bus.line import flipped
 from dxlsim.bus.simulated_bus import PacketFault
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.port.remedies import INJECTED
 from dxlwire.wire import protocol1
 
 

@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from dxlrun.dynamixel.remedies import late_replies
 from dxlrun.errors import counted
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
@@ -29,7 +30,6 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
-from dxlwire.port.remedies import late_replies
 from dxlwire.transaction import BROADCAST_ID
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)

@@ -13,6 +13,7 @@ from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
 from dxlrun.dynamixel.device.safe_values import make_safe
+from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
 from dxlrun.dynamixel.servo.life import Done
@@ -32,7 +33,6 @@ from dxlwire.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlwire.exchange.samples import Samples
 from dxlwire.plan.retry import limit_patience, pause
 from dxlwire.port.ports import Ports
-from dxlwire.port.remedies import CHECK, choose_remedy
 
 STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
 LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then

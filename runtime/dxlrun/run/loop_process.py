@@ -44,6 +44,7 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.guardian import LoopJob, make_ports
+from dxlrun.run.line_reopener import LineReopener
 from dxlrun.run.watch import Duty, LoopWatch
 from dxlwire.clock import MonotonicClock
 from dxlwire.port.ports import (
@@ -52,7 +53,6 @@ from dxlwire.port.ports import (
     SerialPorts,
     StallCounter,
 )
-from dxlwire.port.reopening import LinesAgain
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):
@@ -208,7 +208,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
         make_ports(plan.buses, [bus.port for bus in plan.buses], job.ports, job.memory, stalls),
-        LinesAgain(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
+        LineReopener(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
         _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )
     report = StallReport(stalls, sinks.events)

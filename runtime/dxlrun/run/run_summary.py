@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from dxlrun.channels.events import EventCode, EventGroup, EventTotals
+from dxlrun.dynamixel.remedies import free_machine
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait, describe_busy_machine
 from dxlrun.plan.played_goals import find_unreached_goals
-from dxlwire.port.remedies import free_machine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Reopening: a lost line is opened again by the process that keeps the lines, and handed to the loop."""
+"""Reopening: a lost line is opened again by the process that keeps the lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import msgspec
 
-from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlwire.errors import PortError
 from dxlwire.port.latency_timer import SYSTEM, shorten
 from dxlwire.port.ports import put_in_place, set_aside
@@ -144,25 +143,3 @@ class KeptLines:
             else:
                 os.eventfd_write(self._bell, 1)
                 return
-
-
-class LinesAgain:
-    """Asks the process that keeps the lines for those that are gone; see `port.Reopened`."""
-
-    def __init__(self, channel: MessageChannel[LineReturned]) -> None:
-        self._channel = channel
-        self._asked: set[int] = set()
-        self._came: dict[int, int] = {}
-
-    def __call__(self, index: int) -> int | None:
-        """Return the descriptor of a line that is back, once; None until then. Never waits."""
-        if index not in self._asked:
-            self._asked.add(index)
-            self._channel.send(LineLost(index))
-        if not self._channel.closed and select.select([self._channel], [], [], 0)[0]:
-            for message in self._channel.receive():
-                self._came[message.bus] = self._channel.descriptors.pop(0)
-        descriptor = self._came.pop(index, None)
-        if descriptor is not None:
-            self._asked.remove(index)
-        return descriptor

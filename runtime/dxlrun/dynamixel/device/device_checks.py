@@ -5,13 +5,13 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import choose_remedy
 from dxlwire.bus_plan import BusPlan, DevicePlan
 from dxlwire.control_table import models_by_number
 from dxlwire.control_table.devices import devices_by_number
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import Line
 from dxlwire.plan.retry import retry, setup_line
-from dxlwire.port.remedies import choose_remedy
 from dxlwire.transaction import Outcome, Program
 
 _MODEL_NUMBER = (0, 2)

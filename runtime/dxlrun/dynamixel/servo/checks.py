@@ -16,6 +16,8 @@ import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.bus import SIMULATED
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.registers import shown, tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
@@ -27,12 +29,10 @@ from dxlwire.control_table import (
     find_deviations,
 )
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import listen
 from dxlwire.plan.mode_plan import mode_in
 from dxlwire.plan.reads import servo_read
 from dxlwire.plan.retry import ATTEMPTS, retry
-from dxlwire.port.remedies import CHECK, choose_remedy
 from dxlwire.transaction import Outcome, Program, Reply
 from dxlwire.wire.protocol1 import describe_error
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
@@ -22,7 +23,6 @@ from dxlwire.bus_plan import RegisterValue
 from dxlwire.exchange.goals import GoalArrays
 from dxlwire.exchange.idle import Urgency
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import listen
 from dxlwire.transaction import Program
 

@@ -14,13 +14,13 @@ from collections.abc import Callable, Collection, Mapping
 import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.torque_limits import SILENT, limits_positions
 from dxlrun.plan.loop_plan import LimitedInterface, ServoLimit
 from dxlwire.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.mode_plan import in_mode, mode_in
 from dxlwire.transaction import Outcome, Program
 

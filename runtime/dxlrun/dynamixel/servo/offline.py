@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access
 from dxlrun.dynamixel.servo.checks import inspect, inspect_states
@@ -21,9 +23,7 @@ from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import settle
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry
-from dxlwire.port.remedies import CHECK, choose_remedy
 from dxlwire.transaction import Outcome, Program, Reply
 
 PROBE_NS = 1_000_000_000  # An offline servo is probed once a second (failures.md)

@@ -6,9 +6,9 @@ from collections import deque
 from typing import NamedTuple
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.life import Life
 from dxlwire.plan.retry import retry
-from dxlwire.port.remedies import choose_remedy
 from dxlwire.transaction import Program, Reply, Transaction
 
 TICK_MODULUS_MS = 32_768

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlItem, HardwareErrors
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Program
 
 _RELEASE = "switch its torque off and start again, without --take-over"

@@ -8,6 +8,7 @@ stays so whatever happens to it, until it is requested.
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.life import (
     IN_DOUBT,
@@ -19,7 +20,6 @@ from dxlrun.dynamixel.servo.life import (
 )
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, Offline, rejoin
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.retry import retry
 from dxlwire.transaction import Outcome, Program
 from dxlwire.wire import protocol2

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.device.devices import Devices
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.modes import servo_limits
@@ -28,7 +29,6 @@ from dxlwire.exchange.cyclic_reads import CyclicReads
 from dxlwire.exchange.goals import GoalArrays
 from dxlwire.exchange.idle import IdleScheduler
 from dxlwire.exchange.samples import BusSamples
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Program, Reply, Transaction
 from dxlwire.wire.dialect import dialect_of
 

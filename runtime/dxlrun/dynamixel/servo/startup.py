@@ -16,6 +16,8 @@ import msgspec
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.device.device_checks import survey_devices
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import choose_remedy, describe_late_start
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, first_reach, reach
 from dxlrun.dynamixel.servo.checks import survey
@@ -26,7 +28,6 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import control_table
 from dxlwire.exchange.bus import Lines
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.reads import state_read
@@ -38,7 +39,6 @@ from dxlwire.plan.retry import (
     retry,
     setup_line,
 )
-from dxlwire.port.remedies import choose_remedy, describe_late_start
 from dxlwire.transaction import Program, Result
 
 GROUP = 3

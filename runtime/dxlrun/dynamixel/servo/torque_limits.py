@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlwire.bus_plan import BusPlan, ModePlan, ServoPlan
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import dialect_of, sync_writes
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.registers import tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import ControlItem, control_table
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import dialect_of, sync_writes
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import settle
 from dxlwire.exchange.bus import ASKED_NS, SILENCE_NS
-from dxlwire.plan.findings import Findings
 from dxlwire.transaction import Program
 
 

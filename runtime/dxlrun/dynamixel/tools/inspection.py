@@ -10,6 +10,8 @@ from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import PacketSink
+from dxlrun.dynamixel.findings import Findings
+from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
@@ -21,11 +23,9 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.control_table import FoundDeviation, control_table, models_by_number
 from dxlwire.exchange.bus import Lines
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import listen
 from dxlwire.plan.retry import extend_timeouts, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
-from dxlwire.port.remedies import choose_remedy
 from dxlwire.port.serial_open import open_serial
 from dxlwire.transaction import Outcome, Program, Reply, Result
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.checks import deviations
@@ -27,7 +28,6 @@ from dxlwire.control_table import (
     side_by_side,
 )
 from dxlwire.modes import Mode
-from dxlwire.plan.findings import Findings
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlwire.plan.mode_plan import mode_in
 from dxlwire.plan.planning import Wiring, bus_plan

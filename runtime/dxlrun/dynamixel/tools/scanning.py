@@ -15,12 +15,12 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
+from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlwire.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlwire.control_table.devices import devices_by_number
 from dxlwire.plan.line import MOST_SPARE, Line, listen
 from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
-from dxlwire.port.remedies import CHECK, choose_remedy
 from dxlwire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
 from dxlwire.wire.dialect import dialect_of
 
