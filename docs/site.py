@@ -1,15 +1,17 @@
 """Build the documentation site: `python docs/site.py` writes it to `site/`, and fails on any warning.
 
 The pages are those of this folder, in the order of index.md. Where a page has a line `<!-- keys: NAME -->`,
-`<!-- commands -->` or `<!-- api: NAME ... -->`, the site has what the program says of itself there: tables of
-keys from the JSON Schema, every command with its options, docstrings. What a page links to outside of this
-folder is taken along. Needs `pip install 'zensical>=0.0.73'`; `--into DIRECTORY` builds elsewhere.
+`<!-- commands -->`, `<!-- api: NAME ... -->` or `<!-- page: NAME -->`, the site has what the program says of
+itself there: tables of keys from the JSON Schema, every command with its options, docstrings. What a page
+links to outside of this folder is taken along. Needs `pip install 'zensical>=0.0.73'`; `--into DIRECTORY`
+builds elsewhere.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import importlib.util
 import inspect
 import io
@@ -28,7 +30,7 @@ from typing import Any
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
-MARK = re.compile(r"^<!-- (keys|commands|api):? ?(.*?) ?-->$", re.MULTILINE)
+MARK = re.compile(r"^<!-- (keys|commands|api|page):? ?(.*?) ?-->$", re.MULTILINE)
 
 
 def place_of(path: Path) -> Path:
@@ -174,9 +176,24 @@ def signature(name: str, thing: object) -> str:
     return f"```python\n{name}{re.sub(r'^.(self|cls)(, )?', '(', text)}\n```"
 
 
+def tooling_page(name: str) -> str:
+    """Return a page of `dxlrun.tooling`: its docstring, and the first line about each of its names."""
+    page = importlib.import_module(f"dxlrun.tooling.{name}")
+    rows = ["| name | |", "|---|---|"]
+    for own in sorted(page.__all__, key=str.lower):
+        thing = getattr(page, own)
+        documented = inspect.isclass(thing) or inspect.isroutine(thing)
+        about = (inspect.getdoc(thing) or "").partition("\n\n")[0] if documented else ""
+        rows.append(f"| `{own}` | {' '.join(about.split())} |")
+    return "\n\n".join([f"### `dxlrun.tooling.{name}`", inspect.getdoc(page) or "", "\n".join(rows)])
+
+
+MAKERS = {"keys": keys, "commands": commands, "api": api, "page": tooling_page}
+
+
 def generated(text: str) -> str:
     """Return a page with what the program says in place of its marks."""
-    return MARK.sub(lambda match: {"keys": keys, "commands": commands, "api": api}[match[1]](match[2]), text)
+    return MARK.sub(lambda match: MAKERS[match[1]](match[2]), text)
 
 
 def settings(index: str) -> str:

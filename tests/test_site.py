@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import http.server
+import pkgutil
 import re
 import threading
 from collections.abc import Iterator
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +18,7 @@ from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.loaded import loaded
 
 import dxlrun
+import dxlrun.tooling
 from dxlrun.cli.verbs import names as names_of_verbs
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +50,7 @@ def test_each_link_of_the_site_has_a_file(sources: Path) -> None:
     assert [
         path
         for path in sources.rglob("*.md")
-        if re.search("^<!-- (keys|commands|api)", path.read_text(), re.M)
+        if re.search("^<!-- (keys|commands|api|page)", path.read_text(), re.M)
     ] == []
 
 
@@ -59,6 +62,11 @@ def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
         set(re.findall(r"^### `(\w+)`", names, re.MULTILINE))
         == {*dxlrun.__all__, "simulated_robot"} - units - values
     )
+    pages = {page.name for page in pkgutil.iter_modules(dxlrun.tooling.__path__)}
+    tables = dict(re.findall(r"^### `dxlrun.tooling.(\w+)`\n(.*?)(?=^### |\Z)", names, re.M | re.S))
+    assert {name: sorted(re.findall(r"^\| `(\w+)` ", text, re.M)) for name, text in tables.items()} == {
+        name: sorted(import_module(f"dxlrun.tooling.{name}").__all__) for name in pages
+    }
     client = names.partition("### `RemoteRobot`")[2].partition("\n### ")[0]
     methods = {one for one in dir(dxlrun.RemoteRobot) if not one.startswith("_")} - {"name"}
     assert methods == set(re.findall(r"^#### `(\w+)`", client, re.MULTILINE))

@@ -13,8 +13,9 @@ feature commits, the imported names, the files and the functions.
 - **A feature commit** adds at least 40 product lines and removes at most a third of what it adds. Renamed
   files and commits of docstrings (`NO_FEATURES`) do not count. The last 40 of them are shown.
 - **A name from inside** is imported by a package from a module of dxlrun, dxlwire or dxlsim that is not a
-  face. The faces are `dxlrun` and `dxlrun.tooling`, and `dxlwire` and `dxlsim` themselves. A name is
-  counted once a package (`in each file`: once a file), also inside functions and for type checking.
+  face. The faces are `dxlrun` with `dxlrun.messages` and `dxlrun.testing`, the pages of `dxlrun.tooling`,
+  and `dxlwire` and `dxlsim` themselves. A name is counted once a package (`in each file`: once a file),
+  also inside functions and for type checking.
 - **A mention** is a match of a feature's pattern (`MENTIONS`) in code: not in a docstring, a comment or a
   text with blanks, such as a message. A feature's own folder is not counted, nor are tests.
 - **A function without an object** is a public function or method whose name is one of `BARE_VERBS`.
@@ -40,7 +41,7 @@ LAST = 40
 NO_FEATURES = ("packages: describe what belongs in each folder and what does not",)
 """Subjects of commits that add as many lines as a feature, but only docstrings."""
 LIBRARIES = ("dxlrun", "dxlwire", "dxlsim")
-FACES = ("dxlrun", "dxlrun.tooling", "dxlwire", "dxlsim")
+FACES = ("dxlrun", "dxlrun.messages", "dxlrun.testing", "dxlrun.tooling", "dxlwire", "dxlsim")
 
 
 class Mention(NamedTuple):
@@ -168,9 +169,10 @@ def imported_names(texts: dict[str, str]) -> Iterator[tuple[str, str, bool]]:
                 names |= {(str(node.module), alias.name) for alias in node.names}
         for module, name in names:
             whole = f"{module}.{name}".rstrip(".")
-            of_face = module in FACES and whole.replace(".", "/") not in modules
+            page = module if whole.replace(".", "/") not in modules else whole
+            of_face = page in FACES or page.startswith("dxlrun.tooling.")
             if module.split(".")[0] in LIBRARIES:
-                yield path, whole, of_face or whole in FACES
+                yield path, whole, of_face
 
 
 class _Code(ast.NodeTransformer):

@@ -9,10 +9,12 @@ def test_a_name_from_a_face_is_not_from_inside() -> None:
     texts = {
         "runtime/dxlrun/log/__init__.py": "",
         "runtime/dxlrun/tooling/__init__.py": "",
+        "runtime/dxlrun/tooling/html.py": "",
         "plugins/a/run.py": """
 import dxlrun
 from dxlrun import Log, log
-from dxlrun.tooling import open_log
+from dxlrun.tooling import html
+from dxlrun.tooling.html import section
 def late():
     from dxlrun.log.reader import LogReader
     import dxlwire.wire.crc, numpy
@@ -22,7 +24,13 @@ from dxlwire import Bus
     inside = {name for _, name, of_face in house.imported_names(texts) if not of_face}
     faces = {name for _, name, of_face in house.imported_names(texts) if of_face}
     assert inside == {"dxlrun.log", "dxlrun.log.reader.LogReader", "dxlwire.wire.crc"}
-    assert faces == {"dxlrun", "dxlrun.Log", "dxlrun.tooling.open_log", "dxlwire.Bus"}
+    assert faces == {
+        "dxlrun",
+        "dxlrun.Log",
+        "dxlrun.tooling.html",
+        "dxlrun.tooling.html.section",
+        "dxlwire.Bus",
+    }
 
 
 def test_a_word_is_mentioned_in_code_outside_its_folder_only() -> None:

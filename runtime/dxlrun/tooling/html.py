@@ -1,0 +1,30 @@
+"""HTML: the parts of a report, as one file that loads nothing from elsewhere.
+
+Each function returns an element of `xml.etree`; `document` joins them.
+
+    from dxlrun.tooling import html
+
+    top = html.header("Servos", "bioloid_torso", "", ["No servo responded."], good=False, key_numbers=[])
+    section = html.section("servos", "Servos", [html.paragraph("ID 7: no response")])
+    page = html.document("Servos", top, [section], html.footer("Made by dxlrun"), {"servos": 0})
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.output.html import data as data
+    from dxlrun.output.html import document as document
+    from dxlrun.output.html import figure as figure
+    from dxlrun.output.html import folded as folded
+    from dxlrun.output.html import footer as footer
+    from dxlrun.output.html import header as header
+    from dxlrun.output.html import paragraph as paragraph
+    from dxlrun.output.html import script as script
+    from dxlrun.output.html import section as section
+    from dxlrun.output.html import table_element as table_element
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

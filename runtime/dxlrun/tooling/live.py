@@ -1,0 +1,32 @@
+"""Live: robots that run, here or over the network.
+
+`dxlrun.connect` steers one robot. These names are for programs that serve others, or watch several robots.
+
+    from dxlrun import connect, running
+    from dxlrun.tooling.live import RobotInfo
+
+    info: RobotInfo = connect().info()
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.remote.live.live_messages import LiveMessages as LiveMessages
+    from dxlrun.remote.network.certificates import CLIENT as CLIENT
+    from dxlrun.remote.network.certificates import keys_place as keys_place
+    from dxlrun.remote.network.certificates import revoked as revoked
+    from dxlrun.remote.network.listener import Listener as Listener
+    from dxlrun.remote.network.listener import Place as Place
+    from dxlrun.remote.network.listener import in_url as in_url
+    from dxlrun.remote.network.network_link import NetworkLink as NetworkLink
+    from dxlrun.remote.requests.replies import ControllerInfo as ControllerInfo
+    from dxlrun.remote.requests.replies import RobotInfo as RobotInfo
+    from dxlrun.remote.requests.table import Role as Role
+    from dxlrun.remote.sockets import Address as Address
+    from dxlrun.remote.sockets import SocketLink as SocketLink
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,0 +1,27 @@
+"""Logs: finding, reading and following the files that runs leave.
+
+`dxlrun.open_log` returns a `dxlrun.LogReader`, which reads a log slice by slice; `read_log` reads a whole log
+at once. A damaged log is read as far as possible, and its damage is described.
+
+    from dxlrun.tooling.logs import read_log
+
+    log = read_log("run.mcap")
+    print(len(log.cycles), "cycles,", len(log.packets), "packets", *log.damage)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.log.columns import PacketColumns as PacketColumns
+    from dxlrun.log.parts import is_log_directory as is_log_directory
+    from dxlrun.log.parts import log_files as log_files
+    from dxlrun.log.reader import UNREADABLE as UNREADABLE
+    from dxlrun.log.reader import LogFollower as LogFollower
+    from dxlrun.log.reader import read_log as read_log
+    from dxlrun.log.stored import is_being_written as is_being_written
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

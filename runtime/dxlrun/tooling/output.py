@@ -1,0 +1,44 @@
+"""Output: tables and sentences in the terminal and as JSON, and files that a user names.
+
+A table holds values; the terminal, JSON and HTML pages render it.
+
+    from dxlrun.tooling.output import Column, Table, show
+
+    show(Table.of("Servos", [Column("joint"), Column("ID")], [["head_yaw_joint", 7]]))
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.errors import counted as counted
+    from dxlrun.output.table import Cell as Cell
+    from dxlrun.output.table import Column as Column
+    from dxlrun.output.table import Columns as Columns
+    from dxlrun.output.table import Part as Part
+    from dxlrun.output.table import Sentence as Sentence
+    from dxlrun.output.table import Table as Table
+    from dxlrun.output.table import Tone as Tone
+    from dxlrun.output.table import Value as Value
+    from dxlrun.output.table import flagged as flagged
+    from dxlrun.output.table import microseconds as microseconds
+    from dxlrun.output.table import numbers as numbers
+    from dxlrun.output.target import check_target as check_target
+    from dxlrun.output.target import new_target as new_target
+    from dxlrun.output.target import unwritable as unwritable
+    from dxlrun.output.target import write_target as write_target
+    from dxlrun.output.terminal import err as err
+    from dxlrun.output.terminal import fitted as fitted
+    from dxlrun.output.terminal import out as out
+    from dxlrun.output.terminal import print_error as print_error
+    from dxlrun.output.terminal import print_warning as print_warning
+    from dxlrun.output.terminal import progress_bar as progress_bar
+    from dxlrun.output.terminal import show as show
+    from dxlrun.output.terminal import show_json as show_json
+    from dxlrun.output.unblocked import leave_real_time as leave_real_time
+    from dxlrun.output.unblocked import unblocked as unblocked
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,0 +1,29 @@
+"""Plans: the compiled robot, as a run executes it and as each log has it.
+
+Plans are frozen structs in SI units. What a bus sends is in `dxlwire.BusPlan`.
+
+    from dxlrun import open_log
+    from dxlrun.tooling.plans import Plan, from_json
+
+    plan: Plan = from_json(open_log("run.mcap").attachments["plan.json"])
+    print(plan.robot, [joint.name for joint in plan.loop.joints])
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.plan.loop_plan import ControllerPlan as ControllerPlan
+    from dxlrun.plan.loop_plan import JointPlan as JointPlan
+    from dxlrun.plan.loop_plan import LoopPlan as LoopPlan
+    from dxlrun.plan.loop_plan import ScheduleName as ScheduleName
+    from dxlrun.plan.loop_plan import SchedulerPlan as SchedulerPlan
+    from dxlrun.plan.mechanics_plan import MechanicsPlan as MechanicsPlan
+    from dxlrun.plan.recording_plan import RecordingPlan as RecordingPlan
+    from dxlrun.plan.robot_plan import Plan as Plan
+    from dxlrun.plan.robot_plan import from_json as from_json
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,0 +1,28 @@
+"""Robots: robot and motion files, read and compiled.
+
+Files are read into descriptions, which keep the place of each value for messages; a compiled robot has the
+plan. Each step raises `InputError` with all problems of the files.
+
+    from pathlib import Path
+
+    from dxlrun.tooling.robots import compile_robot, read_robot
+
+    plan = compile_robot(read_robot(Path("robots/bioloid_torso.yaml"), {"port": "sim"}), []).plan
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.compile.robot import compile_robot as compile_robot
+    from dxlrun.control.controllers.plugins import PlugIns as PlugIns
+    from dxlrun.control.controllers.plugins import load_plugins as load_plugins
+    from dxlrun.description.motion import read_motion as read_motion
+    from dxlrun.description.reading import Description as Description
+    from dxlrun.description.reading import read_robot as read_robot
+    from dxlrun.description.robot import Recording as Recording
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,0 +1,28 @@
+"""Runs: running a robot, in processes of its own or on virtual time.
+
+`dxlrun.testing.simulated_robot` makes a virtual run of a robot file in one call.
+
+    from pathlib import Path
+
+    from dxlrun import open_log
+    from dxlrun.tooling.plans import from_json
+    from dxlrun.tooling.runs import VirtualRobot
+
+    plan = from_json(open_log("run.mcap").attachments["plan.json"])
+    robot = VirtualRobot(plan, log=Path("again.mcap"))
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.run.run_log import discard_log as discard_log
+    from dxlrun.run.run_log import new_log as new_log
+    from dxlrun.run.run_summary import RunOptions as RunOptions
+    from dxlrun.run.supervisor import run_robot as run_robot
+    from dxlrun.run.virtual_run import VirtualRobot as VirtualRobot
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
