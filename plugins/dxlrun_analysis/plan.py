@@ -12,6 +12,7 @@ from msgspec import structs
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlrun.plan.robot_plan import decode_plan
 from dxlwire.port.latency_timer import is_simulated
 
 
@@ -162,7 +163,7 @@ def plan_of(log: Log) -> LoggedPlan:
 def _decoded(data: bytes, noted: str) -> LoggedPlan:
     """Return a plan that every slice of a log asks for anew, with the buses that were noted as simulated."""
     try:
-        plan = msgspec.json.decode(data, type=LoggedPlan)
+        plan = decode_plan(data, LoggedPlan)
     except UNREADABLE:
         return LoggedPlan()
     for bus in plan.buses:

@@ -13,7 +13,6 @@ several servos share joints, each has a rotor of its own, and constraints hold t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from functools import partial
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -40,8 +39,6 @@ if TYPE_CHECKING:
 
     from mujoco import MjModel, MjsJoint, MjSpec
 
-_HINGES = ("revolute", "continuous")
-_SLIDES = ("prismatic",)
 _LEAST_MASS = 1e-6
 """kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
 _LEAST_INERTIA = 1e-9  # kg m^2, as above
@@ -72,9 +69,9 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
             {
                 row: joint
                 for row, joint in enumerate(bodies.joints)
-                if joint is not None and _fits(kinds, joint.name, joint.linear)
+                if joint is not None and kinds.get(joint.name) in joint.types
             },
-            tuple(one for one in couplings if all(map(partial(_fits, kinds), one.joints, one.linear))),
+            tuple(one for one in couplings if all(kinds.get(name) in one.types for name in one.joints)),
         )
         _make_movable(root, moved.names)
         text = ElementTree.tostring(root, encoding="unicode")
@@ -97,10 +94,6 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
         return one_plant(joints, parts)
 
     return make
-
-
-def _fits(kinds: Mapping[str, str], name: str, linear: bool) -> bool:
-    return kinds.get(name) in (_SLIDES if linear else _HINGES)
 
 
 class _Moved(msgspec.Struct, frozen=True):

@@ -121,6 +121,9 @@ class CoupledServo(msgspec.Struct, frozen=True):
     per_rad: float  # rad or m for each rad of the shaft, with the sign of its direction
 
 
+HINGES = ("revolute", "continuous")  # Types of the joints of a URDF that turn
+
+
 class Coupling(msgspec.Struct, frozen=True):
     """Servos and joints that move together: q = matrix @ s.
 
@@ -132,7 +135,7 @@ class Coupling(msgspec.Struct, frozen=True):
     matrix: tuple[tuple[float, ...], ...]  # A row for each joint, a column for each servo
     loads: tuple[Load, ...]
     """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's."""
-    linear: tuple[bool, ...]  # Which of the joints slide, in m
+    types: tuple[str, ...] = HINGES  # Of the URDF's joints that it can move
 
 
 class UrdfJoint(msgspec.Struct, frozen=True):
@@ -141,7 +144,7 @@ class UrdfJoint(msgspec.Struct, frozen=True):
     name: str
     reference: float  # rad, of the servo from its raw 0
     per_rad: float  # rad or m of the joint for each rad of the servo, with the sign of its direction
-    linear: bool = False  # It slides, in m; only such ones move slides of the URDF
+    types: tuple[str, ...] = HINGES  # Of the URDF's joints that it can move
 
 
 class UrdfBodies(msgspec.Struct, frozen=True):

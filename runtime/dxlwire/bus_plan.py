@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 from dxlwire.transaction import Transaction
 
@@ -171,12 +171,17 @@ class ServoPlan(msgspec.Struct, frozen=True):
     """What the joint moves while the servo turns by 1 rad: rad (1 / gear ratio), or m where it is linear."""
     name: str = ""
     """Its own among all servos, where several move one joint: `hip/1`, `wrist/left`; empty: its joint's."""
-    linear: bool = False  # The joint's positions are m, its speeds m/s
+    unit: JointUnit = ROTARY  # Of the joint's positions
 
     @property
     def own_name(self) -> str:
         """A name that no other servo has."""
         return self.name or self.joint
+
+    @property
+    def linear(self) -> bool:
+        """True: its positions are lengths."""
+        return self.unit is LINEAR
 
     @property
     def position_per_tick(self) -> float:
@@ -198,9 +203,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
     def position_text(self, position: float) -> str:
         """Write a position of the joint, rad or m, for a person: `12.3 deg`, `4.56 mm`."""
-        from dxlrun.description.units import distance_text  # not above: it loads pydantic
-
-        return distance_text(position, self.linear, digits=2 if self.linear else 1)
+        return self.unit.text(position, digits=self.unit.digits)
 
     def outside_limits(self, raw: int, lower_tick: int, upper_tick: int) -> str:
         """Return the problem and its fix for a position outside limits, all in ticks; follows the name."""
@@ -213,7 +216,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
     def step_text(self, step: float) -> str:
         """Write a step of the joint, rad or m: `12 deg`, `5 mm`."""
-        return f"{step * 1e3:.0f} mm" if self.linear else f"{math.degrees(step):.0f} deg"
+        return self.unit.text(step, digits=0)
 
     def mode_plan(self, mode: int) -> ModePlan:
         """Return one of its modes; raises LookupError when the servo does not have it."""

@@ -17,6 +17,7 @@ from dxlrun.plan.mechanics_plan import CouplingPlan
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.report import analyze, tables
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 TICK = math.tau / 4096
 
@@ -25,13 +26,15 @@ def servo(row: int, joint: str, **more: object) -> dict[str, object]:
     return {"joint": joint, "row": row, "servo_id": row + 1, "rad_per_tick": TICK, **more}
 
 
-def plan(servos: list[dict[str, object]], *, linear: bool = False, **mechanics: object) -> dict[str, object]:
-    loop = loop_of(joints=tuple(JointPlan(name, 0.0, 1.0, None, linear=linear) for name in JOINTS))
+def plan(
+    servos: list[dict[str, object]], *, unit: JointUnit = ROTARY, **mechanics: object
+) -> dict[str, object]:
+    loop = loop_of(joints=tuple(JointPlan(name, 0.0, 1.0, None, unit=unit) for name in JOINTS))
     return {"loop": loop, "buses": [{"name": "main", "servos": servos}], "mechanics": mechanics}
 
 
 def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> None:
-    geared = plan([servo(row, joint, ratio=0.25) for row, joint in enumerate(JOINTS)], linear=True)
+    geared = plan([servo(row, joint, ratio=0.25) for row, joint in enumerate(JOINTS)], unit=LINEAR)
     path = write([Cycle(0), Cycle(1)], plan=geared)
     movers = plan_of(read_log(path)).movers
     assert [[(each.servo.servo_id, each.share) for each in movers[name]] for name in JOINTS] == [

@@ -72,7 +72,10 @@ MENTIONS = {
         r"(dxlsim|simulation)/",  # the memory of a simulated servo
     ),
 }
-LINEAR = Mention(r"\.linear\b(?!\.)|\blinear: bool|\blinear: tuple\[bool|\blinear=")
+LINEAR = Mention(
+    r"\.linear\b(?!\.)|\blinear: bool|\blinear: tuple\[bool|\blinear="
+    r"|\b(is|is not|==|!=) (JointUnit\.)?(LINEAR|ROTARY)\b"
+)
 """Asks whether a joint is linear. The linear part of a twist (`twist.linear.x`) does not."""
 BARE_VERBS = frozenset(
     word

@@ -49,7 +49,8 @@ def test_a_word_is_mentioned_in_code_outside_its_folder_only() -> None:
 
 def test_a_twist_does_not_ask_whether_a_joint_is_linear() -> None:
     codes = {"twist.py": "a = twist.linear.x", "joint.py": "a = joint.linear", "plan.py": "plan(linear=True)"}
-    assert house.mentioning(codes, house.LINEAR) == ["joint.py", "plan.py"]
+    codes |= {"unit.py": "a = joint.unit is not LINEAR", "table.py": "a = {ROTARY: 1.0, LINEAR: 0.1}"}
+    assert house.mentioning(codes, house.LINEAR) == ["joint.py", "plan.py", "unit.py"]
 
 
 def test_a_room_is_a_library_a_package_or_a_feature() -> None:

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
 
 from dxlrun.plan.robot_plan import from_json, to_json
+from dxlwire.joint_unit import LINEAR
 
 TEXT = robot_text("mechanics")
 
@@ -40,7 +41,7 @@ def test_what_the_robot_becomes() -> None:
     assert servos["head"].ratio == 0.5
     assert (head.lower, head.upper) == pytest.approx((-math.pi / 2, math.pi / 2), abs=1e-3)
     assert head.top_speed == pytest.approx(hip.top_speed / 2)
-    assert (grip.linear, grip.lower, grip.upper) == (True, 0.0, 0.04)
+    assert (grip.unit, grip.lower, grip.upper) == (LINEAR, 0.0, 0.04)
     assert servos["grip"].ratio == pytest.approx(0.09 / math.tau)
     assert servos["grip"].upper_tick == math.floor(2048 + 40 / 90 * 4096)
     assert (hip.servo, hip.coupled, pitch.coupled) == ("ID 2 and 3 on bus main", (), ("pitch", "roll"))
@@ -81,11 +82,20 @@ def test_a_plan_of_before_ratios_decodes_as_what_it_was() -> None:
     del old["mechanics"]
     for bus in old["buses"]:
         for servo in bus["servos"]:
-            for key in ("ratio", "name", "linear"):
+            for key in ("ratio", "name", "unit"):
                 servo.pop(key, None)
     found = from_json(json.dumps(old).encode())
     assert not found.mechanics.coupled
     assert {servo.ratio for bus in found.buses for servo in bus.servos} == {1.0}
+
+
+def test_a_plan_of_log_format_8_has_the_units_of_its_joints() -> None:
+    said = 'a "linear":true inside a text'
+    plan = replace(compile_text(TEXT).plan, source_text=said)
+    old = to_json(plan).replace(b'"unit":"m"', b'"linear":true').replace(b'"unit":"rad"', b'"linear":false')
+    assert b'"unit"' not in old
+    assert from_json(old) == plan
+    assert [joint.name for joint in from_json(old).loop.joints if joint.unit is LINEAR] == ["grip"]
 
 
 def test_an_ordinary_robot_has_no_mechanics() -> None:

@@ -76,8 +76,7 @@ def test_every_angle_of_the_servo_lies_in_the_reach(theta: float, reference: flo
 
 def test_degrees_are_short_and_have_no_negative_zero():
     assert degrees(math.radians(60)) == "60"
-    assert degrees(math.radians(60), signed=True) == "+60"
-    assert degrees(-1e-9, signed=True) == "0"
+    assert degrees(-1e-9) == "0"
     assert degrees(1.77) == "101.41"
 
 

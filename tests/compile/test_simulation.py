@@ -98,7 +98,6 @@ def test_servos_that_share_joints_are_simulated_together() -> None:
             ("left_arm_joint", "right_arm_joint"),
             coupling.matrix,
             (Load(0.02), Load()),
-            (False, False),
         ),
     )
     assert simulation.bodies is not None

@@ -13,6 +13,7 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.control import gate
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.joint_unit import LINEAR, ROTARY
 from dxlwire.modes import Mode
 
 FAR = float("inf")
@@ -31,7 +32,7 @@ def some_joint(random, number):
         top_speed=random.choice([None, random.uniform(0.5, 9)]),
         top_effort=random.choice([None, 1.0]),
         acceleration=random.choice([None, random.uniform(0.5, 100), random.uniform(0.5, 100)]),
-        linear=random.random() < 0.1,
+        unit=LINEAR if random.random() < 0.1 else ROTARY,
     )
 
 

@@ -191,7 +191,7 @@ def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-OTHER_FORMAT = "and this version reads format 8 only; use the version of dxlrun that recorded it"
+OTHER_FORMAT = "and this version reads formats 8 and 9 only; use the version of dxlrun that recorded it"
 
 
 @pytest.mark.parametrize(

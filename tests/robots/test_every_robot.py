@@ -11,6 +11,7 @@ from tests.kit.clients import command_of, played
 from tests.kit.examples import as_parameters
 
 from dxlrun.compile.robot import compile_files
+from dxlwire.joint_unit import LINEAR
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 MOTIONS = sorted(ROBOTS.glob("motions/*.yaml"))
@@ -51,7 +52,7 @@ def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     assert ends
     for controller in plan.loop.controllers:
         rows = [run.log.joints.index(joint) for joint in controller.joints if controller.name in ends]
-        least = [0.01 if plan.loop.joints[row].linear else 0.3 for row in rows]  # m, rad
+        least = [0.01 if plan.loop.joints[row].unit is LINEAR else 0.3 for row in rows]  # m, rad
         travel = np.ptp(cycles["position"][:, rows], axis=0)
         assert not rows or (travel > least).any()  # each controller that is played moves something
     for bus, servos in zip(run.robot.buses, plan.buses, strict=True):

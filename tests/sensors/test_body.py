@@ -98,7 +98,7 @@ def test_gears_references_couplings_and_mimic_joints_move_links():
     )
     turn = UrdfJoint("turn", 0.4, -0.25)
     pair = (CoupledServo(1, 0.1, 0.01), CoupledServo(2, 0.2, -0.01))
-    coupling = Coupling(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), (True,))
+    coupling = Coupling(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), ("prismatic",))
     geared = SimulatedBody(SensedBodies(UrdfBodies(urdf, (turn, None, None)), (coupling,)))
     shafts = [np.array(each) for each in ([1.2, 3.0, -2.0], [1.0, 2.0, 0.5], [0.3, 0.2, 0.1])]
     geared.move(Shafts(0, *shafts))

@@ -23,7 +23,7 @@ RUBBING = msgspec.structs.replace(ROTOR, damping=0.1, friction=0.05, load_fricti
 
 
 def alone(per_rad: float, load: Load, reference: float = 0.3) -> Coupling:
-    return Coupling((CoupledServo(0, reference, per_rad),), ("knee",), ((1.0,),), (load,), (False,))
+    return Coupling((CoupledServo(0, reference, per_rad),), ("knee",), ((1.0,),), (load,))
 
 
 def felt(load: Load, per_rad: float, reference: float = 0.3) -> Load:
@@ -35,13 +35,13 @@ def felt(load: Load, per_rad: float, reference: float = 0.3) -> Load:
 
 def on_one_axis(load: Load = NO_LOAD, *per_rad: float) -> Coupling:
     servos = tuple(CoupledServo(number, 0.0, each) for number, each in enumerate(per_rad or (1.0, -1.0)))
-    return Coupling(servos, ("hip",), ((1 / len(servos),) * len(servos),), (load,), (False,))
+    return Coupling(servos, ("hip",), ((1 / len(servos),) * len(servos),), (load,))
 
 
 def differential(*loads: Load, names: tuple[str, str] = ("pitch", "roll")) -> Coupling:
     servos = (CoupledServo(0, 0.0, 1.0), CoupledServo(1, 1.0, 1.0))
     both = tuple(loads) or (NO_LOAD, NO_LOAD)
-    return Coupling(servos, names, ((0.5, 0.5), (0.5, -0.5)), both, (False, False))
+    return Coupling(servos, names, ((0.5, 0.5), (0.5, -0.5)), both)
 
 
 def plant(coupling: Coupling, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
@@ -197,7 +197,6 @@ def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
         ("pitch",),
         ((0.5, 0.5),),
         (NO_LOAD,),
-        (False,),
     )
     made = mujoco_plant(UrdfBodies(ARMS, (None, None)), [reverse]) if in_bodies else plant_of(None, [reverse])
     moved = made([PlantJoint(ROTOR, NO_LOAD, 0.5), PlantJoint(ROTOR, NO_LOAD, 2.0)])
@@ -246,7 +245,7 @@ def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
 def test_a_body_on_a_slide_is_held_by_its_weight():
     lift = urdf(link("a"), joint("lift", "base", "a", kind="prismatic", axis="0 0 1"))
     per_rad = 0.01
-    held = bodies(lift, [UrdfJoint("lift", 0.5, per_rad, linear=True)])
+    held = bodies(lift, [UrdfJoint("lift", 0.5, per_rad, ("prismatic",))])
     run(held, 0.5, drive=MASS * 9.81 * per_rad, damping=0.1)
     assert held.angle[0] == pytest.approx(0.5, abs=1e-5)
     run(held, 0.3, drive=0.0)

@@ -21,6 +21,7 @@ from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
+from dxlrun.plan.robot_plan import decode_plan
 from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"
@@ -180,7 +181,7 @@ def _plan(log: Log) -> RecordedPlan:
     if data is None:
         raise LogError(f"{log.path}: the log has no attachment {PLAN}, so its controllers are unknown")
     try:
-        plan = msgspec.json.decode(data, type=RecordedPlan)
+        plan = decode_plan(data, RecordedPlan)
     except UNREADABLE as error:
         raise LogError(
             f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "

@@ -24,6 +24,7 @@ from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
+from dxlwire.joint_unit import LINEAR, ROTARY
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import PolicyRow, Row
@@ -200,11 +201,12 @@ _MOTIONS: Columns[Row] = [
 
 
 def _joints(joints: Sequence[Row]) -> Table:
-    from dxlrun.compile.joints.limits import degrees, number
+    from dxlrun.compile.joints.limits import degrees
 
     def interval(row: Row, lower: str, upper: str) -> str:
-        linear, unit = row["linear"], " mm" if row["linear"] else ""
-        return f"{number(row[lower], linear)}..{number(row[upper], linear)}{unit}"
+        unit = LINEAR if row["linear"] else ROTARY
+        first, last = (unit.number(row[end], signed=True) for end in (lower, upper))
+        return f"{first}..{last}{unit.suffix}"
 
     def rate(row: Row, key: str, unit: str) -> str:
         if row[key] is None:

@@ -139,7 +139,7 @@ def _wiring(
         continuous=described.continuous,
         start_mode=modes[described.joints[0]],
         ratio=described.ratio,
-        linear=described.linear,
+        unit=described.unit,
         name="" if coupling is None else described.name,
     )
 

@@ -42,6 +42,7 @@ from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError, Mark, suggestion
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 TRAJECTORY = "trajectory"
 _FIELDS: dict[Quantity, str] = {
@@ -49,12 +50,10 @@ _FIELDS: dict[Quantity, str] = {
     "velocity": "velocities",
     "acceleration": "accelerations",
 }
-_EXAMPLES: Mapping[str, tuple[str, str]] = {
-    "position": ("30 deg", "20 mm"),
-    "velocity": ("1 rad/s", "50 mm/s"),
-    "acceleration": ("5 rad/s^2", "200 mm/s^2"),
+_EXAMPLES: Mapping[JointUnit, Mapping[Quantity, str]] = {
+    ROTARY: {"position": "30 deg", "velocity": "1 rad/s", "acceleration": "5 rad/s^2"},
+    LINEAR: {"position": "20 mm", "velocity": "50 mm/s", "acceleration": "200 mm/s^2"},
 }
-"""Of each quantity of a joint that turns, and of a linear one."""
 LEAD_NS = 1_000_000_000
 """From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
 MOST_TARGETS = 200_000
@@ -248,19 +247,19 @@ def _names_own_joints(
 def _right_units(
     motion: MotionDescription, index: int, joints: Mapping[str, JointPlan], problems: Problems
 ) -> bool:
-    """Return whether the listed targets of linear joints are lengths, and those of the others angles."""
+    """Return whether the units of the listed targets are those of their joints."""
     part, good = motion.motion.motions[index], True
     for number, point in enumerate(part.points if isinstance(part, PointsPart) else ()):
         for joint, target in point.joints.items():
             if joint not in joints:
                 continue
             for quantity, value in zip(QUANTITIES, target.quantities, strict=True):
-                linear, unit = joints[joint].linear, "" if value is None else value.unit
-                if value is not None and linear != value.linear:
+                unit = joints[joint].unit
+                if value is not None and value.joint_unit is not unit:
                     problems.error(
                         motion.marks.value("motions", index, "points", number, "joints", joint, quantity),
-                        f"{joint} {'is linear' if linear else 'turns'}, and its {quantity} is in {unit}",
-                        f"write {'mm or m' if linear else 'deg or rad'}, as in {_EXAMPLES[quantity][linear]}",
+                        f"{joint} {unit.verb}, and its {quantity} is in {value.unit}",
+                        f"write {unit.shown} or {unit.value}, as in {_EXAMPLES[unit][quantity]}",
                     )
                     good = False
     return good
@@ -294,7 +293,12 @@ def warn_of_turns(
                 longest[joint] = step, target.mark
             before[joint] = target.position
     for joint, (step, mark) in longest.items():
-        if joint in joints and joints[joint].continuous and not joints[joint].linear and joint not in wrap:
+        if (
+            joint in joints
+            and joints[joint].continuous
+            and joints[joint].unit is ROTARY
+            and joint not in wrap
+        ):
             problems.warning(
                 mark,
                 f"{joint} turns by {math.degrees(step):.4g} deg from one point to the next",

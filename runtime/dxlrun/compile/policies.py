@@ -10,7 +10,6 @@ from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
-from dxlrun.description.units import distance_text
 from dxlrun.errors import suggestion
 from dxlrun.plan.policy_plan import (
     HOLD,
@@ -25,10 +24,13 @@ from dxlrun.plan.policy_plan import (
     longest_pose_ns,
 )
 from dxlwire.bus_plan import BusPlan
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.plan.planning import torque_off_ns
 
 MARGIN_NS = 100_000_000
 """For the processor, and for servos that answer only the second time, while torque is switched off."""
+
+_EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
 
 def compile_policies(
@@ -68,12 +70,11 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
             elif joint in joints:
                 plan = joints[joint].plan
                 allowed, mark = limits_of(plan), file.at("poses", pose, joint)
-                if plan.linear != position.linear:
-                    kind, example = ("is linear", "20 mm") if plan.linear else ("turns", "60 deg")
-                    what = f"{joint} {kind}, and pose {pose} has it in {position.unit}"
-                    file.error(mark, what, f"write it as {example}")
+                if plan.unit is not position.joint_unit:
+                    what = f"{joint} {plan.unit.verb}, and pose {pose} has it in {position.unit}"
+                    file.error(mark, what, f"write it as {_EXAMPLES[plan.unit]}")
                 elif not allowed.contains(Interval(position, position)):
-                    what = f"pose {pose} puts {joint} at {distance_text(position, plan.linear, trim=True)}"
+                    what = f"pose {pose} puts {joint} at {plan.unit.text(position, trim=True)}"
                     file.error(mark, what, f"it can go to {allowed}")
 
 
@@ -98,7 +99,7 @@ def _policy(file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoin
                 what = f"{name} has pose {step.pose}, which is not defined"
                 file.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
             else:
-                linear = [joint for joint in angles if joint in joints and joints[joint].plan.linear]
+                linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]
                 if linear and step.linear_speed is None:
                     mark = file.at("policies", name, index)
                     what = f"{name} brings {linear[0]}, which is linear, to pose {step.pose} at no speed"
@@ -114,7 +115,7 @@ def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, C
     for name, position in positions.items():
         if name in joints:
             plan = joints[name].plan
-            asked = (step.linear_speed or math.inf) if plan.linear else step.speed
+            asked = (step.linear_speed or math.inf) if plan.unit is LINEAR else step.speed
             speed = asked if plan.velocity is None else min(asked, plan.velocity)
             way = max(plan.upper - position, position - plan.lower)
             ramps = (math.inf, 0.0) if plan.acceleration is None else (plan.acceleration, plan.highest_speed)

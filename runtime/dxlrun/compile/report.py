@@ -19,6 +19,7 @@ from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
 from dxlwire.bus_plan import BusPlan, DevicePlan, ServoPlan
+from dxlwire.joint_unit import LINEAR
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
@@ -78,12 +79,12 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
         "acceleration": plan.acceleration,
         "effort": None if math.isinf(plan.highest_effort) else plan.highest_effort,
         "effort_source": _source(limits.effort, plan.top_effort is not None),
-        "effort_unit": "N" if unit == "Nm" and plan.linear else unit.replace("1", ""),
+        "effort_unit": plan.unit.effort_unit(unit).replace("1", ""),
         "reach_lower": joint.reach.lower,
         "reach_upper": joint.reach.upper,
         "bounded": plan.bounded,
         "mode": mode.lower().replace("_", " ") + ("" if joint.described.torque else ", limp"),
-        "linear": plan.linear,
+        "linear": plan.unit is LINEAR,
         "servos": [_servo(servo, servos[servo.described.name]) for servo in joint.servos],
     }
 
@@ -94,7 +95,7 @@ def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:
         "joint": described.title,
         **_described(described),
         "ratio": described.ratio,
-        "linear": described.linear,
+        "linear": described.unit is LINEAR,
         "lower_tick": plan.lower_tick,
         "upper_tick": plan.upper_tick,
         "lower": plan.lower_tick * plan.rad_per_tick,

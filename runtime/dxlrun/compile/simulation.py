@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
+from dxlrun.compile.joints.urdf import TYPES
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import SIMULATED, Bus
 from dxlrun.errors import InputError, suggestion
@@ -36,11 +37,13 @@ from dxlsim.simulation_plan import (
 )
 from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import added_control_tables
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
     from dxlwire.bus_plan import ServoPlan
 
+_MOVE: Mapping[JointUnit, str] = {ROTARY: "turn", LINEAR: "move"}
 NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
 INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
@@ -128,7 +131,7 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
     """Return what simulated servos move: the keys, and where there is none that of the servo's motor file."""
     keys = joint.described.simulation
     friction = float(keys.friction or 0.0)
-    if joint.plan.linear:
+    if joint.plan.unit is LINEAR:
         return Load(keys.mass or 0.0, friction, steady=float(keys.gravity or 0.0))
     known = MotorLoad() if motor is None or joint.coupling is not None else motor.motor.load
     ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
@@ -144,31 +147,29 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
 
 def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDescription | None) -> None:
     keys = joint.described.simulation
-    turning = not joint.plan.linear
     if keys.gravity_angle is not None and not _load(joint, motor).gravity:
         file.warning(
             file.at("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
             "give its weight as `gravity: ... Nm`, or take gravity_angle out",
         )
-    stall, unit = _stall(joint), "Nm" if turning else "N"
+    stall, unit = _stall(joint), joint.plan.unit
     models = ", ".join(dict.fromkeys(servo.table.model for servo in joint.servos))
     several = len(joint.servos) > 1
     for key, torque, what in (
-        ("friction", keys.friction, "turn against a friction" if turning else "move against a friction"),
+        ("friction", keys.friction, f"{_MOVE[unit]} against a friction"),
         ("gravity", keys.gravity, "hold a weight"),
     ):
         if torque is not None and 0 < stall <= torque:
             file.warning(
                 file.at("joints", name, "simulation", key),
-                f"the {models} of {name} cannot {what} of {torque:g} {unit}: "
-                f"{'they stall' if several else 'it stalls'} at {stall:g} {unit}",
+                f"the {models} of {name} cannot {what} of {torque:g} {unit.torque}: "
+                f"{'they stall' if several else 'it stalls'} at {stall:g} {unit.torque}",
                 "check the value and its unit",
             )
     if file.robot.simulation.physics == "mujoco":
-        mass = ("inertia", keys.inertia) if turning else ("mass", keys.mass)
-        for key, value in (mass, ("gravity", keys.gravity)):
-            if value is not None:
+        for key in ("inertia", "mass", "gravity"):
+            if getattr(keys, key) is not None:
                 file.warning(
                     file.at("joints", name, "simulation", key),
                     f"with physics: mujoco the URDF defines the {key} of {name}",
@@ -256,7 +257,7 @@ def _bodies(plan: Plan) -> SensedBodies | None:
     joints = (
         None
         if index in coupled
-        else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, servo.linear)
+        else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, TYPES[servo.unit])
         for index, servo in enumerate(_simulated_servos(plan))
     )
     return SensedBodies(UrdfBodies(plan.urdf, tuple(joints)), couplings)
@@ -273,7 +274,6 @@ def _couplings(plan: Plan) -> tuple[Coupling, ...]:
         servos = [by_row[row] for row in one.servos if row in by_row]
         if len(servos) < len(one.servos):
             continue
-        linear = all(servo.linear for _, servo in servos)
         names = tuple(plan.loop.joints[row].name for row in one.joints)
         found.append(
             Coupling(
@@ -284,7 +284,7 @@ def _couplings(plan: Plan) -> tuple[Coupling, ...]:
                 joints=names,
                 matrix=one.matrix,
                 loads=tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names),
-                linear=(linear,) * len(names),
+                types=TYPES[servos[0][1].unit],
             )
         )
     return tuple(found)
@@ -329,7 +329,7 @@ def _felt(servo: ServoPlan, load: Load | None) -> Load:
     if load is None:
         return NO_LOAD
     inertia, friction = load.inertia * servo.ratio**2, load.friction * servo.ratio
-    if servo.linear:
+    if servo.unit is LINEAR:
         return Load(inertia, friction, steady=servo.direction * (load.steady * servo.ratio))
     if not load.gravity:
         return Load(inertia, friction)

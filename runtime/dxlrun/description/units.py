@@ -25,6 +25,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dxlrun.description.form import refuse
 from dxlrun.description.mistakes.syntax import list_text
+from dxlwire.joint_unit import JointUnit
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
@@ -46,9 +47,9 @@ class Measure(float):
         return self
 
     @property
-    def linear(self) -> bool:
-        """True for a length, and what is per length: it is of a linear joint."""
-        return self.unit.startswith("m")
+    def joint_unit(self) -> JointUnit:
+        """Unit of the joints that have such a quantity; raises LookupError for one that no joint has."""
+        return JointUnit.find_by_quantity(self.unit)
 
 
 def plain(measure: Measure | None) -> float | None:

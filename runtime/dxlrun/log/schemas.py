@@ -56,8 +56,10 @@ COMPRESSED_SUFFIX, COMPRESSED_TYPE = ".zst", "application/zstd"
 """Of an attachment that is compressed: its name has this at its end."""
 KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
-FORMAT = "8"
+FORMAT = "9"
 """Grows when a reader of the version before would misread a log."""
+READ_FORMATS = ("8", FORMAT)
+"""Format 8 has another word for the unit of a joint: see `plan.robot_plan.decode_plan`."""
 
 
 def bus_topic(bus: str) -> str:
@@ -405,10 +407,10 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
 
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
-    if text.get("format") != FORMAT:
+    if text.get("format") not in READ_FORMATS:
         raise ValueError(
-            f"it has log format {text.get('format', 'none')}, and this version reads format {FORMAT} only; "
-            "use the version of dxlrun that recorded it"
+            f"it has log format {text.get('format', 'none')}, and this version reads formats "
+            f"{' and '.join(READ_FORMATS)} only; use the version of dxlrun that recorded it"
         )
     try:
         values = {

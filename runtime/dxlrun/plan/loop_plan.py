@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
-from dxlrun.plan.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
+from dxlrun.plan.policy_plan import SLOW_SPEEDS, PolicyPlan
 from dxlsim.motor_model import MotorModel
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 if TYPE_CHECKING:
@@ -27,8 +29,8 @@ ScheduleName = Literal["absolute", "sequential"]
 """When cycles are due, see `control/schedule.py`. `sequential` has no key in the robot file: it is the
 yardstick of `dxlrun experiment tracking`."""
 
-GOAL_TOLERANCE_RAD, GOAL_TOLERANCE_M = math.radians(5.0), 0.005
-"""Default distance from a goal within which a joint has reached it, rad and m; within the same distance a
+GOAL_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(5.0), LINEAR: 0.005}
+"""Default distance from a goal within which a joint has reached it, rad or m; within the same distance a
 second it is at rest."""
 SETTLE_NS = 1_000_000_000
 """Default time after the end of a motion in which its goal may still be reached."""
@@ -90,8 +92,8 @@ class JointPlan(msgspec.Struct, frozen=True):
     """Its servo's motor, of the motor file that the robot file names; None: it names none"""
     servo_model: ServoModel | None = None  # Its servo by the manual; None: several servos move it
 
-    linear: bool = False
-    """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
+    unit: JointUnit = ROTARY
+    """Of its positions; those of its speeds, accelerations and torques follow from it."""
     coupled: tuple[str, ...] = ()
     """The joints that the same servos move, itself among them; empty: none but itself."""
     tolerance: float | None = None
@@ -103,6 +105,11 @@ class JointPlan(msgspec.Struct, frozen=True):
     wrap: bool = False  # A continuous joint to which a turn more is the same place
     servo_limits: tuple[ServoLimit, ...] = ()
     """Registers of its servos that limit goals; empty in the plan, as they are read at the start."""
+
+    @property
+    def linear(self) -> bool:
+        """True: its positions are lengths."""
+        return self.unit is LINEAR
 
     @property
     def label(self) -> str:
@@ -176,14 +183,12 @@ class JointPlan(msgspec.Struct, frozen=True):
     @property
     def goal_tolerance(self) -> float:
         """Distance within which a goal of the joint is reached, rad or m."""
-        default = GOAL_TOLERANCE_M if self.linear else GOAL_TOLERANCE_RAD
-        return default if self.tolerance is None else self.tolerance
+        return GOAL_TOLERANCES[self.unit] if self.tolerance is None else self.tolerance
 
     @property
     def highest_rest_speed(self) -> float:
         """Speed below which the joint counts as at rest, rad/s or m/s."""
-        default = GOAL_TOLERANCE_M if self.linear else GOAL_TOLERANCE_RAD  # per second
-        return default if self.rest_speed is None else self.rest_speed
+        return GOAL_TOLERANCES[self.unit] if self.rest_speed is None else self.rest_speed
 
     def way(self, begin: float, end: float) -> float:
         """Return the signed way from one position to another, the shorter one of a joint that wraps."""
@@ -192,7 +197,7 @@ class JointPlan(msgspec.Struct, frozen=True):
     @property
     def slow_speed(self) -> float:
         """How fast its goals move at most in the first second after torque was switched on."""
-        return SLOW_LINEAR_SPEED if self.linear else SLOW_SPEED
+        return SLOW_SPEEDS[self.unit]
 
     @property
     def rest(self) -> Mode:

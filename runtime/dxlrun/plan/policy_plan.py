@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
+
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 PolicyName = Literal["on_exit", "on_fault", "on_lost_servo", "on_stale_command"]
 POLICIES: tuple[PolicyName, ...] = ("on_exit", "on_fault", "on_lost_servo", "on_stale_command")
@@ -19,7 +22,11 @@ TORQUE_STAYS = (
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
 full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
-SLOW_LINEAR_SPEED = 0.05  # m/s, of linear joints: a gripper's fingers close in a second [i]
+SLOW_SPEEDS: Mapping[JointUnit, float] = {
+    ROTARY: SLOW_SPEED,
+    LINEAR: 0.05,  # a gripper's fingers close in a second [i]
+}
+"""The same for each unit of joints, rad/s or m/s."""
 SLOW_START_NS = 1_000_000_000  # How long after `ease_in` the slow speed holds (failures: limit violation)
 _NEVER_S = 1e9  # What takes longer is as good as endless, and still a whole number of ns
 SETTLE_NS = 300_000_000
@@ -58,6 +65,10 @@ class Step(msgspec.Struct, frozen=True):
     linear_speed: float | None = None  # m/s, of linear joints; None: the pose has none
     fraction: float = 1.0  # Of each servo's own torque limit, at the end of the step
     levels: int = 0  # In how many steps the torque becomes less; 0: it stays
+
+    def speed_of(self, unit: JointUnit) -> float:
+        """Return the speed toward the pose of a joint with this unit, rad/s or m/s."""
+        return (self.linear_speed or 0.0) if unit is LINEAR else self.speed
 
 
 class Policy(msgspec.Struct, frozen=True):

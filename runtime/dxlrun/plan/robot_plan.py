@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import msgspec
 
@@ -14,6 +14,8 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlsim.motor_model import MotorModel
 from dxlsim.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
 from dxlwire.bus_plan import BusPlan, ServoPlan
+
+Parts = TypeVar("Parts")
 
 
 class SimulationPlan(msgspec.Struct, frozen=True):
@@ -103,6 +105,15 @@ def to_json(plan: Plan) -> bytes:
 
 def from_json(data: bytes) -> Plan:
     """Decode a plan; raises msgspec.ValidationError when it is not one."""
-    import msgspec
+    return decode_plan(data, Plan)
 
-    return msgspec.json.decode(data, type=Plan)
+
+def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
+    """Decode those parts of a plan that a struct has; raises msgspec.MsgspecError when it is not a plan.
+
+    Logs of format 8 say `linear`, a boolean, of joints and servos, in place of their unit. Quotes inside a
+    string are escaped in JSON, so only a key matches.
+    """
+    import msgspec  # not above: to check a robot needs no JSON
+
+    return msgspec.json.decode(data.replace(b'"linear":true', b'"unit":"m"'), type=parts)

@@ -23,6 +23,7 @@ from dxlwire.bus_plan import (
 )
 from dxlwire.control_table import ControlTable
 from dxlwire.control_table.device_table import WAITS, DeviceTable
+from dxlwire.joint_unit import ROTARY, JointUnit
 from dxlwire.modes import Mode
 from dxlwire.plan.line import MOST_SPARE, Line
 from dxlwire.plan.mode_plan import (
@@ -58,7 +59,7 @@ class Wiring(msgspec.Struct, frozen=True):
     start_mode: Mode | None = None
     """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
     ratio: float = 1.0  # What the joint moves while the servo turns by 1 rad, rad or m
-    linear: bool = False  # The joint's positions are m
+    unit: JointUnit = ROTARY  # Of the joint's positions
     name: str = ""  # The servo's own, where several move one joint
 
 
@@ -206,7 +207,7 @@ def _servo(joint: Wiring) -> ServoPlan:
         continuous=joint.continuous,
         registers=joint.registers,
         ratio=joint.ratio,
-        linear=joint.linear,
+        unit=joint.unit,
         name=joint.name,
     )
 

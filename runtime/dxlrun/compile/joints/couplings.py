@@ -15,12 +15,11 @@ from dxlrun.description.joints.joints import ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import (
     LEAST_RATIO,
     MOST_RATIO,
-    TOLERANCE_M,
-    TOLERANCE_RAD,
+    SERVO_TOLERANCES,
     Transmission,
 )
-from dxlrun.description.units import distance_text
 from dxlrun.errors import Mark, suggestion
+from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes
 
@@ -71,9 +70,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
                     known,
                     matrix=((1.0 / count,) * count,),
                     inverse=((1.0,),) * count,
-                    tolerance=float(
-                        joint.tolerance.servos or (TOLERANCE_M if joint.linear else TOLERANCE_RAD)
-                    ),
+                    tolerance=float(joint.tolerance.servos or SERVO_TOLERANCES[joint.unit]),
                     transmission=False,
                 )
                 if _agree(file, coupling):
@@ -93,7 +90,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
             known,
             matrix=matrix[0],
             inverse=matrix[1],
-            tolerance=float(transmission.tolerance or TOLERANCE_RAD)
+            tolerance=float(transmission.tolerance or SERVO_TOLERANCES[ROTARY])
             if len(known) > len(transmission.joints)
             else 0.0,
             transmission=True,
@@ -370,7 +367,7 @@ def _fits(
         upper = needed.upper - reach.upper > reach.lower - needed.lower
         end = needed.upper if upper else needed.lower
         corner = " and ".join(
-            f"{joint} at {distance_text(one.upper if (factor > 0) is upper else one.lower, False, trim=True)}"
+            f"{joint} at {ROTARY.text(one.upper if (factor > 0) is upper else one.lower, trim=True)}"
             for joint, factor, one in zip(coupling.joints, row, limits, strict=True)
             if factor
         )

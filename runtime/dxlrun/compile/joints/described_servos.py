@@ -12,6 +12,7 @@ from dxlrun.description.joints.mechanics import Register
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlwire.bus_plan import ServoPlan
+from dxlwire.joint_unit import ROTARY, JointUnit
 
 
 class DescribedServo(msgspec.Struct, frozen=True):
@@ -28,7 +29,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
     reference: float  # rad from the servo's raw 0
     direction: int
     ratio: float  # What its joint, or its transmission's input, moves while it turns by 1 rad: rad or m
-    linear: bool
+    unit: JointUnit  # Of the positions of what it moves
     continuous: bool
     torque: bool
     registers: Mapping[str, Register]
@@ -71,7 +72,7 @@ def described_servos(description: Description) -> list[DescribedServo]:
                     reference=servo.reference,
                     direction=servo.direction,
                     ratio=1.0 / servo.gear_ratio,
-                    linear=False,
+                    unit=ROTARY,
                     continuous=any(joint.continuous for joint in moved),
                     torque=all(joint.torque for joint in moved),
                     registers=servo.registers,
@@ -105,7 +106,7 @@ def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
             reference=joint.reference if own is None or own.reference is None else own.reference,
             direction=joint.direction if own is None or own.direction is None else own.direction,
             ratio=joint.ratio,
-            linear=joint.linear,
+            unit=joint.unit,
             continuous=joint.continuous,
             torque=joint.torque,
             registers=joint.registers if own is None or own.registers is None else own.registers,

@@ -18,7 +18,7 @@ from dxlrun.compile.joints.couplings import (
     top_efforts,
     top_speeds,
 )
-from dxlrun.compile.joints.limits import Interval, degrees, speed_unit
+from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
 from dxlrun.compile.problems import RobotFile
@@ -28,6 +28,7 @@ from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPla
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import ControlTable
+from dxlwire.joint_unit import LINEAR
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes
 
@@ -188,7 +189,7 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         servo=_servo_label(servos),
         motor=_at_joint(first, levers) if same else None,
         servo_model=first.servo_model if coupling is None else None,
-        linear=first.described.linear,
+        unit=first.described.unit,
         coupled=() if coupling is None or len(coupling.joints) < 2 else coupling.joints,
         tolerance=_limited(joint.tolerance.position),
         rest_speed=_limited(joint.tolerance.velocity),
@@ -295,7 +296,7 @@ def check_tolerances(
     by_error = {name for plan in plans if plan.command in _BY_ERROR for name in plan.joints}
     for name, joint in joints.items():
         plan, described = joint.plan, joint.described
-        if name not in by_error or plan.linear or _I_GAIN in getattr(described, "registers", {}):
+        if name not in by_error or plan.unit is LINEAR or _I_GAIN in getattr(described, "registers", {}):
             continue
         error = _static_error(joint)
         if error is not None and error > plan.goal_tolerance:
@@ -334,9 +335,7 @@ def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo)
         return None
     value, unit = float(joint.limits.effort), joint.limits.effort.unit
     table = servo.table
-    measured: str = table.effort_unit
-    if servo.described.linear and measured == "Nm":
-        measured = "N"
+    measured = servo.described.unit.effort_unit(table.effort_unit)
     if unit != measured:
         file.error(
             file.at("joints", name, "limits", "effort"),
@@ -354,7 +353,7 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
         return
     mark, unit = (
         file.at("joints", plan.name, "limits", "acceleration"),
-        speed_unit(plan.linear),
+        plan.unit.speed,
     )
     seconds = speed / acceleration
     if seconds > MOST_STARTING_S:
@@ -378,7 +377,7 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
     if limits is None:
         return reach
     mark = file.at("joints", name, "limits", "position")
-    written = Interval(float(limits[0]), float(limits[1]), reach.linear)
+    written = Interval(float(limits[0]), float(limits[1]), reach.unit)
     allowed = written.meet(reach)
     if allowed is None:
         file.error(

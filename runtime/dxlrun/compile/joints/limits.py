@@ -11,9 +11,9 @@ import msgspec
 
 from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import CommandModel, SpeedPeak
-from dxlrun.description.units import distance_text
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
+from dxlwire.joint_unit import ROTARY, JointUnit
 
 if TYPE_CHECKING:
     from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone
@@ -32,7 +32,7 @@ class Interval(msgspec.Struct, frozen=True):
 
     lower: float
     upper: float
-    linear: bool = False
+    unit: JointUnit = ROTARY
 
     def contains(self, other: Interval) -> bool:
         """Return whether `other` lies inside, but for rounding."""
@@ -41,41 +41,25 @@ class Interval(msgspec.Struct, frozen=True):
     def meet(self, other: Interval) -> Interval | None:
         """Return what both have in common; None when that is not more than a point."""
         lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
-        return Interval(lower, upper, self.linear) if lower < upper else None
+        return Interval(lower, upper, self.unit) if lower < upper else None
 
-    def scaled(self, ratio: float, *, linear: bool) -> Interval:
+    def scaled(self, ratio: float, unit: JointUnit) -> Interval:
         """Return the interval of what moves by `ratio`, above 0, while this moves by 1."""
-        return Interval(self.lower * ratio, self.upper * ratio, linear)
+        return Interval(self.lower * ratio, self.upper * ratio, unit)
 
     def __str__(self) -> str:
-        unit = "mm" if self.linear else "deg"
-        return f"{number(self.lower, self.linear)}..{number(self.upper, self.linear)} {unit}"
+        lower, upper = (self.unit.number(end, signed=True) for end in (self.lower, self.upper))
+        return f"{lower}..{upper} {self.unit.shown}"
 
 
 def limits_of(joint: JointPlan) -> Interval:
     """Return where the gate lets a joint go."""
-    return Interval(joint.lower, joint.upper, joint.linear)
+    return Interval(joint.lower, joint.upper, joint.unit)
 
 
-def degrees(angle: float, *, signed: bool = False) -> str:
+def degrees(angle: float) -> str:
     """Write an angle of `angle` rad in degrees, with as many digits as it needs, at most two."""
-    return _digits(math.degrees(angle), signed=signed)
-
-
-def number(position: float, linear: bool) -> str:
-    """Write a position in degrees, or mm of a linear joint, with its sign and at most two digits."""
-    return _digits(position * 1e3 if linear else math.degrees(position), signed=True)
-
-
-def speed_unit(linear: bool) -> str:
-    """Return the SI unit of a joint's speed."""
-    return "m/s" if linear else "rad/s"
-
-
-def _digits(value: float, *, signed: bool) -> str:
-    value = round(value, 2) + 0.0  # + 0.0: no minus sign before zero
-    text = f"{value:.2f}".rstrip("0").rstrip(".")
-    return f"+{text}" if signed and value > 0 else text
+    return ROTARY.number(angle)
 
 
 def check_samples(
@@ -92,7 +76,7 @@ def check_samples(
     """
     farthest, fastest = _worst(samples, joints, peaks)
     for joint, (_, sample, position) in farthest.items():
-        where = distance_text(position, joints[joint].linear, trim=True)
+        where = joints[joint].unit.text(position, trim=True)
         problems.warning(
             sample.targets[joint].mark,
             f"{joint} is sent to {where} at {(start_ns + sample.t_ns) * 1e-9:.3f} s, outside its limits "
@@ -140,7 +124,7 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
     own = beyond_servo or most != joint.velocity
     limit = register or ("the top speed of its servo" if own else "its velocity limit")
     shown = top if beyond_servo and top is not None and not register else most
-    unit = speed_unit(joint.linear)
+    unit = joint.unit.speed
     text = f"{joint.name} is asked for {speed:.4g} {unit}{where}, more than {shown:.4g} {unit}, {limit}"
     fix = "give it more time"
     if 0 < abs(speed) < _MOST_LONGER * most:
@@ -221,8 +205,8 @@ def beyond_limits(
 def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[BeyondLimit]:
     for joint, position in zip(joints, _row(joints, values, "positions"), strict=False):
         if not joint.lower - _TOLERANCE <= position <= joint.upper + _TOLERANCE:
-            written = f"{position * 1e3:.6g} mm" if joint.linear else f"{math.degrees(position):.6g} deg"
-            text = f"{joint.name} is sent to {written}{where}, outside its limits {limits_of(joint)}"
+            sent = joint.unit.exact_text(position)
+            text = f"{joint.name} is sent to {sent}{where}, outside its limits {limits_of(joint)}"
             yield BeyondLimit(joint.name, text)
     for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
         if (excess := excess_speed(joint, speed, where)) is not None:

@@ -49,7 +49,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
             reach = many_turns(self.table.protocol, described.reference, described.direction)
         else:
             reach = joint_reach(servo_travel(self.table), described.reference, described.direction)
-        return reach.scaled(described.ratio, linear=described.linear)
+        return reach.scaled(described.ratio, described.unit)
 
     @property
     def top_speed(self) -> float:

@@ -12,12 +12,16 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval, limits_of, speed_unit
+from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import read_text
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
 from dxlrun.errors import InputError, suggestion
 from dxlsim.geometry.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
+
+TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: TURNING, LINEAR: (SLIDING,)}
+"""Types of joints of a URDF whose positions have this unit."""
 
 
 class CompiledUrdf(msgspec.Struct, frozen=True):
@@ -97,7 +101,7 @@ def compile_frames(
 
 def _alike(joint: CompiledJoint, drawn: UrdfJoint) -> bool:
     """Return whether a position of a joint is one of the joint in the URDF: an angle, or a length."""
-    return drawn.type == SLIDING if joint.plan.linear else drawn.type in TURNING
+    return drawn.type in TYPES[joint.plan.unit]
 
 
 def _check_names(
@@ -116,14 +120,14 @@ def _check_names(
         file.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
     unlike = [name for name in joints if name in drawn and drawn[name].moves]
     unlike = [name for name in unlike if not _alike(joints[name], drawn[name])]
-    sliding = [name for name in unlike if not joints[name].plan.linear]
+    sliding = [name for name in unlike if joints[name].plan.unit is ROTARY]
     if sliding:
         file.warning(
             mark,
             f"the URDF slides {', '.join(sliding)}, whose positions are angles, so frames show it at rest",
             "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
         )
-    turning = [name for name in unlike if joints[name].plan.linear]
+    turning = [name for name in unlike if joints[name].plan.unit is LINEAR]
     if turning:
         file.warning(
             mark,
@@ -148,7 +152,7 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
     limits = drawn.limits
     allowed = limits_of(joint.plan)
     if drawn.type != "continuous" and limits.lower is not None and limits.upper is not None:
-        shown = Interval(limits.lower, limits.upper, joint.plan.linear)
+        shown = Interval(limits.lower, limits.upper, joint.plan.unit)
         if not shown.contains(allowed):
             file.warning(
                 marks.value("joints", name, "limits", "position"),
@@ -156,7 +160,7 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
                 "make both alike",
             )
     own = joint.described.limits.velocity
-    unit = speed_unit(joint.plan.linear)
+    unit = joint.plan.unit.speed
     if limits.velocity and own is not None and own > limits.velocity:
         file.warning(
             marks.value("joints", name, "limits", "velocity"),

@@ -39,6 +39,7 @@ from dxlrun.description.units import (
     speed,
     torque_or_force,
 )
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
 """Of simulated servos; real ones are quicker by far."""
@@ -147,9 +148,9 @@ class ServoJoint(BareJoint):
     )
 
     @property
-    def linear(self) -> bool:
-        """True: its positions are lengths."""
-        return self.travel_per_turn is not None
+    def unit(self) -> JointUnit:
+        """Unit of its positions: lengths with `travel_per_turn`, angles without."""
+        return ROTARY if self.travel_per_turn is None else LINEAR
 
     @property
     def ratio(self) -> float:
@@ -210,44 +211,45 @@ JointEntry = Annotated[
     Discriminator(kind_of_joint),
 ]
 
-_MEASURES: Mapping[KeyPath, tuple[Either, tuple[str, str]]] = {
-    ("limits", "position"): (position, ("[-90 deg, 90 deg]", "[0 mm, 40 mm]")),
-    ("limits", "velocity"): (speed, ("2 rad/s", "50 mm/s")),
-    ("limits", "acceleration"): (acceleration, ("20 rad/s^2", "500 mm/s^2")),
-    ("simulation", "friction"): (torque_or_force, ("0.05 Nm", "2 N")),
-    ("simulation", "gravity"): (torque_or_force, ("0.3 Nm", "1.5 N")),
-    ("tolerance",): (position, ("3 deg", "1 mm")),
-    ("tolerance", "servos"): (position, ("3 deg", "1 mm")),
-    ("tolerance", "position"): (position, ("2 deg", "2 mm")),
-    ("tolerance", "velocity"): (speed, ("2 deg/s", "2 mm/s")),
+_MEASURES: Mapping[KeyPath, tuple[Either, Mapping[JointUnit, str]]] = {
+    ("limits", "position"): (position, {ROTARY: "[-90 deg, 90 deg]", LINEAR: "[0 mm, 40 mm]"}),
+    ("limits", "velocity"): (speed, {ROTARY: "2 rad/s", LINEAR: "50 mm/s"}),
+    ("limits", "acceleration"): (acceleration, {ROTARY: "20 rad/s^2", LINEAR: "500 mm/s^2"}),
+    ("simulation", "friction"): (torque_or_force, {ROTARY: "0.05 Nm", LINEAR: "2 N"}),
+    ("simulation", "gravity"): (torque_or_force, {ROTARY: "0.3 Nm", LINEAR: "1.5 N"}),
+    ("tolerance",): (position, {ROTARY: "3 deg", LINEAR: "1 mm"}),
+    ("tolerance", "servos"): (position, {ROTARY: "3 deg", LINEAR: "1 mm"}),
+    ("tolerance", "position"): (position, {ROTARY: "2 deg", LINEAR: "2 mm"}),
+    ("tolerance", "velocity"): (speed, {ROTARY: "2 deg/s", LINEAR: "2 mm/s"}),
 }
 """Keys whose unit goes with the joint: how they are written where it turns, and where it is linear."""
-_TURNING: Mapping[KeyPath, str] = {
-    ("gear_ratio",): "take it out; travel_per_turn is its gear",
-    ("simulation", "inertia"): "a linear joint has a mass; write `mass: 0.2 kg`",
-    ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; take gravity_angle out",
+_OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
+    ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
+    LINEAR: {
+        ("gear_ratio",): "take it out; travel_per_turn is its gear",
+        ("simulation", "inertia"): "a linear joint has a mass; write `mass: 0.2 kg`",
+        ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; take gravity_angle out",
+    },
 }
-"""Keys that a linear joint does not have."""
-_LINEAR: Mapping[KeyPath, str] = {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"}
-"""Keys that only a linear joint has."""
+"""Keys that joints with this unit do not have, each with a fix."""
 
 
 def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
-    """Yield what is of a linear joint where a joint turns, and the other way: path, what is wrong, and fix.
+    """Yield what is of another kind of joint: path, problem, and fix.
 
     `joints` as the file has them; what is wrong with their form is for the model.
     """
     for name, entry in joints.items() if isinstance(joints, dict) else ():
-        linear = isinstance(entry, dict) and "travel_per_turn" in entry
-        is_so = f"{name} {'is linear' if linear else 'turns'}"
-        for path, fix in (_TURNING if linear else _LINEAR).items():
+        unit = LINEAR if isinstance(entry, dict) and "travel_per_turn" in entry else ROTARY
+        is_so = f"{name} {unit.verb}"
+        for path, fix in _OF_OTHER_JOINTS[unit].items():
             if _written(entry, path) is not None:
                 yield ("joints", name, *path), f"{is_so}, and has no {path[-1]}", fix
         for path, (kind, examples) in _MEASURES.items():
-            for step, unit in _units(kind, _written(entry, path)):
-                if (unit in ("m", "m/s", "m/s^2", "N")) is not linear:
-                    what = f"{is_so}, and its {path[-1]} is in {unit}"
-                    yield ("joints", name, *path, *step), what, f"write it as {examples[linear]}"
+            for step, written in _units(kind, _written(entry, path)):
+                if JointUnit.find_by_quantity(written) is not unit:
+                    what = f"{is_so}, and its {path[-1]} is in {written}"
+                    yield ("joints", name, *path, *step), what, f"write it as {examples[unit]}"
 
 
 def _written(entry: object, path: KeyPath) -> object:

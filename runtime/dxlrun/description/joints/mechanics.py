@@ -7,6 +7,7 @@ joint of one servo is q = s, of several servos the mean of theirs, and a transmi
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -32,21 +33,21 @@ from dxlrun.description.units import (
     RestSpeed,
     Speed,
 )
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
 """Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
 LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0  # Travel a servo turn; as above
-TOLERANCE_RAD = math.radians(3.0)
+SERVO_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(3.0), LINEAR: 1e-3}
 """By which the servos of one joint may disagree if the file gives nothing: backlash, a loaded gear. [i]"""
-TOLERANCE_M = 1e-3  # The same of a linear joint. [i]
 
 MotorFile = Annotated[str, Field(min_length=1)]  # Name of a motor file, as `dxlrun identify` writes it
-_MOST_TOLERANCE_RAD = math.radians(20.0)
+_MOST_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(20.0), LINEAR: math.inf}
 """Servos that are further apart pull against each other, whatever they hold. [i]"""
 
 
 def _useful(value: Measure) -> Measure:
-    if value > _MOST_TOLERANCE_RAD and not value.linear:
+    if value > _MOST_TOLERANCES[value.joint_unit]:
         raise refuse(
             "a tolerance above 20 deg would let servos pull against each other unseen",
             "write for example 3 deg",

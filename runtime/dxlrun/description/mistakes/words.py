@@ -128,8 +128,8 @@ class Context:
         """Return how a lower and an upper limit are written, either of which may be missing."""
         values = [unknown.get(limits.get(side, "")) for side in ("lower", "upper")]
         of_urdf = not {"lower", "upper"}.isdisjoint(limits.values())
-        linear = "travel_per_turn" in self.present
-        written = _limits_text([*values], of_urdf=of_urdf, linear=linear)
+        length = ("m" if of_urdf else "mm") if "travel_per_turn" in self.present else ""
+        written = _limits_text([*values], of_urdf=of_urdf, length=length)
         said = "limits are angles, not ticks: write for example" if written is None else "write"
         text, condition = written or ("[-90 deg, 90 deg]", "")
         return f"{said} `{self._at(('limits', 'position'), text)}`{condition}"
@@ -312,14 +312,20 @@ def _plain(value: object, example: str) -> _Written:
     return (_yaml(value), "") if unit is None or isinstance(value, str) else None
 
 
-def _limits_text(values: list[object], *, of_urdf: bool = False, linear: bool = False) -> _Written:
-    """Return a lower and an upper limit as a list; a missing one (None) is named in capitals."""
+def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "") -> _Written:
+    """Return a lower and an upper limit as a list; a missing one (None) is named in capitals.
+
+    Args:
+        values: The limits as they are written.
+        of_urdf: They are written as in a URDF, in SI.
+        length: Unit of the limits of a linear joint; empty: the joint turns.
+    """
     numbers = [abs(value) for value in values if isinstance(value, int | float)]
     if numbers and max(numbers) > _LARGEST_ANGLE and not of_urdf:
         return None
     in_rad = of_urdf or any(isinstance(number, float) and number % 1 for number in numbers)
     turns = "rad" if in_rad and max(numbers, default=0) <= _TURN else "deg"
-    unit = ("m" if of_urdf else "mm") if linear else turns
+    unit = length or turns
     texts = [
         name if value is None else f"{_yaml(value)} {unit}" if _is_number(value) else _yaml(value)
         for value, name in zip(values, ("LOWER", "UPPER"), strict=True)
