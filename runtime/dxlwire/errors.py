@@ -4,6 +4,7 @@
 Exception
 └── DxlError                       every error that is raised on purpose; exit code 1
     ├── InputError (ValueError)    a file or an argument is wrong; exit code 2
+    ├── NotCompiled                a compiled C source is missing; the installation is broken
     └── PortError (OSError)        a serial line cannot be opened, or is gone
 ```
 """
@@ -65,6 +66,10 @@ class InputError(DxlError, ValueError):
         self.problems: tuple[Problem, ...] = () if isinstance(problems, str) else tuple(problems)
         text = problems if isinstance(problems, str) else "\n".join(str(problem) for problem in problems)
         super().__init__(text)
+
+
+class NotCompiled(DxlError, RuntimeError):
+    """The shared object of a C source is missing, or was compiled from another source."""
 
 
 class PortError(DxlError, OSError):

@@ -15,7 +15,6 @@ from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
@@ -23,6 +22,7 @@ from dxlrun.output.table import microseconds
 from dxlrun.output.terminal import show
 from dxlrun_analysis.cycles.latency import Durations, Punctuality
 from dxlrun_analysis.report import Report, analyze_log, parts, tables
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 ASK_5 = bytes.fromhex("ffff0504022406ca")

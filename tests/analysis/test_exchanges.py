@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import pytest
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Pairing
 from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
+from dxlwire.packets import PacketKind
 
 ASK, STATUS, NOISE, LATE = PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.NOISE, PacketKind.LATE
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000)

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.report import analyze_log
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 IDS = (1, 2, 3, 4)

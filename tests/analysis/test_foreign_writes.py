@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 from dxlwire.control_table import control_table
+from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol1, protocol2
 
 S = 10**9

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from tests.analysis.stranger.kit import JOINTS, ROBOTS, Story
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.servos.joint_states import BINS
 from dxlrun_analysis.servos.losses import narrowest
 from dxlrun_analysis.servos.traffic import Traffic
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 SYNC_READ = bytes.fromhex("fffffd00fe0a0082840004000307040000")  # servos 3, 7 and 4

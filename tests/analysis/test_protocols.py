@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from tests.kit.made_logs import PLAN
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun_analysis.report import analyze_log
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 SYNC_READ = bytes.fromhex("fffffd00fe090082840004000102cefa")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
@@ -16,6 +16,7 @@ from dxlrun_analysis.servos.exchanges import Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.reply_times import ReplyTimes
+from dxlwire.packets import PacketKind
 
 IDS = (1, 2, 3)
 CYCLES = 300

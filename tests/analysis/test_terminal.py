@@ -11,10 +11,10 @@ from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show
 from dxlrun_analysis.report import Report, analyze_log, parts
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 

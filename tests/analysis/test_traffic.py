@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from tests.analysis import traffic_oracle as oracle
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import read_log
 from dxlrun.testing import simulated_robot
@@ -18,6 +18,7 @@ from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.traffic import Traffic
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
+from dxlwire.packets import PacketKind
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 VARIOUS = ("bioloid_torso", "humanoid_20", "mechanics", "wolfgang")

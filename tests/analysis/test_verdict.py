@@ -17,7 +17,6 @@ from tests.kit.totals import totals_of
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode, EventGroup, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
@@ -38,6 +37,7 @@ from dxlrun_analysis.tally import RealTime, RunTotals, Tally
 from dxlrun_analysis.verdict import judge
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, NamedTuple
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.traffic import error_names
+from dxlwire.packets import PacketKind
 
 BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s
 BROADCAST_ID = 0xFE

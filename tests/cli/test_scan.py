@@ -6,9 +6,9 @@ import sys
 import yaml
 from tests.kit.answers import result_of
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.packets import PacketKind
 
 
 def servos(*models):

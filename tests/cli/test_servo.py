@@ -9,13 +9,13 @@ import time
 import pytest
 from tests.kit.answers import result_of
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.packets import PacketKind
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")

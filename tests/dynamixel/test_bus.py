@@ -1,9 +1,9 @@
 import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import PortError
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketKind
 from dxlwire.plan.line import Line, listen
 from dxlwire.transaction import Outcome, ProgramJob, Reply
 from dxlwire.wire import protocol1, protocol2

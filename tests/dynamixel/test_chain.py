@@ -3,8 +3,8 @@
 import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
-from dxlrun.channels.packets import PacketLog
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketLog
 from dxlwire.plan.line import Line
 from dxlwire.transaction import Outcome
 from dxlwire.wire import protocol2

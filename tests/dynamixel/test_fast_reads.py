@@ -8,8 +8,8 @@ from tests.kit.line_faults import corrupt_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlwire.control_table import control_table, model_names
+from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol2
 
 IDS = rigs.X_IDS

@@ -18,15 +18,15 @@ from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
-from dxlrun.channels.compiled import structs
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.packets import RECORD_HEADER, PacketKind
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.errors import StartUpError
 from dxlwire.clock import MonotonicClock
+from dxlwire.compiled import parse_structs
+from dxlwire.errors import NotCompiled
 from dxlwire.exchange import bus, kernel
 from dxlwire.exchange.bus import FREE_NS
 from dxlwire.exchange.cyclic_reads import CALM_CYCLES
+from dxlwire.packets import RECORD_HEADER, PacketKind
 from dxlwire.port import ports
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.wire import protocol2
@@ -129,9 +129,9 @@ def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monk
     kernel.library(path=tmp_path / "libkernel.so")
     (tmp_path / "kernel.c").write_text("int changed;")
     monkeypatch.setattr(kernel, "SOURCE", tmp_path / "kernel.c")
-    with pytest.raises(StartUpError, match=r"of another source than kernel\.c .* install dxlrun again"):
+    with pytest.raises(NotCompiled, match=r"of another source than kernel\.c .* install dxlrun again"):
         kernel.library(path=tmp_path / "libkernel.so")
-    with pytest.raises(StartUpError, match=r"^the compiled kernel is missing: install dxlrun again"):
+    with pytest.raises(NotCompiled, match=r"^the compiled kernel is missing: install dxlrun again"):
         kernel.library(path=tmp_path / "absent.so")
 
 
@@ -149,7 +149,7 @@ typedef struct Big {
     float last;
 } Big;
 """
-    small, big = structs(source).values()
+    small, big = parse_structs(source).values()
     assert [(name, ctypes.sizeof(kind)) for name, kind in small._fields_] == [("one", 2), ("two", 2)]
     sizes = {"many": 8, "more": 8, "flags": 3, "own": 8, "call": 8, "last": 4}
     assert {name: ctypes.sizeof(kind) for name, kind in big._fields_} == sizes

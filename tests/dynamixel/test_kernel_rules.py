@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import fuzz_kernel as fuzz
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import PortError
+from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol1, protocol2
 
 DATA = bytes((0, 2, 0, 0, 0, 0, 0, 2, 0, 0))

@@ -3,10 +3,10 @@
 import pytest
 from tests.kit.answers import result_of
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.log.reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.packets import PacketKind
 
 ROBOT = """\
 name: pair

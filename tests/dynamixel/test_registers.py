@@ -5,7 +5,6 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import PacketLog
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach, reach
@@ -15,6 +14,7 @@ from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import all_tables, control_table
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketLog
 
 
 def register(table, name, value):

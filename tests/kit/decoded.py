@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind, split_packets
+from dxlrun.channels.packets import LoggedPacket, split_packets
 from dxlrun.channels.ring import Payload
+from dxlwire.packets import PacketKind
 
 
 def decode_packets(payload: Payload) -> list[LoggedPacket]:

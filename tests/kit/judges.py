@@ -17,13 +17,13 @@ from typing import NamedTuple
 from tests.kit.line_faults import OTHER_HOST
 
 from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
 from dxlrun_analysis.plan import plan_of
 from dxlsim.bus.ledger import FAULT, LedgerEntry
 from dxlsim.faults.fault import Fault, parse_fault
 from dxlsim.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
+from dxlwire.packets import PacketKind
 
 WINDOW_NS = 2_000_000_000
 """An event that comes later reports something else [i]."""

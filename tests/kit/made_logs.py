@@ -12,12 +12,13 @@ from msgspec import structs
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun_analysis.plan import NO_LOOP
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_yaw_joint")

@@ -28,7 +28,7 @@ from tests.kit.line_faults import corrupt_next, truncate_next
 
 from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlsim.bus.ledger import Ledger
@@ -40,6 +40,7 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.clock import VirtualClock
 from dxlwire.control_table import control_table
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketKind
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.port.ports import OwnProcessors
 

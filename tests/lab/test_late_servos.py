@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from tests.kit.made_logs import Cycle, Wire, made_log
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun_lab.late_servos import overruns_by_servos, transactions, waits_for_servos
 from dxlsim.bus.ledger import LedgerEntry
+from dxlwire.packets import PacketKind
 
 PERIOD_US = 20_000
 ASKED = b"\xff\xff\x05\x04\x02\x24\x02\xcc"

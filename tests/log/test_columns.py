@@ -17,7 +17,7 @@ from tests.kit.pages import page_text
 
 import dxlrun
 from dxlrun import LogError, open_log
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import InputError
 from dxlrun.log import reader as log_reader
@@ -27,6 +27,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import ColumnReader
 from dxlrun.messages.definition import MessageType
+from dxlwire.packets import PacketKind
 
 Cycle = Callable[[int], bytes]
 RULE = "=" * 80

@@ -25,12 +25,13 @@ import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import LogReader, open_log, read_log
 from dxlrun.log.schemas import LogHeader
+from dxlwire.packets import PacketKind
 
 pytestmark = pytest.mark.campaign
 COUNT = int(os.environ.get("DXLRUN_DAMAGE", "60"))

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import LogFollower, read_log
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import MOST_FAILED, Event, EventCode, EventRing, GoalReport, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
@@ -37,6 +37,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
 from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
 
 Cycle = Callable[[int], bytes]
 PACKETS = [

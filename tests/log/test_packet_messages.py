@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind
+from dxlrun.channels.packets import BatchedPacket, PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log import log_writer, schemas
 from dxlrun.log.columns import PacketColumns
@@ -23,6 +23,7 @@ from dxlrun.log.packing.bus_messages import pack_packets, read_packets
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
+from dxlwire.packets import PacketKind
 
 PACKETS = [
     (0, PacketKind.INSTRUCTION, 254, 1, 2, b"\xff\xff\xfe\x02\x01\xfe"),

@@ -15,7 +15,7 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import LogFile
@@ -27,6 +27,7 @@ from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_analysis.cycles.latency import Punctuality
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
 
 SECOND = 1_000_000_000
 PER_SECOND = 50

@@ -23,13 +23,14 @@ import pytest
 from dxlrun.channels import ring
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
-from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
+from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
 from dxlrun.log.schemas import MACHINE_TOPIC, CycleSpan, LogHeader, RecorderJob
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
 
 Cycle = Callable[[int], bytes]
 

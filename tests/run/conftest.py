@@ -19,10 +19,10 @@ import pytest
 from tests.kit.stories import plugin_folder
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
 from dxlrun_controllers.group import JointGroupPositionController
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
+from dxlwire.packets import PacketKind
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\

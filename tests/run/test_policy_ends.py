@@ -12,7 +12,7 @@ from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.events import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
-from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
@@ -22,6 +22,7 @@ from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.testing import plan_of, simulated_robot
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketKind
 
 Start = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("no_memory_left")

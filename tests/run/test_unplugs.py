@@ -29,8 +29,8 @@ import pytest
 from tests.kit.answers import result_of
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import PacketKind
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
+from dxlwire.packets import PacketKind
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 A_RUN = 10

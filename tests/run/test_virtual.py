@@ -12,12 +12,12 @@ import pytest
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.joints.tracking import tracking
+from dxlwire.packets import PacketKind
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

@@ -20,7 +20,6 @@ from dxlrun.channels import heartbeat, process
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.events import Event, EventCode, EventRing, Severity, Waited
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
-from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
 from dxlrun.compile.robot import compile_robot
@@ -50,6 +49,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
 from dxlwire.exchange import bus
+from dxlwire.packets import PacketLog
 from dxlwire.port.ports import StallCounter
 from dxlwire.port.reopening import KeptLines
 

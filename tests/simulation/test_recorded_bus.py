@@ -14,7 +14,6 @@ from msgspec.structs import replace
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
@@ -27,6 +26,7 @@ from dxlsim.bus.recorded_bus import RecordedBus
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.messages import SimulationJob, SimulationMessage
 from dxlsim.simulation_plan import BusConfig, SimulationConfig
+from dxlwire.packets import PacketKind
 from exchange.simulated import SimulatedServos
 
 ROBOT = """\

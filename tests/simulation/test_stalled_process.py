@@ -15,12 +15,12 @@ from tests.kit.rigs import make_plan
 
 from dxlrun.channels import process
 from dxlrun.channels.heartbeat import SimulationProgress, create_progress
-from dxlrun.channels.packets import PacketSink
 from dxlrun.run.simulation_front import first_message, start_simulation
 from dxlsim.messages import SimulationJob
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlwire.clock import MonotonicClock
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketSink
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.retry import ReplyTimes, extend_timeouts
 from dxlwire.port.ports import SerialPorts, SimulatedPort, StallCounter

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.reader import Log, LogReader
@@ -25,6 +24,7 @@ from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import parse, short_name
 from dxlwire.modes import Mode
+from dxlwire.packets import PacketKind
 
 CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one

@@ -5,16 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum, unique
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, RingWriter, record_size
+from dxlwire.packets import RECORD, RECORD_HEADER, Desk, PacketKind, PacketLog
 
 LONGEST_BATCH = 16 * 1024
 """Bytes: a batch has the packets of one cycle, of a large robot and of noisy lines in pieces of this size."""
 
-_HEADER = struct.Struct("<BBBxI qq")
-RECORD_HEADER = _HEADER.size
-"""Bytes in front of the packet in its record; its two times, 64-bit each, are the last of them."""
 _BATCH = struct.Struct("<QQ")
 """In front of a batch, cycles counted from 1, 0: before the first. The cycle of its first packets; then the
 cycle of all others, shifted by _MARK_BITS, and where those begin. One word, so that it is never torn."""
@@ -27,23 +24,6 @@ DESK_SIZE = _BATCH_AT + LONGEST_BATCH
 """Bytes of memory for a batch that is not finished."""
 BEFORE_FIRST_CYCLE = -1
 """Cycle of the packets that set the servos up."""
-
-
-@unique
-class PacketKind(IntEnum):
-    """What a run of bytes was; the number is in the log."""
-
-    INSTRUCTION = 1
-    STATUS = 2
-    """Of a fast form that was cut off or spoilt: its intact parts."""
-    NOISE = 3
-    """Bytes from the line that belong to no intact packet."""
-    LATE = 4
-    """An intact status that came after it was given up; nothing was taken from it."""
-    OTHER_HOST = 5
-    """An intact packet that no servo sends: an instruction of another host on the line."""
-    ECHO = 6
-    """An instruction of this host, given back by the adapter."""
 
 
 _KINDS = frozenset(int(kind) for kind in PacketKind)
@@ -65,45 +45,6 @@ class LoggedPacket:
     first_ns: int
     last_ns: int
     data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Desk:
-    """Memory of a batch that is not committed yet."""
-
-    records: memoryview
-    """The records, one behind the other."""
-    used: memoryview
-    """One 64-bit word: how many of these bytes are used."""
-
-
-class PacketSink:
-    """Takes packets; never blocks, never raises. This one forgets them."""
-
-    __slots__ = ()
-
-    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
-        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
-    ) -> None:
-        """Record bytes that were sent or received; `data` is copied before the call returns."""
-
-
-class PacketLog(PacketSink):
-    """Takes packets of the cyclic exchange, too. This one forgets them: a run without a log."""
-
-    __slots__ = ()
-
-    @property
-    def desk(self) -> Desk | None:
-        """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
-        return None
-
-    def wake(self, cycle: int) -> None:
-        """Note that a cycle begins: what follows is of its period."""
-
-    def commit(self) -> object:
-        """Hand on what was collected."""
-        return None
 
 
 class PacketBatch(PacketLog):
@@ -136,7 +77,7 @@ class PacketBatch(PacketLog):
         self._words[_USED] = 0
         self._words[_POSITION] = writer.head
         self._words[_CYCLE] = cycle + 1 << _MARK_BITS
-        if self._room <= _HEADER.size:
+        if self._room <= RECORD_HEADER:
             raise ValueError(f"a desk of {self._room} bytes holds no packet")
         self.commit: Callable[[], object] = self._hand_on
         """Hands on what was collected; without packets nothing is."""
@@ -154,7 +95,7 @@ class PacketBatch(PacketLog):
         if end > self._room:
             self._overfull((bus, kind, servo_id, first_ns, last_ns), data)
             return
-        _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
+        RECORD.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
         self._buffer[body:end] = data
         self._words[_USED] = end
 
@@ -165,7 +106,7 @@ class PacketBatch(PacketLog):
 
     def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
         self.commit()
-        most = self._room - _HEADER.size
+        most = self._room - RECORD_HEADER
         for start in range(0, len(data), most):
             self.packet(*head, data[start : start + most])
 
@@ -219,13 +160,13 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
     earlier, number = earlier - 1, (now >> _MARK_BITS) - 1
     while start < end:
         try:
-            bus, kind, servo_id, length, first_ns, last_ns = _HEADER.unpack_from(payload, start)
+            bus, kind, servo_id, length, first_ns, last_ns = RECORD.unpack_from(payload, start)
         except struct.error as error:
             raise ValueError(f"a batch of packets ends inside a header: {error}") from error
         if kind not in _KINDS:
             raise ValueError(f"a packet is of kind {kind}, which is none")
         cycle = earlier if start < mark else number
-        start += _HEADER.size
+        start += RECORD_HEADER
         data = bytes(payload[start : start + length])
         if len(data) != length:
             raise ValueError("a batch of packets ends inside a packet")
@@ -240,5 +181,5 @@ def packet_capacity(period_ns: int, servos: int) -> int:
     Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
     bytes each beside the header.
     """
-    cycle = record_size((2 * servos + 4) * (_HEADER.size + 40))
+    cycle = record_size((2 * servos + 4) * (RECORD_HEADER + 40))
     return max(32 * LONGEST_BATCH, RING_SECONDS * 1_000_000_000 // period_ns * cycle)

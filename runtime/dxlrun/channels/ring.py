@@ -30,7 +30,8 @@ from functools import partial
 from typing import NamedTuple, Protocol
 
 from dxlrun.channels import shared_memory
-from dxlrun.channels.shared_memory import array_of, library, load, mapped, store
+from dxlrun.channels.shared_memory import library, load, mapped, store
+from dxlwire.compiled import array_of
 
 RING_SECONDS = 10
 """How long a reader may be away before records are lost, at the rates that the sizes are computed for."""
@@ -148,7 +149,7 @@ class RingWriter(_Ring):
 
     The pages are touched when it is built, so that the loop does not meet their first use. Continues after
     the last record when the ring was written before. Raises ValueError when the memory is no ring,
-    StartUpError where what writes was not compiled.
+    NotCompiled where what writes was not compiled.
     """
 
     __slots__ = ("_append",)
@@ -186,7 +187,7 @@ class RingWriter(_Ring):
 
 
 class RingReader(_Ring):
-    """One reader of a ring, at its own pace. Raises ValueError when the memory is no ring, StartUpError where
+    """One reader of a ring, at its own pace. Raises ValueError when the memory is no ring, NotCompiled where
     what reads was not compiled.
 
     Whatever the memory holds, no method raises, and each takes a time that the longest record bounds.

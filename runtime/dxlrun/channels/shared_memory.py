@@ -11,7 +11,7 @@ import os
 from functools import cache
 from pathlib import Path
 
-from dxlrun.channels.compiled import compiled
+from dxlwire.compiled import load_compiled
 
 SOURCE = Path(__file__).with_name("shared_memory.c")
 
@@ -19,8 +19,8 @@ SOURCE = Path(__file__).with_name("shared_memory.c")
 @cache
 def library() -> ctypes.PyDLL:
     """Return the compiled functions, which keep the interpreter: they take no time in which others could have
-    it. Raises StartUpError where they were not built, or of another source."""
-    found = compiled(SOURCE, ctypes.PyDLL)
+    it. Raises NotCompiled where they were not built, or of another source."""
+    found = load_compiled(SOURCE, ctypes.PyDLL)
     address, word, number = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int64
     words = ctypes.POINTER(word)
     for name, result, arguments in (
@@ -45,11 +45,6 @@ def load(words: memoryview, index: int) -> int:
 def store(words: memoryview, index: int, value: int) -> None:
     """Publish a shared word; what was written before it is seen before it."""
     library().dxl_store(ctypes.c_uint64.from_buffer(words, 8 * index), value)
-
-
-def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
-    """Return memory that can be written as compiled functions take it; it lives as long as this does."""
-    return (ctypes.c_char * len(memory)).from_buffer(memory)
 
 
 def create(name: str, size: int) -> int:

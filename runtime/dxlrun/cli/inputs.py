@@ -18,9 +18,9 @@ from dxlrun.output.target import check_target, write_target
 if TYPE_CHECKING:
     from cyclopts import Token
 
-    from dxlrun.channels.packets import PacketSink
     from dxlrun.compile.robot import Ask, Compiled
     from dxlwire.bus_plan import BusPlan
+    from dxlwire.packets import PacketSink
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 """An option without a value."""

@@ -13,15 +13,15 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
+from dxlwire.compiled import load_compiled, parse_structs
 from dxlwire.modes import Mode
 
 SOURCE = Path(__file__).with_name("gate.c")
-STRUCTS = structs(SOURCE.read_text())
+STRUCTS = parse_structs(SOURCE.read_text())
 BRAKING = 10.0
 """rad/s^2, at which a joint that follows efforts brakes toward a limit, unless its acceleration limit is
 higher: what an XM430 of 1.2 A does with 0.2 kg m^2. A heavier one begins too late. [i]"""
@@ -129,7 +129,7 @@ class Gate:
             count=count,
             accelerates=any(joint.acceleration is not None for joint in plan.joints),
         )
-        self._law = compiled(SOURCE, ctypes.PyDLL).gate_apply
+        self._law = load_compiled(SOURCE, ctypes.PyDLL).gate_apply
         self._law.argtypes = (c_void_p, c_int64)
         self._address = ctypes.addressof(self._gate)
         self.modes = b""

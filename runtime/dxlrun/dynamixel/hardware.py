@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.channels.packets import PacketLog
 from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
@@ -31,6 +30,7 @@ from dxlwire.exchange.cyclic_reads import MOST_BROKEN
 from dxlwire.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
 from dxlwire.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlwire.exchange.samples import Samples
+from dxlwire.packets import PacketLog
 from dxlwire.plan.retry import limit_patience, pause
 from dxlwire.port.ports import Ports
 
@@ -74,7 +74,7 @@ class DynamixelHardware:
 
         `sources`, `device_commands`: of the cycle's record, with the states and commands of devices.
 
-        Raises StartUpError where the exchange kernel was not compiled.
+        Raises NotCompiled where the exchange kernel was not compiled.
         """
         self._lines = Lines(plans, ports, clock, packets, beat)
         self._plans, self._buses = self._lines.plans, self._lines.buses

@@ -9,8 +9,9 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket, PacketKind
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket
 from dxlrun.messages.cdr_columns import pieces
+from dxlwire.packets import PacketKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,6 @@ from dxlrun.channels.events import EventSink
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink
-from dxlrun.channels.packets import PacketLog
 from dxlrun.channels.ring import Appender, RecordKind
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.activity import Activity
@@ -28,6 +27,7 @@ from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosToget
 from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.clock import Clock
+from dxlwire.packets import PacketLog
 from dxlwire.port.ports import Ports
 
 

@@ -48,7 +48,7 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     """Create the memory of a run, its rings sized for ten seconds of this robot.
 
-    `kept`: what its controllers kept in earlier runs. Raises StartUpError where what shares it was
+    `kept`: what its controllers kept in earlier runs. Raises NotCompiled where what shares it was
     not compiled.
     """
     shared_memory.library()

@@ -15,7 +15,7 @@ from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
 from dxlrun.channels.messages import MessageRing, MessageSink
-from dxlrun.channels.packets import PacketBatch, PacketLog
+from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
@@ -38,6 +38,7 @@ from dxlsim.motion.body import SensedBody
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketLog
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from dxlrun.channels.events import Granted as Granted
     from dxlrun.channels.events import LostRecords as LostRecords
     from dxlrun.channels.events import Severity as Severity
-    from dxlrun.channels.packets import PacketKind as PacketKind
     from dxlrun.messages.cdr import Codec as Codec
     from dxlrun.messages.declared import declared_message as declared_message
     from dxlrun.messages.definition import MessageType as MessageType
+    from dxlwire.packets import PacketKind as PacketKind
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import open_log
+from dxlwire.packets import PacketKind
 
 
 class Heard(NamedTuple):

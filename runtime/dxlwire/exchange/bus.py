@@ -10,11 +10,11 @@ from array import array
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeAlias
 
-from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import Clock
 from dxlwire.errors import PortError
 from dxlwire.exchange.owed import OwedReplies
+from dxlwire.packets import PacketKind, PacketSink
 from dxlwire.plan.line import BITS_PER_BYTE, lengthen
 from dxlwire.port.ports import Port, Ports
 from dxlwire.transaction import (

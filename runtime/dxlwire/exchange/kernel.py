@@ -18,16 +18,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.compiled import compiled, structs
 from dxlrun.channels.cycle import Commands, Floats
-from dxlrun.channels.packets import RECORD_HEADER, PacketLog
-from dxlrun.channels.shared_memory import array_of
 from dxlwire.bus_plan import BusPlan, Field
+from dxlwire.compiled import array_of, load_compiled, parse_structs
 from dxlwire.errors import PortError
 from dxlwire.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.goals import GoalArrays, SyncWrite
 from dxlwire.exchange.samples import Samples
+from dxlwire.packets import RECORD_HEADER, PacketLog
 from dxlwire.plan.line import BITS_PER_BYTE
 from dxlwire.port.ports import ReplyPolling
 from dxlwire.transaction import BROADCAST_ID, Transaction
@@ -56,7 +55,7 @@ _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
 
 SOURCE = Path(__file__).with_name("kernel.c")
 LIBRARY = SOURCE.with_name("libkernel.so")  # Where the build puts it
-STRUCTS = structs(SOURCE.read_text())
+STRUCTS = parse_structs(SOURCE.read_text())
 _Field, _Servo, _DeviceField, _Block, _Device = (
     STRUCTS[name] for name in ("Field", "Servo", "DeviceField", "Block", "Device")
 )
@@ -66,9 +65,9 @@ _Part, _Packet, _Read, _Cell, _SyncWrite = (
 
 
 def library(path: Path | None = None) -> ctypes.CDLL:
-    """Return the functions of the compiled kernel. Raises StartUpError where it was not built, or of another
+    """Return the functions of the compiled kernel. Raises NotCompiled where it was not built, or of another
     source."""
-    found = compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
+    found = load_compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
     for name, result, arguments in (
         ("read", c_int32, (c_void_p,)),
         ("write", c_int32, (c_void_p,)),

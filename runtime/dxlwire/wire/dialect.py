@@ -9,10 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
+from dxlwire.packets import Bytes
 from dxlwire.transaction import Status
 from dxlwire.wire import protocol1, protocol2
-
-Bytes = bytes | bytearray | memoryview
 
 
 class Dialect(Protocol):

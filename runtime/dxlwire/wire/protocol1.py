@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import IntEnum, IntFlag, unique
 
+from dxlwire.packets import Bytes
 from dxlwire.transaction import BROADCAST_ID, Status
-
-Bytes = bytes | bytearray | memoryview
 
 PROTOCOL = 1.0
 HEADER = b"\xff\xff"

@@ -13,9 +13,8 @@ from enum import IntEnum, unique
 
 from fastcrc import crc16
 
+from dxlwire.packets import Bytes
 from dxlwire.transaction import BROADCAST_ID, Status
-
-Bytes = bytes | bytearray | memoryview
 
 PROTOCOL = 2.0
 HEADER = b"\xff\xff\xfd\x00"

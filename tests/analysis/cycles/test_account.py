@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from dxlrun.channels.packets import LoggedPacket, PacketKind
+from dxlrun.channels.packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.causes.account import Account
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Pairing
+from dxlwire.packets import PacketKind
 
 PERIOD = 10_000  # us, as all times here
 IDS = (1, 2, 3)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from tests.kit.made_logs import Cycle, Wire
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
 from dxlrun_analysis.causes.causes import Causes, CycleCauses
 from dxlrun_analysis.counts import has_them_alone
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 PERIOD = 20_000  # us, as all times here

@@ -17,11 +17,11 @@ import pytest
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
 from dxlrun_analysis.page.page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 _VOID = {"meta", "br", "img", "input", "link", "hr"}

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
 from dxlrun_analysis.cycles.latency import Punctuality
 from dxlrun_analysis.page import curves as curves_module
@@ -24,6 +23,7 @@ from dxlrun_analysis.page.loop import latency_plots
 from dxlrun_analysis.page.page import analyzed_page
 from dxlrun_analysis.page.replies import ReplyCollector
 from dxlrun_analysis.report import analyze
+from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
 Data = NDArray[np.float64]

@@ -16,14 +16,7 @@ import numpy as np
 from dxlrun.channels.commands import NoCommands
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.packets import (
-    LONGEST_BATCH,
-    PacketBatch,
-    PacketKind,
-    PacketLog,
-    packet_capacity,
-    split_packets,
-)
+from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, packet_capacity, split_packets
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
@@ -31,6 +24,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun_lab.late_servos import Sent
 from dxlwire.clock import MonotonicClock
+from dxlwire.packets import PacketKind, PacketLog
 from dxlwire.port.ports import ReplyPolling, SerialPort, SerialPorts
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk

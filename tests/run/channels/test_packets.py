@@ -15,13 +15,12 @@ from dxlrun.channels.packets import (
     LONGEST_BATCH,
     LoggedPacket,
     PacketBatch,
-    PacketKind,
-    PacketLog,
     packet_capacity,
     salvage,
     split_packets,
 )
 from dxlrun.channels.ring import Handover, Payload, RecordKind, RingReader, RingWriter, create, record_size
+from dxlwire.packets import PacketKind, PacketLog
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(

@@ -12,8 +12,8 @@ from dxlrun.output.target import check_target, unwritable
 from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
-    from dxlrun.channels.packets import PacketSink
     from dxlwire.bus_plan import BusPlan
+    from dxlwire.packets import PacketSink
 
 TOOL_NAME = "tool"
 """The metadata record of a log that a tool wrote: its `command`."""

@@ -9,7 +9,6 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import PacketSink
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
@@ -23,6 +22,7 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.control_table import FoundDeviation, control_table, models_by_number
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketSink
 from dxlwire.plan.line import listen
 from dxlwire.plan.retry import extend_timeouts, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts

@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import termios
 
-from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.channels.ring import Payload
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.exchange.bus import Lines
+from dxlwire.packets import PacketKind, PacketSink
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlwire.port.latency_timer import latency_timer, shorten
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.packets import BatchedPacket, PacketKind
+from dxlrun.channels.packets import BatchedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.schemas import BUS_PACKETS
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import Column, ColumnReader
+from dxlwire.packets import PacketKind
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
 _FIELDS = ("cycle_delta", "first_ns_delta", "duration_ns", "kind", "servo_id", "length", "data")
