@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from dxlrun.compile.report import PolicyRow, Row
     from dxlrun.compile.robot import Compiled
     from dxlrun.dynamixel.tools.inspection import DeviationRow, Found, RegisterRow
+    from dxlrun.plan.loop_plan import JointProperty
     from dxlwire.bus_plan import BusPlan
 
 
@@ -202,19 +203,22 @@ _MOTIONS: Columns[Row] = [
 
 def _joints(joints: Sequence[Row]) -> Table:
     from dxlrun.compile.joints.limits import degrees
+    from dxlrun.plan.loop_plan import JOINT_PROPERTIES
 
     def interval(row: Row, lower: str, upper: str) -> str:
         unit = LINEAR if row["linear"] else ROTARY
         first, last = (unit.number(row[end], signed=True) for end in (lower, upper))
         return f"{first}..{last}{unit.suffix}"
 
-    def rate(row: Row, key: str, unit: str) -> str:
-        if row[key] is None:
-            return "none"
-        return f"{row[key] * 1e3:.6g} mm{unit}" if row["linear"] else f"{degrees(row[key])}{unit}"
-
     def own(text: str, source: str) -> str:
         return f"{text} (servo)" if source == "servo" and text != "none" else text
+
+    def measure(row: Row, one: JointProperty) -> str:
+        value = row[one.name]
+        if value is None:
+            return "none"
+        text = f"{value * 1e3:.6g} mm" if row["linear"] else degrees(value)
+        return own(f"{text}{one.column}", row[f"{one.name}_source"] if one.limit else "none")
 
     def effort(row: Row) -> str:
         most, unit = row["effort"], row["effort_unit"]
@@ -233,13 +237,19 @@ def _joints(joints: Sequence[Row]) -> Table:
             Column("reach", detail=True),
             lambda row: interval(row, "reach_lower", "reach_upper") if row["bounded"] else "continuous",
         ),
-        (Column("velocity"), lambda row: own(rate(row, "velocity", "/s"), row["velocity_source"])),
-        (Column("acceleration"), lambda row: rate(row, "acceleration", "/s^2")),
+        *[
+            (Column(one.name), partial(measure, one=one))
+            for one in JOINT_PROPERTIES
+            if one.column is not None
+        ],
         (Column("effort limit"), effort),
         (Column("motor file", "text", missing="none", detail=True), "motor"),
     ]
     unused = {
-        "acceleration": all(row["acceleration"] is None for row in joints),
+        one.name: all(row[one.name] is None for row in joints)
+        for one in JOINT_PROPERTIES
+        if one.column is not None and not one.limit
+    } | {
         "effort limit": all(row["effort_source"] != "file" for row in joints),
         "motor file": all(row["motor"] is None for row in joints),
     }

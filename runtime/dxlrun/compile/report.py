@@ -15,7 +15,8 @@ from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, SensorPlan
+from dxlrun.description.joints.mechanics import Limits
+from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
 from dxlwire.bus_plan import BusPlan, DevicePlan, ServoPlan
@@ -74,9 +75,7 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
         "lower": plan.lower,
         "upper": plan.upper,
         "position_source": _source(limits.position, plan.bounded),
-        "velocity": plan.velocity,
-        "velocity_source": _source(limits.velocity, plan.velocity is not None),
-        "acceleration": plan.acceleration,
+        **_properties(plan, limits),
         "effort": None if math.isinf(plan.highest_effort) else plan.highest_effort,
         "effort_source": _source(limits.effort, plan.top_effort is not None),
         "effort_unit": plan.unit.effort_unit(unit).replace("1", ""),
@@ -87,6 +86,18 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
         "linear": plan.unit is LINEAR,
         "servos": [_servo(servo, servos[servo.described.name]) for servo in joint.servos],
     }
+
+
+def _properties(plan: JointPlan, limits: Limits) -> Row:
+    """Return the numbers of a joint that have a column, with the source of limits."""
+    row: Row = {}
+    for one in JOINT_PROPERTIES:
+        if one.column is None:
+            continue
+        row[one.name] = value = one.value(plan)
+        if one.limit:
+            row[f"{one.name}_source"] = _source(getattr(limits, one.name), value is not None)
+    return row
 
 
 def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:

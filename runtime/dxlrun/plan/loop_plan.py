@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
@@ -203,6 +204,54 @@ class JointPlan(msgspec.Struct, frozen=True):
     def rest(self) -> Mode:
         """The mode into which a joint without a command is brought where it would not hold still."""
         return Mode.VELOCITY if self.continuous else Mode.POSITION
+
+
+class JointProperty(msgspec.Struct, frozen=True):
+    """A property of joints that `dxlrun check` or a running robot shows."""
+
+    name: str  # Key in the JSON of `check`, and heading of its column
+    value: Callable[[JointPlan], object]  # In SI units; None: the joint has none
+    column: str | None = None
+    """`check` shows the number in the unit of positions followed by this, such as `/s`; None: it does not."""
+    limit: bool = False
+    """A joint has it in its `limits` in the robot file; without it, the number is the servo's own."""
+    listed: str = ""  # Field of `JointValues` that has it; empty: none
+
+
+JOINT_PROPERTIES: tuple[JointProperty, ...] = (
+    JointProperty("unit", lambda joint: joint.unit.value, listed="units"),
+    JointProperty(
+        "limits", lambda joint: (joint.lower, joint.upper) if joint.bounded else None, listed="limits"
+    ),
+    JointProperty("highest speed", lambda joint: joint.highest_speed, listed="speeds"),
+    JointProperty("velocity", lambda joint: joint.velocity, column="/s", limit=True),
+    JointProperty("acceleration", lambda joint: joint.acceleration, column="/s^2"),
+)
+"""In the order of the columns of `check`. A new key of joints is shown everywhere by its row here, and by its
+field of `JointValues`."""
+
+
+@dataclass(frozen=True)
+class JointValues:
+    """Properties of all joints by name, as clients of a running robot get them."""
+
+    units: dict[str, str]
+    """Of each joint's positions."""
+    effort_units: dict[str, str]
+    limits: dict[str, tuple[float, float]]
+    """Lowest and highest position of the joints that have limits."""
+    speeds: dict[str, float | None]
+    """Highest one of each joint; null: without a limit."""
+
+    @classmethod
+    def collect(cls, joints: Sequence[JointPlan], effort_units: dict[str, str]) -> JointValues:
+        """Return the properties of these joints; their units of effort follow from the models of servos."""
+        values: dict[str, object] = {
+            one.listed: {joint.name: value for joint in joints if (value := one.value(joint)) is not None}
+            for one in JOINT_PROPERTIES
+            if one.listed
+        }
+        return msgspec.convert(values | {"effort_units": effort_units}, cls)
 
 
 def _or_inf(limit: float | None) -> float:

@@ -44,7 +44,7 @@ from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointValues
 from dxlrun.remote.asked import Allowance, Asked, client_of, peer, received
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
@@ -229,10 +229,7 @@ class GatewayApp:
             skipped=link.heartbeat.skipped,
             joints=tuple(joint.name for joint in joints),
             groups=dict(plan.groups),
-            units={joint.name: position_unit(plan, joint.name) for joint in joints},
-            effort_units=effort_units(plan),
-            limits={one.name: (one.lower, one.upper) for one in joints if one.bounded},
-            speeds={one.name: one.highest_speed for one in joints},  # JSON has null for infinite ones
+            **vars(JointValues.collect(joints, effort_units(plan))),
             controllers=tuple(self._shown(one) for one in link.controllers.values()),
             sources=plan.loop.sources,
             file=str(Path(plan.source_file).absolute()),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import msgspec
 
 from dxlrun.channels.answers import Halted
+from dxlrun.plan.loop_plan import JointValues
 
 AGoal = TypeVar("AGoal")
 Written = bool | int | float | str
@@ -42,8 +44,9 @@ class ControllerInfo(msgspec.Struct, frozen=True):
     """Those that it plays by name, with their lengths, s."""
 
 
-class RobotInfo(msgspec.Struct, frozen=True):
-    """A run, its controllers and the commands that they take."""
+@dataclass(frozen=True)
+class RunInfo:
+    """A run, and the names that its robot file gives to joints and groups."""
 
     robot: str
     rate: float
@@ -55,13 +58,13 @@ class RobotInfo(msgspec.Struct, frozen=True):
     skipped: int
     joints: tuple[str, ...]
     groups: dict[str, tuple[str, ...]]
-    units: dict[str, str]
-    """Of each joint's positions."""
-    effort_units: dict[str, str]
-    limits: dict[str, tuple[float, float]]
-    """Lowest and highest position of the joints that have limits."""
-    speeds: dict[str, float | None]
-    """Highest one of each joint; null: without a limit."""
+
+
+# Dataclasses, as a Struct cannot have the fields of two bases; the fields are in the order of the JSON.
+@dataclass(frozen=True)
+class RobotInfo(JointValues, RunInfo):
+    """A run, its controllers and the commands that they take."""
+
     controllers: tuple[ControllerInfo, ...]
     sources: tuple[object, ...]
     """Devices and sensors, with their states and commands."""
