@@ -9,7 +9,6 @@ from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
-from dxlrun.description.devices import Device, DeviceSimulation, SensorEntry
 from dxlrun.description.form import Form
 from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
 from dxlrun.description.joints.mechanics import (
@@ -30,12 +29,14 @@ from dxlrun.description.robot import (
     Policies,
     PoseStep,
     Recording,
-    Robot,
     RobotModel,
     Scheduler,
     Simulation,
     TorqueStep,
+    robot_form,
 )
+from dxlrun.features.devices.form import Device, DeviceSimulation
+from dxlrun.features.sensors.form import SensorEntry
 
 PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -99,7 +100,7 @@ def test_every_part_has_a_table() -> None:
     assert {part.__name__ for part in PARTS} | {"robot", "motor"} == TABLES
 
 
-@pytest.mark.parametrize("part", [*PARTS, Robot, SharedJoint, MotorForm, Motion, Point, Target])
+@pytest.mark.parametrize("part", [*PARTS, robot_form(), SharedJoint, MotorForm, Motion, Point, Target])
 def test_every_key_is_described(part: type[Form]) -> None:
     for key, field in part.model_fields.items():
         assert field.description, key

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from dxlrun.compile.devices import CompiledDevice
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.joints.couplings import Coupling, servo_ranges
 from dxlrun.compile.joints.described_servos import described_servos, first_joint
 from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
@@ -37,7 +37,7 @@ WATCHDOG_NS = 200_000_000  # Bus Watchdog of a servo of Protocol 2.0 where the f
 def compile_buses(
     file: RobotFile,
     joints: Mapping[str, CompiledJoint],
-    devices: Mapping[str, CompiledDevice],
+    contributions: Collection[Contribution],
     modes: Mapping[str, Mode],
 ) -> list[BusPlan]:
     """Return the plans of the buses that have joints or devices, in the order of the file.
@@ -49,10 +49,8 @@ def compile_buses(
     servos = moving_servos(joints.values())
     for name, bus in file.robot.buses.items():
         mark = file.key("buses", name)
-        robot = file.robot
-        used = {servo.bus for servo in described_servos(file.description)} | {
-            one.bus for one in robot.devices.values()
-        }
+        used = {servo.bus for servo in described_servos(file.description)}
+        used.update(*(each.buses for each in contributions))
         if name not in used:
             file.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
         wirings = [
@@ -60,7 +58,7 @@ def compile_buses(
             for row, servo in enumerate(servos)
             if servo.described.bus == name and servo.table.protocol == bus.protocol
         ]
-        attached = [device for device in devices.values() if device.described.bus == name]
+        attached = [device for each in contributions for device in each.devices if device.bus == name]
         if not wirings and not attached:
             continue
         _check_baud_rate(file, name, [*(each.table for each in wirings), *(each.table for each in attached)])

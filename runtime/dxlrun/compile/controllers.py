@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -12,6 +11,7 @@ from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import report_speed
@@ -22,13 +22,13 @@ from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath, read_file
-from dxlrun.description.form import ParametersModel
+from dxlrun.description.form import ParametersModel, PlugInEntry
 from dxlrun.description.mistakes.foreign import ros_type
 from dxlrun.description.problems import errors_between_keys, problems_of
 from dxlrun.description.reading import Description
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import Mark, suggestion
-from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import CommandName, Mode, mode_of
 from dxlwire.plan.mode_plan import LACKS, controls_speed, model_modes
 
@@ -41,7 +41,6 @@ _REMOVED = {
     "joint_limiter": "take it out: the gate keeps all goals within `limits` of their joints",
 }
 """Types of earlier versions, and what to do instead."""
-Kind = Literal["controller", "sensor"]
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
     Mode.VELOCITY: "a velocity alone",
@@ -85,11 +84,11 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
 
 
 def compile_controllers(
-    file: RobotFile, plugins: PlugIns, sources: Sequence[SourcePlan]
+    file: RobotFile, plugins: PlugIns, contributions: Collection[Contribution]
 ) -> dict[str, CompiledController]:
     """Return the controllers that could be compiled, by name, in the order of the file.
 
-    `sources`: devices and sensors, whose states they may read.
+    They may read the sources of `contributions`, and command them.
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
@@ -99,7 +98,7 @@ def compile_controllers(
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
-    _check_graph(file, plans, compiled, sources)
+    _check_graph(file, plans, compiled, contributions)
     for name, joints in file.description.groups.items():
         own = compiled[name].plan if name in compiled else None
         if own is not None and own.command and set(own.joints) != set(joints):
@@ -116,16 +115,15 @@ def compile_controllers(
 
 def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
     """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
-    name = plan.name
+    name, entry = plan.name, file.robot.controllers[plan.name]
     offer = _offer(file, name, plan.type, plugins)
-    parameters = (
-        None
-        if offer is None
-        else parameters_of(file, "controller", name, offer.distribution, offer.controller.Parameters)
-    )
-    if offer is None or parameters is None:
+    if offer is None:
         return None
-    written = file.robot.controllers[name].parameters
+    model = offer.controller.Parameters
+    parameters = parameters_of(file, "controller", name, entry, offer.distribution, model=model)
+    if parameters is None:
+        return None
+    written = entry.parameters
     wrapping = {joint for joint, described in file.robot.joints.items() if described.wrap}
     if (found := wrapped(written, offer.controller.Parameters, wrapping)) is not written:
         parameters = offer.controller.Parameters.model_validate(found)
@@ -205,15 +203,17 @@ def class_plan(
 
 
 def _check_graph(
-    file: RobotFile, plans: Sequence[ControllerPlan], compiled: Collection[str], sources: Sequence[SourcePlan]
+    file: RobotFile,
+    plans: Sequence[ControllerPlan],
+    compiled: Collection[str],
+    contributions: Collection[Contribution],
 ) -> None:
     """Check the controllers against each other."""
+    sources = [source for each in contributions for source in each.sources]
     known = {*compiled, *(source.name for source in sources)}
-    robot = file.robot
-    named = (*(plan.name for plan in plans), *robot.devices, *robot.sensors)
-    incomplete = frozenset(name for name in named if name not in known)
+    named = {*(plan.name for plan in plans), *(name for each in contributions for name in each.names)}
     by_name = {plan.name: plan for plan in plans}
-    graph = ControllerGraph(tuple(robot.joints), plans, sources, incomplete)
+    graph = ControllerGraph(tuple(file.robot.joints), plans, sources, frozenset(named - known))
     for mistake in graph.mistakes():
         file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
     for mistake in graph.warnings():
@@ -299,19 +299,33 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
 
 
 def parameters_of(
-    file: RobotFile, kind: Kind, name: str, distribution: str, model: type[ParametersModel]
+    file: RobotFile,
+    kind: str,
+    name: str,
+    entry: PlugInEntry,
+    distribution: str,
+    *,
+    model: type[ParametersModel],
 ) -> ParametersModel | None:
-    """Return the parameters of a controller or a sensor; None where they are wrong."""
-    entries = file.robot.controllers if kind == "controller" else file.robot.sensors
+    """Return the parameters of a plug-in's class, such as a controller; None where they are wrong.
+
+    Args:
+        file: Robot file; problems are added to it.
+        kind: Word for the class in messages, with which its section is named: `sensor`.
+        name: Name of the entry.
+        entry: Entry of the section.
+        distribution: Publisher of the class.
+        model: Form of the parameters.
+    """
     try:
-        return model.model_validate(entries[name].parameters)
+        return model.model_validate(entry.parameters)
     except ValidationError as error:
         prefix = (f"{kind}s", name)
-        beside = sorted(type(entries[name]).model_fields.keys() - {"parameters"})
+        beside = sorted(type(entry).model_fields.keys() - {"parameters"})
         file.extend(
             problems_of(error, file.marks, prefix, model=model, beside=beside, document=type(file.robot))
         )
-        between = errors_between_keys(entries[name].parameters, error, model)
+        between = errors_between_keys(entry.parameters, error, model)
         if between is not None:
             replaced = {(*prefix, *path) for path in between[1]}
             file.extend(problems_of(between[0], file.marks, prefix, model=model, unknown=replaced))
@@ -320,8 +334,8 @@ def parameters_of(
     return None
 
 
-def at_fault(file: RobotFile, kind: Kind, name: str, distribution: str, breach: tuple[str, str]) -> None:
-    """Add what the plug-in of a controller or a sensor did wrong, and how to fix it."""
+def at_fault(file: RobotFile, kind: str, name: str, distribution: str, breach: tuple[str, str]) -> None:
+    """Add a mistake in the code of a plug-in, and how to fix it."""
     what, fix = breach
     file.error(file.key(f"{kind}s", name), f"{kind} {name} ({distribution}) {what}", fix)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import suggestion
-from dxlrun.plan.loop_plan import SensorPlan
 from dxlsim.geometry.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
 from dxlsim.geometry.urdf import Urdf
 
@@ -20,12 +20,11 @@ def check_orientations(
     file: RobotFile,
     urdf: Urdf,
     frames: FramesPlan | None,
-    sensors: Sequence[SensorPlan],
+    contributions: Iterable[Contribution],
     controllers: Mapping[str, CompiledController],
 ) -> None:
     """Warn where sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
-    links = {sensor.name: sensor.links[0] for sensor in sensors if len(sensor.links) == 1}
-    links |= {name: one.simulation.link for name, one in file.robot.devices.items() if one.simulation.link}
+    links = {name: link for each in contributions for name, link in each.links.items()}
     for name, controller in controllers.items():
         if (frame := _text(controller, "frame")) and _text(controller, "sensor"):
             _check_frame(file, urdf, name, controller, links)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
+from dxlrun.compile.contribution import Compilation, CompileStage, check_source_names
 from dxlrun.compile.controllers import (
     check_motions,
     check_robot,
@@ -18,7 +19,6 @@ from dxlrun.compile.controllers import (
     compile_modes,
     read_controller_files,
 )
-from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
     CompiledJoint,
     check_limp_joints,
@@ -34,7 +34,6 @@ from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import RobotFile
 from dxlrun.compile.recording import compile_recording
-from dxlrun.compile.sensors import compile_sensors, sensor_source
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
@@ -43,7 +42,8 @@ from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
-from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
+from dxlrun.features import stages
+from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 from dxlwire.bus_plan import BusPlan
 
@@ -154,27 +154,26 @@ def compile_robot(
     check_twins(file, {name: joint.table for name, joint in joints.items()})
     body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
-    links = None if body is None else body.urdf.links
-    devices = compile_devices(file)
-    simulation = compile_simulation(file, joints, devices, motors, links=links)
-    sensors = compile_sensors(file, plugins, body)
-    sources: tuple[SourcePlan, ...] = (
-        *(device.source for device in devices.values()),
-        *(sensor_source(sensor) for sensor in sensors),
-    )
-    controllers = compile_controllers(file, plugins, sources)
+    compilation = Compilation(file, plugins, joints, body)
+    by_feature = {feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage)}
+    contributions = tuple(by_feature.values())
+    sources = tuple(source for each in contributions for source in each.sources)
+    sensors = tuple(sensor for each in contributions for sensor in each.sensors)
+    devices = (device for each in contributions for device in each.devices)
+    simulation = compile_simulation(file, joints, devices, motors)
+    controllers = compile_controllers(file, plugins, contributions)
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
     frames = compile_frames(file, body, states)
     if body is not None:
-        check_orientations(file, body.urdf, frames, sensors, controllers)
-    check_source_names(file, sources, (one.plan for one in controllers.values()))
+        check_orientations(file, body.urdf, frames, contributions, controllers)
+    check_source_names(file, by_feature, (one.plan for one in controllers.values()))
     check_limp_joints(file, (one.plan for one in controllers.values()))
     check_tolerances(file, joints, (one.plan for one in controllers.values()))
     check_robot(file, joints, urdf, controllers)
     check_motions(file, joints, controllers)
     modes = compile_modes(file, joints, controllers)
-    buses = compile_buses(file, joints, devices, modes)
+    buses = compile_buses(file, joints, contributions, modes)
     policies = compile_policies(file, joints, buses)
     recording = compile_recording(file)
     parts: list[MotionPart] = []
@@ -206,8 +205,9 @@ def compile_robot(
         urdf=urdf,
         sensors=sensors,
     )
-    tables = {str(one.path): one.table.text for one in devices.values() if one.path is not None}
-    texts = {**description.included, **motors.texts, **tables}
+    texts = {**description.included, **motors.texts}
+    for each in contributions:
+        texts |= each.texts
     robot, folder = description.robot, description.path.parent
     plan = Plan(
         robot=robot.name,

@@ -6,16 +6,16 @@ On a real port none of these keys is used, so one that could not be simulated is
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from dxlrun.compile.devices import CompiledDevice
+from dxlrun.compile.contribution import BusDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.urdf import TYPES
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import SIMULATED, Bus
-from dxlrun.errors import InputError, suggestion
+from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan, SimulationPlan
 from dxlsim.motor_model import MotorLoad
 from dxlsim.simulation_plan import (
@@ -30,7 +30,6 @@ from dxlsim.simulation_plan import (
     SensedBodies,
     ServoConfig,
     ServoTimes,
-    Shown,
     SimulationConfig,
     UrdfBodies,
     UrdfJoint,
@@ -53,15 +52,10 @@ NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 def compile_simulation(
     file: RobotFile,
     joints: Mapping[str, CompiledJoint],
-    devices: Mapping[str, CompiledDevice],
+    devices: Iterable[BusDevice],
     motors: Motors,
-    *,
-    links: Collection[str] | None,
 ) -> SimulationPlan:
-    """Return the plan of the simulated servos and buses; add problems for contradictory keys.
-
-    `links`: those of the robot's URDF; None: it has none.
-    """
+    """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
     for name, joint in joints.items():
         _check_load(file, name, joint, _motor(joint, motors))
     _check_buses(file)
@@ -79,34 +73,7 @@ def compile_simulation(
         },
         times={name: times for name, times in slow.items() if times != ServoTimes()},
         physics=file.robot.simulation.physics,
-        devices={name: _measured(file, name, device, links) for name, device in devices.items()},
-    )
-
-
-def _measured(file: RobotFile, name: str, device: CompiledDevice, links: Collection[str] | None) -> Shown:
-    """Return what a simulated device shows, by its items."""
-    keys, read = device.described.simulation, device.read
-    for key, numbers in (("values", keys.values), ("noise", keys.noise)):
-        for state, number in numbers.items():
-            mark = file.at("devices", name, "simulation", key, state)
-            if state not in read:
-                file.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
-            elif key == "noise" and number < 0:
-                file.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
-    if keys.link and (links is None or keys.link not in links):
-        mark = file.at("devices", name, "simulation", "link")
-        if links is None:
-            what = f"{name} is on link {keys.link}, and the file names no URDF"
-            file.error(mark, what, "write `model: {urdf: ...}`, or take link out")
-        else:
-            what = f"{name} is on link {keys.link}, which the URDF does not have"
-            file.error(mark, what, suggestion(keys.link, tuple(links)))
-    return Shown(
-        states={item.name: state for state, item in read.items()},
-        values={read[state].name: value for state, value in keys.values.items() if state in read},
-        noise={read[state].name: value for state, value in keys.noise.items() if state in read},
-        link=keys.link,
-        table=device.table.text,
+        devices={device.plan.name: device.simulated for device in devices},
     )
 
 

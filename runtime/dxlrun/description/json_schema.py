@@ -30,7 +30,7 @@ from dxlrun.description.joints.groups import DEFAULTS, GROUPS
 from dxlrun.description.joints.joints import JOINT_FORMS
 from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion
-from dxlrun.description.robot import Robot
+from dxlrun.description.robot import robot_form
 
 Schema = dict[str, Any]  # A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true
 
@@ -94,7 +94,7 @@ def _without_arguments(model: type[BaseModel], title: str) -> Schema:
 
 def _robot(controllers: Models, sensors: Models) -> Schema:
     """Return the schema of a robot file that includes nothing."""
-    schema = Robot.model_json_schema()
+    schema = robot_form().model_json_schema()
     shaped = _Shaper(arguments=True)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
     top = shaped.node(schema)

@@ -16,7 +16,7 @@ from dxlrun.description.joints.joints import misfits
 from dxlrun.description.mistakes.foreign import kind_of_data
 from dxlrun.description.mistakes.words import misplaced_sections
 from dxlrun.description.problems import path_text, read_form
-from dxlrun.description.robot import Robot
+from dxlrun.description.robot import Robot, robot_form
 from dxlrun.errors import InputError, Problem, told_once
 
 
@@ -68,7 +68,7 @@ def read_robot(
     data = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     grown = replace(grown, data=data, problems=(*grown.problems, *wrong))
     try:
-        robot = read_form(grown, Robot)
+        robot = read_form(grown, robot_form())
     except InputError as error:
         joints = {str(at[1]) for at in grown.marks.keys if len(at) == 2 and at[0] == "joints"}
         raise InputError(_in_order(told_once(error.problems, joints))) from None
@@ -100,7 +100,7 @@ def _refuse_misplaced_sections(grown: Grown) -> None:
     """Raise InputError for sections of another name or place: their contents stay unchecked."""
     own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     problems: dict[str, Problem] = {}
-    for path, fix in misplaced_sections(Robot, own):
+    for path, fix in misplaced_sections(robot_form(), own):
         what = f"{path_text(path[:-1])} has an unknown key {path[-1]!r}"
         problems.setdefault(fix, Problem(grown.marks.key(*path), what, fix))
     if problems:

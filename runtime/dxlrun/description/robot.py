@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -12,11 +13,11 @@ from pydantic import (
     Field,
     Tag,
     WithJsonSchema,
+    create_model,
 )
 
 from dxlrun.description import units
 from dxlrun.description.bus import Bus
-from dxlrun.description.devices import Device, SensorEntry
 from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse
 from dxlrun.description.joints.joints import JointEntry
 from dxlrun.description.joints.mechanics import (
@@ -33,6 +34,8 @@ from dxlrun.description.units import (
     Share,
     SizeOrDuration,
 )
+from dxlrun.features import stages
+from dxlrun.features.feature import Section
 
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
@@ -261,7 +264,10 @@ class Simulation(Form):
 
 
 class Robot(Form):
-    """A robot file, without its arguments."""
+    """A robot file, without its arguments: the sections that are not features.
+
+    `robot_form` adds those; `Section.of` returns one of them.
+    """
 
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include", "joint_defaults")
     """Keys of the file that are taken out of it before the model sees it."""
@@ -277,9 +283,6 @@ class Robot(Form):
         "{left_arm: {bus: main, joints: [left_shoulder, left_elbow]}}",
         {},
     )
-    devices: dict[Name, Device] = key(
-        "What is on a bus and is no servo, by name.", "{imu: {bus: main, id: 241, model: ...}}", {}
-    )
     transmissions: dict[Name, Transmission] = key(
         "Several servos that move several joints together, by name.",
         "{wrist: {type: differential, joints: [roll, pitch], ...}}",
@@ -287,9 +290,6 @@ class Robot(Form):
     )
     controllers: dict[Name, ControllerEntry] = key(
         "Controllers by name, updated in this order.", "{head: {type: ...}}", {}
-    )
-    sensors: dict[Name, SensorEntry] = key(
-        "Sensors by name, each with a process of its own.", "{imu: {type: serial_imu, ...}}", {}
     )
     poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = key(
         "Positions of some or all joints, by name, for policies.", "{home: {head_joint: 0 deg}}", {}
@@ -301,3 +301,10 @@ class Robot(Form):
     simulation: Simulation = key(
         "How simulated servos move what they move.", "{physics: mujoco}", Simulation()
     )
+
+
+@cache
+def robot_form() -> type[Robot]:
+    """Return the form of a robot file with the sections of all features."""
+    sections: dict[str, Any] = {each.name: (each.form, each.field) for _, each in stages(Section)}
+    return create_model(Robot.__name__, __base__=Robot, __doc__=Robot.__doc__, **sections)

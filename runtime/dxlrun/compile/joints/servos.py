@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Protocol
 
 import msgspec
 
@@ -13,7 +14,6 @@ from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.devices import Device
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import Mark, suggestion
 from dxlsim.motor_model import MotorModel
@@ -126,10 +126,20 @@ def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
             )
 
 
-def check_bus(
-    file: RobotFile, one: DescribedServo | Device, name: str, at: Callable[[str], Mark], called: str
-) -> bool:
-    """Check bus and ID of a servo or a device; return whether the bus is defined. `at`: places of keys."""
+class OnBus(Protocol):
+    """Entry of a file with a place on a bus."""
+
+    @property
+    def bus(self) -> str:
+        """Name of the bus."""
+
+    @property
+    def id(self) -> int:
+        """ID on the bus."""
+
+
+def check_bus(file: RobotFile, one: OnBus, name: str, at: Callable[[str], Mark], called: str) -> bool:
+    """Check bus and ID of an entry; return whether the bus is defined. `at`: places of keys."""
     bus = file.robot.buses.get(one.bus)
     if bus is None:
         what = f"{name} is on bus {one.bus}, which is not defined"

@@ -1,23 +1,25 @@
-"""Devices of the robot file against buses, models, and the names of all that has states."""
+"""Devices of the robot file, checked against buses, servos and control tables, and compiled."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import msgspec
 from msgspec.structs import replace
 
+from dxlrun.compile.contribution import BusDevice, Compilation, CompileStage, Contribution
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.joints.servos import check_bus
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
-from dxlrun.description.devices import Device
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
-from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
+from dxlrun.features.devices import form
+from dxlrun.features.devices.form import Device
+from dxlrun.features.devices.simulate import simulated_states
+from dxlrun.plan.loop_plan import SourcePlan
 from dxlwire.bus_plan import DeviceCommand, DevicePlan
 from dxlwire.control_table.device_table import DeviceItem, DeviceTable, read_device_table
 from dxlwire.control_table.devices import device_table, perhaps_meant_device
@@ -26,25 +28,18 @@ from dxlwire.plan.line import Line
 from dxlwire.wire.dialect import dialect_of
 
 
-class CompiledDevice(msgspec.Struct, frozen=True):
-    """A device whose bus and model are known."""
+def compile_devices(compilation: Compilation) -> Contribution:
+    """Return the devices of the file that have no mistake in their bus, model or states.
 
-    plan: DevicePlan
-    source: SourcePlan
-    described: Device
-    table: DeviceTable
-    read: Mapping[str, DeviceItem]  # Items of its states, by the states' names
-    path: Path | None = None  # The file of its table, where the robot file names one
-
-
-def compile_devices(file: RobotFile) -> dict[str, CompiledDevice]:
-    """Return the devices that could be compiled, by name, in the order of the file.
-
-    They are the first sources of the cycle's record, in this order.
+    Columns of states and commands are counted from the first ones of the cycle's record.
     """
-    compiled: dict[str, CompiledDevice] = {}
+    file, body = compilation.file, compilation.body
+    described = form.STAGE.of(file.robot)
+    sources: list[SourcePlan] = []
+    devices: list[BusDevice] = []
+    texts: dict[str, str] = {}
     states = commands = 0
-    for name, device in file.robot.devices.items():
+    for name, device in described.items():
         _check_place(file, name, device)
         table = _table(file, name, device)
         if table is None:
@@ -59,7 +54,7 @@ def compile_devices(file: RobotFile) -> dict[str, CompiledDevice]:
             servo_id=device.id,
             model=table.model,
             model_number=table.model_number,
-            source=len(compiled),
+            source=len(sources),
             blocks=device_blocks(_line(bus), table, read, states),
             commands=_with_safe_values(
                 file,
@@ -70,38 +65,34 @@ def compile_devices(file: RobotFile) -> dict[str, CompiledDevice]:
                 },
             ),
         )
-        source = SourcePlan(
-            name=name,
-            kind="device",
-            states=tuple(read),
-            commands=tuple(written),
-            ranges=tuple((command.lowest, command.highest) for command in plan.commands),
-            label=f"{name} (ID {device.id} on bus {device.bus})",
+        sources.append(
+            SourcePlan(
+                name=name,
+                kind="device",
+                states=tuple(read),
+                commands=tuple(written),
+                ranges=tuple((command.lowest, command.highest) for command in plan.commands),
+                label=f"{name} (ID {device.id} on bus {device.bus})",
+            )
         )
-        compiled[name] = CompiledDevice(
-            plan, source, device, table, read, _file(file.description, name, device)
-        )
+        links = None if body is None else body.urdf.links
+        shown = simulated_states(file, name, table, read, links)
+        devices.append(BusDevice(device.bus, plan, table, shown))
+        if (path := _file(file.description, name, device)) is not None:
+            texts[str(path)] = table.text
         states += len(read)
         commands += len(written)
-    return compiled
+    return Contribution(
+        names=tuple(described),
+        buses=frozenset(device.bus for device in described.values()),
+        sources=tuple(sources),
+        devices=tuple(devices),
+        links={name: each.simulation.link for name, each in described.items() if each.simulation.link},
+        texts=texts,
+    )
 
 
-def check_source_names(
-    file: RobotFile, sources: Sequence[SourcePlan], controllers: Iterable[ControllerPlan]
-) -> None:
-    """Check that joints, devices, sensors, and controllers that provide states have names of their own."""
-    owners = dict.fromkeys(file.robot.joints, "joint")
-    for plan in controllers:
-        if plan.provides:
-            owners.setdefault(plan.name, "controller")
-    for source in sources:
-        if source.name in owners:
-            file.error(
-                file.key(f"{source.kind}s", source.name),
-                f"{source.name} is the name of a {owners[source.name]} already, and both have states",
-                f"give the {source.kind} another name",
-            )
-        owners.setdefault(source.name, source.kind)
+STAGE = CompileStage(compile_devices)
 
 
 def _check_place(file: RobotFile, name: str, device: Device) -> None:
@@ -109,7 +100,7 @@ def _check_place(file: RobotFile, name: str, device: Device) -> None:
     robot, marks = file.robot, file.marks
     check_bus(file, device, name, partial(marks.value, "devices", name), "ID")
     others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}
-    for each, other in robot.devices.items():
+    for each, other in form.STAGE.of(robot).items():
         if each == name:
             break
         others.setdefault((other.bus, other.id), each)
@@ -196,7 +187,7 @@ def _with_safe_values(
 ) -> tuple[DeviceCommand, ...]:
     """Return the commands of a device with the safe values that the file gives."""
     found = dict(commands)
-    for each, value in file.robot.devices[name].safe.items():
+    for each, value in form.STAGE.of(file.robot)[name].safe.items():
         mark = file.at("devices", name, "safe", each)
         if (command := commands.get(each)) is None:
             fix = suggestion(each, tuple(commands)) if commands else "name its item under commands"

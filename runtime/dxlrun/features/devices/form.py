@@ -1,20 +1,15 @@
-"""Devices and sensors of a robot file: their forms.
-
-A device is on a servo bus and is not a servo; `compile` checks it against its table. A sensor's own keys are
-checked by the plug-in that offers its type.
-"""
+"""Form of the section `devices`: what is on a servo bus and is not a servo."""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, PlainValidator, WithJsonSchema
 
-from dxlrun.description import units
-from dxlrun.description.form import Form, PlugInEntry, key, refuse
-from dxlrun.description.units import Duration
+from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.features.feature import Section
 
 _STATE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 _ITEM = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)
@@ -134,16 +129,8 @@ class Device(Form):
     )
 
 
-class SensorEntry(PlugInEntry):
-    """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
-
-    type: str = key("Type that a plug-in offers.", "serial_imu", min_length=1)
-    rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = key(
-        "Samples per second, Hz; the loop's rate when absent.", "100", None
-    )
-    timeout: Annotated[Duration, Field(gt=0)] | None = key(
-        "Age at which its values are no longer valid; 5 periods when absent, 50 ms at least.", "50 ms", None
-    )
-    on_lost: Literal["continue", "stop"] = key(
-        "When it brings nothing for that time; stop: the run ends by the policy on_fault.", "stop", "continue"
-    )
+STAGE: Section[dict[str, Device]] = Section(
+    "devices",
+    dict[Name, Device],
+    key("What is on a bus and is no servo, by name.", "{imu: {bus: main, id: 241, model: ...}}", {}),
+)

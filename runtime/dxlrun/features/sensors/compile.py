@@ -5,37 +5,46 @@ from __future__ import annotations
 import json
 from collections.abc import Collection
 
+from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
 from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to_get
-from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.sensors.offer import SensorOffer, names_breach
 from dxlrun.description.bus import SIMULATED
 from dxlrun.description.form import ParametersModel
-from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
+from dxlrun.features.sensors import form
+from dxlrun.features.sensors.form import SensorEntry
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 
 _LEAST_TIMEOUT_NS = 50_000_000  # A process without real time may wait so long for a processor
 _TIMEOUT_PERIODS = 5
 
 
-def sensor_source(plan: SensorPlan) -> SourcePlan:
-    """Return a sensor's states as controllers and the record see them."""
-    return SourcePlan(plan.name, "sensor", plan.states, label=f"sensor {plan.name}")
-
-
-def compile_sensors(file: RobotFile, plugins: PlugIns, body: CompiledUrdf | None) -> tuple[SensorPlan, ...]:
-    """Return the sensors that could be compiled, in the order of the file; `body`: of the robot's URDF."""
+def compile_sensors(compilation: Compilation) -> Contribution:
+    """Return the sensors of the file that have no mistake in their type, parameters and names."""
+    file, body = compilation.file, compilation.body
     links = None if body is None else body.urdf.links
-    found = (_compiled(file, name, plugins, links) for name in file.robot.sensors)
-    return tuple(one for one in found if one is not None)
+    described = form.STAGE.of(file.robot)
+    found = (_compiled(file, name, entry, compilation.plugins, links) for name, entry in described.items())
+    sensors = tuple(each for each in found if each is not None)
+    return Contribution(
+        names=tuple(described),
+        sources=tuple(
+            SourcePlan(plan.name, "sensor", plan.states, label=f"sensor {plan.name}") for plan in sensors
+        ),
+        links={plan.name: plan.links[0] for plan in sensors if len(plan.links) == 1},
+        sensors=sensors,
+    )
+
+
+STAGE = CompileStage(compile_sensors)
 
 
 def _compiled(
-    file: RobotFile, name: str, plugins: PlugIns, known: Collection[str] | None
+    file: RobotFile, name: str, entry: SensorEntry, plugins: PlugIns, known: Collection[str] | None
 ) -> SensorPlan | None:
-    entry, marks = file.robot.sensors[name], file.marks
+    marks = file.marks
     offer = plugins.sensors.get(entry.type)
     if offer is None:
         file.error(
@@ -44,14 +53,14 @@ def _compiled(
             where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
         )
         return None
-    parameters = parameters_of(file, "sensor", name, offer.distribution, offer.sensor.Parameters)
+    parameters = parameters_of(file, "sensor", name, entry, offer.distribution, model=offer.sensor.Parameters)
     if parameters is None:
         return None
     names = _names(file, name, offer, parameters)
     if names is None:
         return None
     states, links, noisy = names
-    _check_links(file, name, links, known)
+    _check_links(file, name, entry, links, known)
     rate = entry.rate or file.robot.loop.rate
     period_ns = round(1e9 / rate)
     if entry.timeout is not None and entry.timeout <= period_ns:
@@ -97,7 +106,13 @@ def _names(
     return states, links, noisy
 
 
-def _check_links(file: RobotFile, name: str, links: Collection[str], known: Collection[str] | None) -> None:
+def _check_links(
+    file: RobotFile,
+    name: str,
+    entry: SensorEntry,
+    links: Collection[str],
+    known: Collection[str] | None,
+) -> None:
     """Check that what a simulated sensor senses is there."""
     robot = file.robot
     if not links:
@@ -119,15 +134,15 @@ def _check_links(file: RobotFile, name: str, links: Collection[str], known: Coll
     for link in links:
         if known is not None and link not in known:
             file.error(
-                _text_mark(file.description, name, link),
+                _text_mark(file, name, entry, link),
                 f"{name} is on link {link}, which the URDF does not have",
                 suggestion(link, tuple(known)),
             )
 
 
-def _text_mark(description: Description, name: str, text: str) -> Mark:
+def _text_mark(file: RobotFile, name: str, entry: SensorEntry, text: str) -> Mark:
     """Return where a parameter of a sensor has a text; the sensor's own place if nowhere."""
-    for key, value in description.robot.sensors[name].parameters.items():
+    for key, value in entry.parameters.items():
         if value == text:
-            return description.marks.value("sensors", name, key)
-    return description.marks.key("sensors", name)
+            return file.at("sensors", name, key)
+    return file.key("sensors", name)

@@ -1,0 +1,1 @@
+"""Sensors: what is not on a servo bus, sampled by a process of its own."""
