@@ -306,5 +306,12 @@ class Robot(Form):
 @cache
 def robot_form() -> type[Robot]:
     """Return the form of a robot file with the sections of all features."""
-    sections: dict[str, Any] = {each.name: (each.form, each.field) for _, each in stages(Section)}
-    return create_model(Robot.__name__, __base__=Robot, __doc__=Robot.__doc__, **sections)
+    sections = [section for _, section in stages(Section)]
+    definitions: dict[str, Any] = {each.name: (each.form, each.field) for each in sections}
+    form = create_model(Robot.__name__, __base__=Robot, __doc__=Robot.__doc__, **definitions)
+    order = [*Robot.model_fields]
+    for each in sections:
+        order.insert(order.index(each.before) if each.before else len(order), each.name)
+    # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
+    form.__pydantic_fields__ = {name: form.model_fields[name] for name in order}
+    return form

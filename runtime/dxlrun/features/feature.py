@@ -41,6 +41,8 @@ class Section(Generic[T]):
     """Type of the section's value, for pydantic: `dict[Name, Device]`."""
     field: T
     """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    before: str = ""
+    """Key that follows it in lists of all keys; empty: it is the last."""
 
     def of(self, robot: object) -> T:
         """Return the section of a robot file that was read."""

@@ -31,4 +31,5 @@ STAGE: Section[dict[str, SensorEntry]] = Section(
     "sensors",
     dict[Name, SensorEntry],
     key("Sensors by name, each with a process of its own.", "{imu: {type: serial_imu, ...}}", {}),
+    before="poses",
 )
