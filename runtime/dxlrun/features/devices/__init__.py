@@ -1,1 +1,4 @@
-"""Devices: what is on a servo bus and is not a servo, with states, commands and safe values."""
+"""Devices: units on a servo bus that are not servos, with states, commands and safe values.
+
+Their tables, reads and packets are in `dxlwire`, and sensors that have a process of their own in `sensors`.
+"""

@@ -1,1 +1,4 @@
-"""Sensors: what is not on a servo bus, sampled by a process of its own."""
+"""Sensors: sources of states that a process of their own samples.
+
+The class of a sensor is in `contract`, and what is on a servo bus in `devices`.
+"""
