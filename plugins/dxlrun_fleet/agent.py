@@ -20,9 +20,8 @@ from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
-from dxlrun.remote.network.listener import Listener
-from dxlrun.remote.requests.table import Role
 from dxlrun.remote.server import Connection, config_of
+from dxlrun.tooling.live import Listener, Role
 from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"

@@ -24,10 +24,9 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from dxlrun.errors import InputError
-from dxlrun.output.target import unwritable
-from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
-from dxlrun.remote.requests.table import Role
+from dxlrun import InputError
+from dxlrun.tooling.live import CLIENT, Role, keys_place, revoked
+from dxlrun.tooling.output import unwritable
 
 _AUTHORITY_DAYS = 3650
 _EARLIER = timedelta(minutes=5)

@@ -14,9 +14,9 @@ from urllib.parse import quote
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.errors import DxlrunError, InputError
-from dxlrun.output.terminal import print_error, show, show_json
+from dxlrun import DxlrunError, InputError
+from dxlrun.tooling.output import print_error, show, show_json
+from dxlrun.tooling.verbs import DebugFlag, JsonFlag
 
 if TYPE_CHECKING:
     from dxlrun_fleet.fleet_file import Fleet
@@ -113,7 +113,7 @@ def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_j
 
 def _start(fleet: Fleet, name: str) -> str:
     """Let a robot's agent start it; return when it can be reached."""
-    from dxlrun.remote.network.network_link import NetworkLink
+    from dxlrun.tooling.live import NetworkLink
     from dxlrun_fleet.agent import START
 
     robot, path = NetworkLink(fleet.robots[name], "dxlrun fleet"), START + quote(name)
@@ -131,8 +131,8 @@ def _start(fleet: Fleet, name: str) -> str:
 
 
 def _stop(fleet: Fleet, name: str) -> str:
-    from dxlrun.remote.client import RemoteRobot
-    from dxlrun.remote.network.network_link import NetworkLink
+    from dxlrun import RemoteRobot
+    from dxlrun.tooling.live import NetworkLink
 
     with RemoteRobot(name, NetworkLink(fleet.robots[name], "dxlrun fleet")) as robot:
         robot.info()  # to a client, one that cannot be reached has been stopped

@@ -8,13 +8,15 @@ from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator
 
+from dxlrun import InputError
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import grow, parse, read_text
 from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.problems import read_form
-from dxlrun.errors import InputError, suggestion
 from dxlrun.remote.network.robots_file import ListedAddress, RobotsFile
-from dxlrun.remote.sockets import Address, address_of
+from dxlrun.remote.sockets import address_of
+from dxlrun.tooling.live import Address
+from dxlrun.tooling.verbs import suggestion
 
 
 def _line(text: str) -> str:

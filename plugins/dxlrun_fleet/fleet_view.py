@@ -10,13 +10,11 @@ from datetime import datetime
 import msgspec
 import numpy as np
 
+from dxlrun import DxlrunError, Refused, RemoteRobot
 from dxlrun.channels.answers import Code
-from dxlrun.errors import DxlrunError, Refused
-from dxlrun.output.table import Cell, Column, Columns, Table
-from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.network.network_link import NetworkLink
-from dxlrun.remote.requests.replies import Events, RobotInfo
-from dxlrun.remote.sockets import Address
+from dxlrun.remote.requests.replies import Events
+from dxlrun.tooling.live import Address, NetworkLink, RobotInfo
+from dxlrun.tooling.output import Cell, Column, Columns, Table
 
 LOOK_S = 0.5
 SILENT_S = 1.5
@@ -144,7 +142,7 @@ def show_live(views: list[RobotView], wait: Callable[[float], bool]) -> None:
     from rich.live import Live
 
     from dxlrun.cli.steering.watch import compact
-    from dxlrun.output.terminal import out
+    from dxlrun.tooling.output import out
 
     with Live(console=out(), screen=True, auto_refresh=False) as live:
         while True:

@@ -8,11 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Table
-from dxlrun.output.terminal import show, show_json
-from dxlrun.remote.requests.table import Role
+from dxlrun import InputError
+from dxlrun.tooling.live import Role
+from dxlrun.tooling.output import Column, Table, show, show_json
+from dxlrun.tooling.verbs import DebugFlag, JsonFlag
 
 if TYPE_CHECKING:
     from dxlrun_fleet.authority import Issued
@@ -56,7 +55,7 @@ def keys(
         from dxlrun_fleet import authority
     except ImportError as error:
         raise InputError("`dxlrun keys` needs cryptography: pip install 'dxlrun[network]'") from error
-    from dxlrun.remote.network.certificates import CLIENT, keys_place, revoked
+    from dxlrun.tooling.live import CLIENT, keys_place, revoked
 
     _refuse_unused(action, {"--role": role, "--days": days, "--output": output, "a name": name})
     if action != "list":

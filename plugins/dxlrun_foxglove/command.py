@@ -14,12 +14,11 @@ from urllib.parse import quote
 from cyclopts import Parameter
 
 from dxlrun import InputError, connect
-from dxlrun.cli.inputs import DebugFlag, Flag, RobotName
-from dxlrun.output.terminal import show
-from dxlrun.output.unblocked import leave_real_time
+from dxlrun.tooling.output import leave_real_time, show
+from dxlrun.tooling.verbs import DebugFlag, Flag, RobotName
 
 if TYPE_CHECKING:
-    from dxlrun.remote.network.listener import Listener
+    from dxlrun.tooling.live import Listener
     from dxlrun_foxglove.server import FoxgloveServer
 
 PORT = 8765
@@ -58,7 +57,8 @@ def foxglove(
     origin
         Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
     """
-    from dxlrun.remote.network.listener import LOOPBACK, Place
+    from dxlrun.remote.network.listener import LOOPBACK
+    from dxlrun.tooling.live import Place
 
     place = Place.parse(listen)
     if cert is None and key is not None:
@@ -87,7 +87,7 @@ async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
-    from dxlrun.remote.network.listener import in_url
+    from dxlrun.tooling.live import in_url
 
     async with await served.serve(listener, tls):
         host, taken = listener.getsockname()[:2]

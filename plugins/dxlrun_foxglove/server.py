@@ -25,7 +25,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Origin, Subprotocol
 
 from dxlrun import DxlrunError, InputError
-from dxlrun.remote.network.listener import Listener
+from dxlrun.tooling.live import Listener
 from dxlrun_foxglove import protocol
 from dxlrun_foxglove.protocol import ERROR, Call, Subscription, Words, status, text
 from dxlrun_foxglove.viewed_run import ENCODING, HALT, ViewedRun, advertised, advertised_services

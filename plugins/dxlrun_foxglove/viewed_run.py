@@ -8,13 +8,11 @@ from functools import partial
 
 import msgspec
 
-from dxlrun import DxlrunError, InputError, RemoteRobot, connect
+from dxlrun import DxlrunError, InputError, RemoteRobot, TopicMessage, connect
 from dxlrun.channels.loop_requests import Switch, TorqueRequest
 from dxlrun.log import schemas
-from dxlrun.messages.definition import MessageType
-from dxlrun.remote.live.listening import TopicMessage
-from dxlrun.remote.live.live_messages import LiveMessages
-from dxlrun.remote.requests.replies import RobotInfo
+from dxlrun.tooling.live import LiveMessages, RobotInfo
+from dxlrun.tooling.records import MessageType
 from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
 

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 
 import msgspec
 
+from dxlrun import distance_text
 from dxlrun.compile.joints.limits import degrees
 from dxlrun.compile.joints.servos import servo_travel
 from dxlrun.description.document import KeyPath
 from dxlrun.description.reading import Replacement
-from dxlrun.description.units import distance_text
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find

@@ -10,8 +10,8 @@ import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from dxlrun.errors import InputError
-from dxlrun.output.terminal import print_error
+from dxlrun import InputError
+from dxlrun.tooling.output import print_error
 
 LOOK_S = 0.02
 """Between two looks while Enter is awaited."""

@@ -6,9 +6,10 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
+from dxlrun import InputError, PortError
 from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
-from dxlrun.errors import InputError, PortError, suggestion
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_hand.dialogue import Dialogue
 from dxlwire.port.reopening import lasting_name
 

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import yaml
 
+from dxlrun import InputError
 from dxlrun.description.document import KeyPath, node_mark, refusal
 from dxlrun.description.including import Source, read_sources
-from dxlrun.errors import InputError
-from dxlrun.output.target import unwritable
+from dxlrun.tooling.output import unwritable
 
 
 class _Edit(NamedTuple):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from dxlrun import PortError
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.joints.servos import AUTO
-from dxlrun.compile.robot import compile_robot
-from dxlrun.description.reading import Description
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import first_reach
@@ -16,7 +15,8 @@ from dxlrun.dynamixel.servo.registers import compare, merged
 from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
 from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.errors import PortError, ServoFault
+from dxlrun.errors import ServoFault
+from dxlrun.tooling.robots import Description, compile_robot
 from dxlrun_hand.dialogue import Dialogue, yes
 from dxlrun_hand.lines import BusLines
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.tooling.plans import ControllerPlan
 from dxlrun_analysis.playback.motion_file import motion_file
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion, What
 from dxlrun_analysis.playback.spline_path import PINION_M, fit, tolerances

@@ -9,11 +9,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from dxlrun import GoalState, RemoteRobot
+from dxlrun import GoalState, InputError, Refused, RemoteRobot
 from dxlrun.cli.steering.goals import cancelled, sentence
-from dxlrun.errors import InputError, Refused, ServoFault, suggestion
-from dxlrun.output.target import write_target
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.errors import ServoFault
+from dxlrun.tooling.output import write_target
+from dxlrun.tooling.plans import ControllerPlan
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, ending_with, yes

@@ -10,9 +10,9 @@ from typing import cast
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun import RemoteRobot
+from dxlrun import InputError, RemoteRobot
 from dxlrun.cli.steering.steer import Row
-from dxlrun.errors import InputError, suggestion
+from dxlrun.tooling.verbs import suggestion
 
 USUAL_SPEED = {"rad": 0.5, "m": 0.05}
 """Of a joint at the end of its axis at factor 1: rad/s and m/s."""

@@ -8,9 +8,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, Flag, RobotName, terminated_as_interrupted
+from dxlrun import InputError
 from dxlrun.cli.steering.steer import Chosen, robot_of
-from dxlrun.errors import InputError
+from dxlrun.tooling.verbs import DebugFlag, Flag, RobotName, terminated_as_interrupted
 
 Targets = Annotated[str, Parameter(name="target", show_default=False)]
 """Names of controllers, groups or joints."""
@@ -41,7 +41,7 @@ def teleop(
     speed
         Factor of the speed: 0.5 takes twice as long.
     """
-    from dxlrun.output.terminal import show
+    from dxlrun.tooling.output import show
     from dxlrun_teleop.bank import banks_of
     from dxlrun_teleop.devices import chosen
     from dxlrun_teleop.drive import FACTORS, PERIOD_S, Drive

@@ -11,7 +11,8 @@ from contextlib import suppress
 from glob import glob
 from typing import TYPE_CHECKING
 
-from dxlrun.errors import DxlrunError, InputError, missing_extra
+from dxlrun import DxlrunError, InputError
+from dxlrun.tooling.verbs import missing_extra
 from dxlrun_teleop.keyboard import AXES
 from dxlrun_teleop.source import Given, Press
 

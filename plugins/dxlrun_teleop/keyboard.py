@@ -9,7 +9,7 @@ import sys
 import termios
 import tty
 
-from dxlrun.errors import InputError
+from dxlrun import InputError
 from dxlrun_teleop.source import Given, Press
 
 HELD_S = 0.13

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dxlrun import RemoteRobot
-from dxlrun.output.table import Column, Table
-from dxlrun.output.terminal import fitted, out
+from dxlrun.tooling.output import Column, Table, fitted, out
 from dxlrun_teleop.drive import Drive
 from dxlrun_teleop.source import Source
 

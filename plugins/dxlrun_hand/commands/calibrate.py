@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, DebugFlag, RobotPath, compiled, parse_assignments, read_models
-from dxlrun.errors import InputError
+from dxlrun import InputError
+from dxlrun.tooling.verbs import Assignment, DebugFlag, RobotPath, compiled, parse_assignments, read_models
 
 if TYPE_CHECKING:
     from dxlrun.compile.joints.joints import CompiledJoint

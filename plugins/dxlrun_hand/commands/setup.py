@@ -6,9 +6,9 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, DebugFlag, Flag, RobotPath, known_file, parse_assignments
+from dxlrun import InputError
 from dxlrun.cli.tools.scan import load_models
-from dxlrun.errors import InputError
+from dxlrun.tooling.verbs import Assignment, DebugFlag, Flag, RobotPath, known_file, parse_assignments
 from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ def setup(
     find_port
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     """
-    from dxlrun.description.reading import read_robot
     from dxlrun.dynamixel.tools.tool_line import TunablePort
+    from dxlrun.tooling.robots import read_robot
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.servo_setup import SetUp
     from dxlwire.port.adapters import serial_devices

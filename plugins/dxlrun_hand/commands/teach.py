@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, RobotName
+from dxlrun import InputError
 from dxlrun.cli.steering.steer import Chosen, robot_of
-from dxlrun.errors import InputError
+from dxlrun.tooling.verbs import DebugFlag, RobotName
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
 """Names of joints, groups or controllers."""
@@ -40,7 +40,7 @@ def teach(
         Velocity of the joints on the way from one pose to the next.
     """
     from dxlrun.description.units import angular_velocity
-    from dxlrun.output.target import check_target
+    from dxlrun.tooling.output import check_target
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.teaching import taught
 

@@ -14,7 +14,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
 from dxlrun import DxlrunError, Floats, GoalState, InputError, Refused, RemoteGoal, RemoteRobot, connect
-from dxlrun.remote.requests.replies import ControllerInfo
+from dxlrun.tooling.live import ControllerInfo
 from dxlrun_controllers.laws.spline import SplineSample
 from dxlrun_ros2 import CLIENT
 from dxlrun_ros2.manager import info_of

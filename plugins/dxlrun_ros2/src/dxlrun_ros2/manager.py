@@ -31,7 +31,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
-from dxlrun.remote.requests.replies import ControllerInfo, RobotInfo
+from dxlrun.tooling.live import ControllerInfo, RobotInfo
 from dxlrun_ros2 import CLIENT
 
 TYPES = {

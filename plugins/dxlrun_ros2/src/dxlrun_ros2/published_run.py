@@ -15,8 +15,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_rosout_default
 from dxlrun import DxlrunError, Floats, RemoteRobot, TopicMessage, connect
 from dxlrun.log import schemas
 from dxlrun.messages.cdr import ENCAPSULATION
-from dxlrun.messages.definition import MessageType
-from dxlrun.remote.live.live_messages import LiveMessages
+from dxlrun.tooling.live import LiveMessages
+from dxlrun.tooling.records import MessageType
 from dxlrun_ros2 import CLIENT
 
 STATE = QoSProfile(depth=1)

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.subscription import MessageInfo
 
 from dxlrun import DxlrunError, RemoteRobot, connect
-from dxlrun.remote.sockets import SocketLink
+from dxlrun.tooling.live import SocketLink
 from dxlrun_ros2 import CLIENT
 
 Message = TypeVar("Message")

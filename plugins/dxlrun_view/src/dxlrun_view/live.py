@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 
 from dxlrun import DxlrunError, Refused, RemoteRobot, connect, running
-from dxlrun.channels.cycle import Torque
-from dxlrun.description.motion import read_motion
 from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
 from dxlrun.remote.live.states import RobotStates
+from dxlrun.tooling.records import Torque
+from dxlrun.tooling.robots import read_motion
 from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, Values, columns_of, numbers_in
 from dxlrun_view.shown import LiveEvent, RobotInfo, Shown
 from dxlwire.modes import Mode

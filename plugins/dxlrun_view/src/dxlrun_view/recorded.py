@@ -10,9 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import LogError, open_log
-from dxlrun.channels.events import Event
-from dxlrun.errors import DxlrunError
+from dxlrun import DxlrunError, LogError, open_log
 from dxlrun.log.schemas import (
     ACTIVATION_TOPIC,
     BUS_PREFIX,
@@ -22,7 +20,8 @@ from dxlrun.log.schemas import (
     JOINT_COMMANDS_TOPIC,
     JOINT_STATES_TOPIC,
 )
-from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun.tooling.plans import Plan, from_json
+from dxlrun.tooling.records import Event
 from dxlrun_view.curves import (
     CYCLE,
     JOINT_COLUMNS,

@@ -29,9 +29,8 @@ from starlette.routing import Route
 
 from dxlrun import DxlrunError, InputError
 from dxlrun.remote.asked import client_of
-from dxlrun.remote.network.listener import Listener, in_url
-from dxlrun.remote.requests.table import Role
 from dxlrun.remote.server import Connection
+from dxlrun.tooling.live import Listener, Role, in_url
 from dxlrun_view.actions import Action, ListParameters, act
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.shown import LiveEvent, Shown, Source

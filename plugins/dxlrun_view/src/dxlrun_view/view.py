@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import DxlrunError, InputError, running
-from dxlrun.errors import suggestion
-from dxlrun.output.terminal import print_warning, progress_bar, show
-from dxlrun.output.unblocked import leave_real_time
+from dxlrun.tooling.output import leave_real_time, print_warning, progress_bar, show
+from dxlrun.tooling.verbs import suggestion
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -47,7 +46,7 @@ def view(
         keys`: the robot's, and the browser's, whose role decides whether it may steer. Without a port it is
         8765, or if that is taken a free one.
     """
-    from dxlrun.remote.network.listener import Place, in_url
+    from dxlrun.tooling.live import Place, in_url
 
     place = Place.parse(listen)
     leave_real_time()
@@ -101,7 +100,7 @@ def _source(what: str | None) -> Source:
         with progress_bar(hidden=False) as draw:
             return RecordedRobot(path, lambda share: draw(f"reading {path.name}", share))
     if path.suffix in (".yaml", ".yml"):
-        from dxlrun.description.reading import read_robot
+        from dxlrun.tooling.robots import read_robot
 
         name = read_robot(path, {}).robot.name
         if name not in running():
