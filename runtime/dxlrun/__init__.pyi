@@ -22,6 +22,7 @@ from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
 from dxlrun.contract.sensor import Sensor as Sensor
 from dxlrun.contract.sensor import SensorContext as SensorContext
+from dxlrun.contract.serial_line import open_serial as open_serial
 from dxlrun.description.form import Mistake as Mistake
 from dxlrun.description.form import ParametersModel as ParametersModel
 from dxlrun.description.joints.servo import ServoModel as ServoModel
@@ -69,4 +70,3 @@ from dxlsim.motion.link_motion import LinkMotion as LinkMotion
 from dxlsim.motor_model import MotorLoad as MotorLoad
 from dxlsim.motor_model import MotorModel as MotorModel
 from dxlsim.motor_model import Stribeck as Stribeck
-from dxlwire.port.serial_open import open_serial as open_serial

@@ -106,6 +106,14 @@ def robot_of(process: Path) -> str | None:
     return found[1] if found else None
 
 
+def describe_run(process: Path) -> str:
+    """Name the run that a process is part of, and how to stop it, by its folder in /proc; empty: of none."""
+    robot = robot_of(process)
+    if robot is None:
+        return ""
+    return f"a run of {robot}; `dxlrun stop --robot {robot}` ends it, or Ctrl-C in its terminal"
+
+
 def found_runs() -> list[FoundRun]:
     """Return the runs of this user (root: of all) on this computer, whatever state their processes are in."""
     runs: dict[tuple[int, int], tuple[str, list[RunProcess]]] = {}

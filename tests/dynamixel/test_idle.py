@@ -2,6 +2,7 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.wire_reports import WireReports
 from dxlwire.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
 from dxlwire.plan.line import listen
 from dxlwire.plan.planning import plan_line
@@ -19,7 +20,7 @@ class Rounds:
         self.rig = make_rig(make_x((11, 12)))
         self.lines = self.rig.lines
         (self.bus,) = self.lines.buses
-        self.idle = IdleScheduler(self.bus, self.rig.events)
+        self.idle = IdleScheduler(self.bus, WireReports(self.rig.events))
 
     def gap(self, length_ns):
         until = self.rig.clock.now_ns() + length_ns

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import goals_in, make_plan, make_rig
 
-from dxlrun.channels.cycle import States
+from dxlrun.channels.cycle import SourceStates, States
 from dxlrun.dynamixel.servo import life
 from dxlrun.dynamixel.servo.life import (
     GETS_GOALS,
@@ -35,9 +35,11 @@ def one():
     plan = make_plan((1,))
     rig = make_rig(plan)
     reads = CyclicReads(
-        plan, Samples([plan], States.empty(1), rig.events).buses[0], OwedReplies(rig.clock.now_ns)
+        plan,
+        Samples([plan], States.empty(1), SourceStates.empty(), None).buses[0],
+        OwedReplies(rig.clock.now_ns),
     )
-    return Life(rig.hardware._idle[0], reads)
+    return Life(rig.hardware._idle[0], reads, rig.events)
 
 
 def put(servo, state):

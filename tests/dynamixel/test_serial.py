@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from tests.kit.rigs import make_plan, make_rig
 
+import dxlrun
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.process import memory_file
 from dxlrun.compile.robot import compile_files
@@ -241,7 +242,7 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
         assert run.stdout.readline() == "opened\n"
         fcntl.ioctl(terminal[2], termios.TIOCNXCL)  # root may open it all the same; the flock stays
         with pytest.raises(PortError) as refused:
-            open_serial(path, 1_000_000)
+            dxlrun.open_serial(path, 1_000_000)
     assert str(refused.value) == (
         f"{path} is in use by a run of pan_tilt; `dxlrun stop --robot pan_tilt` ends it, or Ctrl-C in its "
         "terminal"

@@ -21,6 +21,7 @@ from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
 from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits, restore_torque_limits
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
+from dxlrun.dynamixel.wire_reports import WireReports
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.bus_plan import BusPlan
@@ -95,11 +96,12 @@ class DynamixelHardware:
         self._due_ns = 0  # when idle time has something to do,
         self._waiting: list[tuple[array[int], int]] = []
         """or where it is so long, ns, on a line, whose words these are."""
-        self._idle = tuple(IdleScheduler(bus, events) for bus in self._buses)
-        self._samples = Samples(self._plans, states, events, sources)
+        reports = WireReports(events)
+        self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
+        self._samples = Samples(self._plans, states, sources or SourceStates.empty(), reports)
         commands = np.empty(0) if device_commands is None else device_commands
         self._servos = tuple(
-            Servos(idle, states, arrays, commands)
+            Servos(idle, states, arrays, commands, events)
             for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
         )
         self._pairs = tuple(zip(self._buses, self._servos, strict=True))
@@ -110,7 +112,7 @@ class DynamixelHardware:
         }
         """Row of a joint -> where its servo is."""
         shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
-        self._kernel = Kernel(self._lines, shared, self._samples, goals, packets)
+        self._kernel = Kernel(self._lines, shared, self._samples, goals.values, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
         self._start_up = StartUp(self._lines, self._servos, events)
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}

@@ -36,6 +36,7 @@ from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.process_table import describe_run
 from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import MonotonicClock
@@ -232,7 +233,8 @@ class Guardian:
             [
                 Wanted(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
                 for path, bus in zip(self._job.ports, self._job.buses, strict=True)
-            ]
+            ],
+            describe_holder=describe_run,
         )
         # before the loop is executed, which inherits none of it
         grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlrun.channels.cycle import Floats, SourceStates
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlwire.arrays import Floats, SourceArrays
 from dxlwire.bus_plan import BusPlan
+from dxlwire.reports import Reason, ReportSink
 
 REPORT_AGAIN_NS = 1_000_000_000  # One device has at most one event in this time
 
@@ -21,9 +21,9 @@ class DeviceSamples:
     keeps its values, is invalid, and its age grows.
     """
 
-    def __init__(self, plans: Sequence[BusPlan], sources: SourceStates, events: EventSink) -> None:
+    def __init__(self, plans: Sequence[BusPlan], sources: SourceArrays, reports: ReportSink) -> None:
         self.sources = sources  # Those of the cycle's record
-        self._events = events
+        self._reports = reports
         devices = [(plan, device) for plan in plans for device in plan.devices]
         blocks = [block for _, device in devices for block in device.blocks]
         self.values: Floats = np.full(len(sources.values), np.nan)
@@ -64,4 +64,4 @@ class DeviceSamples:
                 if not math.isfinite(self.values[field.column])
             ]
             text = f"{label} sent no finite {', '.join(wrong)}: not believed"
-            self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
+            self._reports.report(Reason.IMPLAUSIBLE, name, text)

@@ -12,9 +12,9 @@ from enum import IntEnum, unique
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlwire.exchange.bus import NEVER, Bus
 from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
+from dxlwire.reports import Reason, ReportSink
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000
@@ -72,10 +72,10 @@ class IdleScheduler:
     line that is gone answers with time-outs (`abandon`).
     """
 
-    def __init__(self, bus: Bus, events: EventSink) -> None:
+    def __init__(self, bus: Bus, reports: ReportSink) -> None:
         self.plan = bus.plan
         self.bus = bus
-        self.events = events
+        self._reports = reports
         self.now_ns = bus.now_ns
         self.tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
@@ -214,7 +214,7 @@ class IdleScheduler:
             need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
             text = f"{task.name} waits for idle time: it may take {need:.1f} ms, of which the cycle leaves"
             text = f"{text} {left:.1f} ms; periods may be skipped"
-            self.events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
+            self._reports.report(Reason.NO_IDLE_TIME, source, text)
         return True
 
 

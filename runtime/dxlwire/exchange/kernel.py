@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Commands, Floats
+from dxlwire.arrays import Floats
 from dxlwire.bus_plan import BusPlan, Field
 from dxlwire.compiled import array_of, load_compiled, parse_structs
 from dxlwire.errors import PortError
@@ -201,9 +201,10 @@ class Kernel:
         lines: Lines,
         shared: Sequence[KernelGoals],
         samples: Samples,
-        goals: Commands,
+        goals: Floats,
         packets: PacketLog,
     ) -> None:
+        """`goals`: shape (4, joints), one row for each of COMMAND_INTERFACES; NaN: no goal."""
         self._library = library()
         self._buses = lines.buses
         self._shared = tuple(shared)
@@ -260,7 +261,7 @@ class Kernel:
         self._kernel.line_count = len(self._buses)
         return lines
 
-    def _lay_states(self, plans: Sequence[BusPlan], samples: Samples, goals: Commands) -> None:
+    def _lay_states(self, plans: Sequence[BusPlan], samples: Samples, goals: Floats) -> None:
         servos = [servo for plan in plans for servo in plan.servos]
         kernel = self._kernel
         kernel.servo_count = len(servos)
@@ -274,7 +275,7 @@ class Kernel:
             setattr(kernel, name, _data(getattr(samples, name)))
         for name in ("position", "velocity", "effort", "valid", "age_ns"):
             setattr(kernel, name, _data(getattr(samples.states, name)))
-        kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals.values))
+        kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals))
 
     def _lay_devices(self, plans: Sequence[BusPlan], samples: DeviceSamples) -> None:
         kernel, sources = self._kernel, samples.sources

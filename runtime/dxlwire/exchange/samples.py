@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats, SourceStates, States
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlwire.arrays import Floats, JointArrays, SourceArrays
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import control_table
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.modes import Mode
+from dxlwire.reports import Reason, ReportSink
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 
@@ -34,11 +34,10 @@ class Samples:
     def __init__(
         self,
         plans: Sequence[BusPlan],
-        states: States,
-        events: EventSink,
-        sources: SourceStates | None = None,
+        states: JointArrays,
+        sources: SourceArrays,
+        reports: ReportSink,
     ) -> None:
-        """`sources`: with the states of devices; None: there are none."""
         servos = [servo for plan in plans for servo in plan.servos]
         self.states = states  # Of the robot; filled here
         self.rows = np.array([servo.row for servo in servos], dtype=np.intp)
@@ -61,7 +60,7 @@ class Samples:
         """Time of the last sample before a servo began to count its turns again; -2: it did not."""
         self.doubted = np.zeros(len(servos), dtype=np.bool_)
         """True where the reply of this cycle is not believed."""
-        self.jumps = Jumps(plans, events)
+        self.jumps = Jumps(plans, reports)
         self.take: Callable[[int, int, bytes, int], object]
         """Takes what a member of a bus answered, both by their index, and when it came; of the kernel."""
         self.settle_all: Callable[[int], int]
@@ -72,7 +71,7 @@ class Samples:
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
         self.modes = b""  # The robot's modes, as of the last `follow_modes`
-        self.devices = DeviceSamples(plans, sources or SourceStates.empty(), events)
+        self.devices = DeviceSamples(plans, sources, reports)
         """Where the replies of devices go."""
         first_servo = first_block = 0
         buses = []
@@ -155,8 +154,8 @@ class Jumps:
     servo that really stands elsewhere is believed again after a moment.
     """
 
-    def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
-        self._events = events
+    def __init__(self, plans: Iterable[BusPlan], reports: ReportSink) -> None:
+        self._reports = reports
         both = [(plan, servo) for plan in plans for servo in plan.servos]
         self._servos = [servo for _, servo in both]
         speeds = [np.inf if servo.wraps else _most_speed(plan, servo) for plan, servo in both]
@@ -182,7 +181,7 @@ class Jumps:
             servo, time = self._servos[index], elapsed_ns * 1e-6
             name, jump = servo.joint, servo.step_text(abs(step))
             text = f"{name} jumped by {jump} in {time:.0f} ms, faster than it can turn: not believed"
-            self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
+            self._reports.report(Reason.IMPLAUSIBLE, name, text)
         return False
 
 

@@ -12,7 +12,6 @@ from typing import Protocol
 
 import msgspec
 
-from dxlrun.channels.heartbeat import LineProgress
 from dxlwire.errors import PortError
 
 # found at once, some dozen times a cycle
@@ -224,6 +223,43 @@ class StallCounter:
             self._until_ns = begin_ns
         self.waited_ns += max(0, end_ns - self._until_ns)
         self._until_ns = max(self._until_ns, end_ns)
+
+
+class SimulatingProcess(Protocol):
+    """A process that simulates servos, as their ports see it."""
+
+    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+        """Return for how long the process did not run between two times of CLOCK_MONOTONIC, ns."""
+        ...
+
+
+class LineProgress(Protocol):
+    """Progress of a simulating process on one line; times are CLOCK_MONOTONIC, ns."""
+
+    @property
+    def process(self) -> SimulatingProcess:
+        """The process."""
+        ...
+
+    @property
+    def taken_ns(self) -> int:
+        """Time at which the newest byte that the process received is off the wire; to be read first."""
+        ...
+
+    @property
+    def served_ns(self) -> int:
+        """Time before which every byte that was due to the host was sent to it."""
+        ...
+
+    @property
+    def given_ns(self) -> int:
+        """Time at which the newest bytes were sent to the host; 0 before the first."""
+        ...
+
+    @property
+    def due_ns(self) -> int:
+        """Time at which these bytes were due."""
+        ...
 
 
 class SimulatedPort(SerialPort):

@@ -15,7 +15,7 @@ import msgspec
 from dxlwire.errors import PortError
 from dxlwire.port.latency_timer import SYSTEM, shorten
 from dxlwire.port.ports import put_in_place, set_aside
-from dxlwire.port.serial_open import let_go, open_serial, rate_remark
+from dxlwire.port.serial_open import DescribeProcess, describe_no_process, let_go, open_serial, rate_remark
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0  # Between two attempts at a line; each pause is twice the one before
@@ -68,13 +68,25 @@ class KeptLines:
     lost line: a driver may take seconds over it, and the process that keeps the lines has a loop to watch.
     """
 
-    def __init__(self, lines: Sequence[Wanted], system: Path = SYSTEM) -> None:
-        """Open the lines; raises PortError when one cannot be opened, or keeps replies back for too long."""
+    def __init__(
+        self,
+        lines: Sequence[Wanted],
+        system: Path = SYSTEM,
+        describe_holder: DescribeProcess = describe_no_process,
+    ) -> None:
+        """Open the lines; raises PortError when one cannot be opened, or keeps replies back for too long.
+
+        Args:
+            lines: The lines.
+            system: Where the kernel shows its devices, for tests.
+            describe_holder: As in `open_serial`.
+        """
         self.descriptors: list[int] = []  # In the order of the lines
         self.done: list[str] = []  # What was done to latency timers, one sentence each
         self.remarks: list[str] = []  # About rates that drivers did not set as asked
         self._lines = tuple(lines)
         self._system = system
+        self._describe_holder = describe_holder
         wrong: list[str] = []
         try:
             for index, line in enumerate(lines):
@@ -127,7 +139,13 @@ class KeptLines:
 
     def _open(self, index: int, path: str) -> Opened:
         line = self._lines[index]
-        port = open_serial(path, line.baud_rate, rs485=line.rs485, boot_ns=line.boot_ns)
+        port = open_serial(
+            path,
+            line.baud_rate,
+            rs485=line.rs485,
+            boot_ns=line.boot_ns,
+            describe_holder=self._describe_holder,
+        )
         done, wrong = shorten(port.fileno(), path, line.latency_ns, self._system)
         remark = rate_remark(port, line.baud_rate)
         return Opened(index, port.detach(), done, wrong, remark)

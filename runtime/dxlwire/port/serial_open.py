@@ -6,11 +6,10 @@ import errno
 import os
 import struct
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from dxlrun.process_table import robot_of
 from dxlwire.errors import PortError
 from dxlwire.port.adapters import serial_devices
 from dxlwire.port.latency_timer import is_simulated
@@ -31,6 +30,9 @@ _SETTINGS = struct.Struct("4I20s2I")
 _TIOCSRS485 = 0x542F
 _RS485 = struct.pack("8I", 0b11, *(0,) * 7)
 """struct serial_rs485 (linux/serial.h): enabled, RTS is high while it sends, no delays."""
+
+DescribeProcess = Callable[[Path], str]
+"""Describes a process by its folder in /proc, and how to stop it; returns an empty text if it is unknown."""
 
 
 class SerialLine:
@@ -102,7 +104,19 @@ def let_go(descriptors: Iterable[int]) -> None:
         os.close(descriptor)
 
 
-def open_serial(path: str, baud_rate: int, *, rs485: bool = False, boot_ns: int = 0) -> SerialLine:
+def describe_no_process(process: Path) -> str:
+    """Return an empty description; the default of `DescribeProcess`."""
+    return ""
+
+
+def open_serial(
+    path: str,
+    baud_rate: int,
+    *,
+    rs485: bool = False,
+    boot_ns: int = 0,
+    describe_holder: DescribeProcess = describe_no_process,
+) -> SerialLine:
     """Open a serial device for this process alone: raw, 8N1; also a pseudo-terminal.
 
     Args:
@@ -110,6 +124,7 @@ def open_serial(path: str, baud_rate: int, *, rs485: bool = False, boot_ns: int 
         baud_rate: bit/s; `SerialLine.baud_rate` is what the driver made of it.
         rs485: Let the kernel switch the direction of an RS-485 transceiver by RTS.
         boot_ns: How long to wait for a board that resets when its port is opened; only where this did that.
+        describe_holder: Describes a process that has the port open, for the message of the error.
 
     Raises:
         PortError: There is no such device, this user may not open it, another process has it, or it cannot do
@@ -118,7 +133,7 @@ def open_serial(path: str, baud_rate: int, *, rs485: bool = False, boot_ns: int 
     try:
         line = SerialLine(path, baud_rate)
     except OSError as error:
-        raise PortError(_sentence(path, baud_rate, error)) from error
+        raise PortError(_sentence(path, baud_rate, error, describe_holder)) from error
     if rs485 and not is_simulated(path):
         try:
             fcntl.ioctl(line.fileno(), _TIOCSRS485, _RS485)
@@ -149,7 +164,7 @@ def rate_remark(line: SerialLine, baud_rate: int) -> str:
     )
 
 
-def _sentence(path: str, baud_rate: int, error: OSError) -> str:
+def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: DescribeProcess) -> str:
     number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return f"there is no {path}; {_what_exists()}"
@@ -159,7 +174,7 @@ def _sentence(path: str, baud_rate: int, error: OSError) -> str:
             f"`{command_for_access(Path(os.path.realpath(path)), os.path.realpath(path), '$USER')}`"
         )
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return f"{path} is in use by {_holder(path)}"
+        return f"{path} is in use by {_holder(path, describe_holder)}"
     if number == errno.ENOTTY:
         return f"{path} is no serial line"
     if number == errno.EINVAL:
@@ -174,8 +189,10 @@ def _what_exists() -> str:
     return f"there are: {', '.join(devices)}"
 
 
-def _holder(path: str) -> str:
-    """Name the run, or else the processes that have the device open, and how to stop them.
+def _holder(path: str, describe: DescribeProcess) -> str:
+    """Name the processes that have the device open, and how to stop them.
+
+    The first description counts; without one each process is named by its command.
 
     Only what this user may see is named.
     """
@@ -183,9 +200,8 @@ def _holder(path: str) -> str:
     found = [
         process for process in _processes() if process.name != str(os.getpid()) and _has_open(process, device)
     ]
-    robot = next((name for name in map(robot_of, found) if name), None)
-    if robot is not None:
-        return f"a run of {robot}; `dxlrun stop --robot {robot}` ends it, or Ctrl-C in its terminal"
+    if described := next(filter(None, map(describe, found)), ""):
+        return described
     named = [f"{_command(process)} (process {process.name})" for process in found]
     return f"{' and '.join(named) or 'another process, which this user may not see'}; stop that first"
 

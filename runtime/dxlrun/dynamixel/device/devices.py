@@ -12,7 +12,7 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.device.device_checks import inspect_device
 from dxlwire.bus_plan import DeviceCommand, DevicePlan
 from dxlwire.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
@@ -52,7 +52,12 @@ class Devices:
     """The devices of one bus, by their index in its plan."""
 
     def __init__(
-        self, idle: IdleScheduler, reads: CyclicReads, samples: BusSamples, commands: Floats
+        self,
+        idle: IdleScheduler,
+        reads: CyclicReads,
+        samples: BusSamples,
+        commands: Floats,
+        events: EventSink,
     ) -> None:
         """`commands`: of all devices of the robot, SI units; NaN = as it is."""
         self._plan = plan = idle.plan
@@ -60,6 +65,7 @@ class Devices:
         self._reads = reads
         self._samples = samples
         self._commands = commands
+        self._events = events
         self._dialect = dialect_of(plan.protocol)
         self._members: list[list[int]] = [[] for _ in plan.devices]
         for number, member in enumerate(plan.members):
@@ -223,7 +229,7 @@ class Devices:
 
     def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         device = self._plan.devices[index]
-        self._idle.events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+        self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
 
 
 def _probes(line: Line, device: DevicePlan) -> list[Transaction]:

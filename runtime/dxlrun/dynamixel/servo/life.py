@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -207,11 +207,11 @@ class Loss(msgspec.Struct):
 class Life:
     """The state of each servo of one bus, and what follows from it; programs that drive it wait in `idle`."""
 
-    def __init__(self, idle: IdleScheduler, reads: CyclicReads) -> None:
+    def __init__(self, idle: IdleScheduler, reads: CyclicReads, events: EventSink) -> None:
         count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
         self.plan = idle.plan
-        self.events = idle.events
+        self.events = events
         self.idle = idle
         self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
         self.states = [ServoState.LIMP] * count  # The state of each servo

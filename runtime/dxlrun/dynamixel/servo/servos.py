@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.device.devices import Devices
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -47,13 +47,18 @@ class Servos:
     """The servos of one bus: their life, cyclic reads, goals and desired state."""
 
     def __init__(
-        self, idle: IdleScheduler, states: States, samples: BusSamples, device_commands: Floats
+        self,
+        idle: IdleScheduler,
+        states: States,
+        samples: BusSamples,
+        device_commands: Floats,
+        events: EventSink,
     ) -> None:
         """`device_commands`: of all devices of the robot."""
         plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
         self._bus = idle.bus
-        self._events = idle.events
+        self._events = events
         self._samples = samples
         self._shown = states.hardware_error  # of the robot: the model's error item, or the error byte of 1.0
         self._hardware_errors = [control_table(servo.model, plan.protocol).errors for servo in plan.servos]
@@ -63,9 +68,9 @@ class Servos:
         self.goals = GoalArrays(plan)  # Builds the sync write
         self.reads = CyclicReads(plan, samples, idle.bus.owed)
         """The job that reads every servo and every device once."""
-        self.devices = Devices(idle, self.reads, samples, device_commands)
+        self.devices = Devices(idle, self.reads, samples, device_commands, events)
         """What is on the bus and is no servo."""
-        self.life = Life(idle, self.reads)  # The state of each servo
+        self.life = Life(idle, self.reads, events)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
         """Modes and registers that the servos shall have."""

@@ -9,6 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
+from dxlrun.contract.serial_line import open_serial
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
@@ -26,7 +27,6 @@ from dxlwire.packets import PacketSink
 from dxlwire.plan.line import listen
 from dxlwire.plan.retry import extend_timeouts, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
-from dxlwire.port.serial_open import open_serial
 from dxlwire.transaction import Outcome, Program, Reply, Result
 
 NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken

@@ -6,6 +6,7 @@ import errno
 import termios
 
 from dxlrun.channels.ring import Payload
+from dxlrun.contract.serial_line import open_serial
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
@@ -14,7 +15,6 @@ from dxlwire.packets import PacketKind, PacketSink
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlwire.port.latency_timer import latency_timer, shorten
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
-from dxlwire.port.serial_open import open_serial
 from dxlwire.transaction import Program, Reply, Result
 from dxlwire.wire.dialect import dialect_of
 
