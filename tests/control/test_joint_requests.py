@@ -257,7 +257,7 @@ def test_a_servo_that_reboots_by_request_is_not_lost_and_one_that_stays_away_is(
         for cycle, torque in happens.items()
     }
     story.run(cycles, {1: story.asks("reboot", joints=["j2"])} | shown)
-    assert story.loop._lost.rows == ({2} if lost else set())
+    assert story.loop.manager._lost == ([2] if lost else [])
     assert story.result.invalid == (0, 0, invalid)
 
 

@@ -14,8 +14,8 @@ from tests.kit.wire import all_writes
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.cycle import States
-from dxlrun.channels.events import EventCode
-from dxlrun.control.loop import LostServos
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.control.monitors.lost_servos import LostServos, MissedReplies
 from dxlrun.plan.policy_plan import LIMP, GroupPolicy, PolicyPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
@@ -258,38 +258,62 @@ MISSED, HEARD = False, True
     ],
 )
 def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(cycles, lost):
-    look, states, found = LostServos(2), States.empty(2), []
+    missed, states, found = MissedReplies(2), States.empty(2), []
     states.valid[:] = True
     before = frozenset[int]()
     for heard, age_ms in cycles:
         states.valid[1], states.age_ns[1] = heard, age_ms * 1_000_000 if age_ms > 0 else age_ms
-        assert look.look(states) is (look.rows != before)
-        before = look.rows
-        found.append(1 in look.rows)
-        assert 0 not in look.rows
+        assert missed.count(states) is (missed.lost != before)
+        before = missed.lost
+        found.append(1 in missed.lost)
+        assert 0 not in missed.lost
     assert found == lost
 
 
-def test_a_group_is_let_go_once_however_long_its_servo_stays_away():
+class NotedActions:
+    """Notes what a monitor does to a run."""
+
+    def __init__(self, policies: PolicyPlan) -> None:
+        self.policies = policies
+        self.done: list[tuple[str, object]] = []
+
+    def end_run(self, policy: str, why: str) -> None:
+        self.done.append((policy, why))
+
+    def make_limp(self, rows: frozenset[int]) -> None:
+        self.done.append(("limp", set(rows)))
+
+    def hold_controllers(self, lost: frozenset[int]) -> None:
+        self.done.append(("hold", set(lost)))
+
+    def report(self, severity: Severity, text: str) -> None:
+        self.done.append((severity.name, text))
+
+
+def test_group_becomes_limp_once_however_long_its_servo_stays_away():
     arm = GroupPolicy("arm", frozenset({0, 1}), "limp")
-    plan, look, states = PolicyPlan(groups=(arm,)), LostServos(3), States.empty(3)
-    states.valid[2] = True
+    states, actions = States.empty(3), NotedActions(PolicyPlan(groups=(arm,)))
+    monitor = LostServos(("a", "b", "c"), states, actions)
     states.age_ns[:] = 100_000_000
-    told = []
-    for _ in range(5):
-        look.look(states)
-        told.append(look.judge(plan))
-    assert told == [({}, [])] * 2 + [({}, [arm])] + [({}, [])] * 2
+    for lost in [(0,)] * 5 + [(0, 1)] * 5 + [()] * 2 + [(0,)] * 5:
+        states.valid[:] = True
+        states.valid[[*lost]] = False
+        monitor.check(0)
+    sentence = "group arm lost a servo: it is limp until a client requests torque"
+    held = [("hold", {0}), ("hold", {0, 1}), ("hold", set()), ("hold", {0})]
+    assert actions.done == [("limp", {0, 1}), ("ERROR", sentence), *held]
 
 
 @pytest.mark.parametrize(
-    ("own", "ending"),
-    [(None, {"on_lost_servo": [0]}), ("stop", {"on_fault": [0]}), ("hold", {}), ("limp", {})],
+    ("own", "policy"), [(None, "on_lost_servo"), ("stop", "on_fault"), ("hold", ""), ("limp", "")]
 )
-def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(own, ending):
+def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(own, policy):
     groups = () if own is None else (GroupPolicy("arm", frozenset({0}), own),)
-    look, states = LostServos(1), States.empty(1)
+    states, actions = States.empty(1), NotedActions(PolicyPlan(on_lost_servo=LIMP, groups=groups))
+    monitor = LostServos(("a",), states, actions)
     states.age_ns[:] = 100_000_000
     for _ in range(3):
-        look.look(states)
-    assert look.judge(PolicyPlan(on_lost_servo=LIMP, groups=groups))[0] == ending
+        monitor.check(0)
+    ending = [(policy, "a missed at least 3 replies in a row")] if policy else [("hold", {0})]
+    assert actions.done[-1:] == ending
+    assert [name for name, _ in actions.done if name.startswith("on_")] == [policy] * bool(policy)

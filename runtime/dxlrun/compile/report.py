@@ -15,6 +15,7 @@ from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
+from dxlrun.control.monitors import MONITORS
 from dxlrun.description.joints.mechanics import Limits
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
@@ -201,13 +202,6 @@ _HELD = {
 }
 
 
-_GROUP_ACTIONS = {
-    "hold": "hold their controllers until it answers, the others go on",
-    "limp": "the group goes limp, the others go on",
-    "stop": "end the run by on_fault",
-}
-
-
 class PolicyRow(msgspec.Struct, frozen=True):
     """What happens when something does not go on as planned."""
 
@@ -224,8 +218,8 @@ def policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> list[PolicyRo
         policy = policies.named(name)
         does = _HELD.get(name, policy.text) if policy.goes_on else policy.text
         found.append((name, does, policy.longest_ns * 1e-9))
-    for group in policies.groups:
-        found.append((f"on_lost_servo of {group.name}", _GROUP_ACTIONS[group.on_lost_servo], 0.0))
+    for monitor in MONITORS:
+        found += ((name, does, 0.0) for name, does in monitor.rows(policies))
     found.append(("on_returned_servo", _on_returned_servo(buses), 0.0))
     alone = policies.on_fault.last
     return [PolicyRow(name, does, longest, alone) for name, does, longest in found]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer
 from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
-from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
+from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.anchoring import Anchoring
@@ -23,12 +23,15 @@ from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
+from dxlrun.control.monitors import build_monitors
+from dxlrun.control.monitors.monitor import Monitor
+from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan, ServoLimit
-from dxlrun.plan.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
+from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, ServoLimit
+from dxlrun.plan.policy_plan import Last, PolicyName
 from dxlwire.clock import Clock
 
 
@@ -122,10 +125,8 @@ class Loop:
     _all_valid: bytes = field(init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
-    _lost: LostServos = field(init=False)
-    _needed: tuple[tuple[int, SensorPlan], ...] = field(init=False)
-    """Sensors without which the run ends, with their rows."""
-    _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
+    _actions: PolicyActions = field(init=False)
+    _monitors: tuple[Monitor, ...] = field(init=False)
     _motion: SafeMotion | None = field(default=None, init=False)
     _servo_limits: Mapping[int, Sequence[ServoLimit]] = field(init=False)
     """What the gate has of the hardware; compared by identity, as it changes when a servo returns."""
@@ -135,12 +136,8 @@ class Loop:
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._invalid = np.zeros(len(self.plan.joints), np.int64)
         self._all_valid = bytes([True]) * len(self.plan.joints)
-        self._lost = LostServos(len(self.plan.joints))
-        self._needed = tuple(
-            (self.record.layout.sources.index(one.name), one)
-            for one in self.plan.sensors
-            if one.on_lost == "stop"
-        )
+        self._actions = PolicyActions(self.plan.policies, self.hardware, self.manager, self.gate, self.events)
+        self._monitors = build_monitors(self.plan, self.record, self._actions)
         joints, switching = self.plan.joints, self.manager.switching
         self._anchoring = Anchoring(joints, self.hardware, switching, self.gate, self.record)
         self.steering = Steering(
@@ -159,7 +156,7 @@ class Loop:
             self.cycle_limit,
             self.pace,
             self.stop.request,
-            self._give_up,
+            self._actions.end_run,
         )
 
     def run(self) -> LoopResult:
@@ -181,8 +178,8 @@ class Loop:
         if reason != "fault" and self.manager.switching.fault is not None:
             reason, detail = "fault", self.manager.switching.fault
         policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
-        if self._given_up:
-            policy, sentence = self._given_up
+        if self._actions.ending:
+            policy, sentence = self._actions.ending
             reason, detail = "fault", detail or sentence
         last = self._wind_up(policy)
         self._log_end(reason, detail)
@@ -221,8 +218,8 @@ class Loop:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
-            if self._given_up:
-                return "fault", self._given_up[1]
+            if self._actions.ending:
+                return "fault", self._actions.ending[1]
             self._one()
             if self._next():
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
@@ -264,8 +261,6 @@ class Loop:
             steering.refuse()
             self._motion.command()
         else:
-            if not (all_valid and self._lost.none) and self._lost.look(record.states):
-                self._miss()
             self._update(cycle, time_ns)
         self.gate.apply(dt_ns)
         updated_ns = now_ns()
@@ -278,13 +273,13 @@ class Loop:
         self.beat()
 
     def _update(self, cycle: int, time_ns: int) -> None:
-        """Take commands, and update the controllers unless the loop is paused."""
+        """Let the monitors look, take commands, and update the controllers unless the loop is paused."""
         record, steering, manager = self.record, self.steering, self.manager
         # it never goes back: a cycle that was late when a pause began catches up
         self.schedule.grid_ns += max(0, self._time_ns - time_ns)
         self._time_ns = max(self._time_ns, time_ns)
-        if self._needed:
-            self._look_at_needed_sensors()
+        for monitor in self._monitors:
+            monitor.check(self._time_ns)
         commands = steering.inbox.take()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
             record.command_count = steering.take(commands, self._time_ns)
@@ -294,34 +289,6 @@ class Loop:
             manager.update(cycle - self._paused_cycles, self._time_ns)
         if manager.switching.ended:
             steering.answer_late()
-
-    def _miss(self) -> None:
-        """Apply the policies: other servos are lost than in the cycle before."""
-        ending, limp = self._lost.judge(self.plan.policies)
-        for group in limp:
-            for row in sorted(group.rows):
-                self.hardware.switch_torque(row, False, _unanswered)
-            text = f"group {group.name} lost a servo: it is limp until a client requests torque"
-            self.events.emit(EventCode.POLICY, Severity.ERROR, "loop", text)
-        for policy, rows in ending.items():
-            names = ", ".join(self.plan.joints[row].name for row in rows)
-            self._give_up(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
-        if not ending:
-            self.gate.ease_in(self.manager.hold_lost(self._lost.rows))
-
-    def _look_at_needed_sensors(self) -> None:
-        """End the run when a sensor brought nothing new for its timeout; by the record, as in a replay."""
-        ages_ns = self.record.sources.age_ns
-        for row, sensor in self._needed:
-            age_ns = ages_ns.item(row)
-            if (age_ns if age_ns >= 0 else self._time_ns) > sensor.timeout_ns:
-                nothing = f"sensor {sensor.name} brought nothing for {sensor.timeout_ns / 1e6:g} ms"
-                self._give_up("on_fault", nothing)
-
-    def _give_up(self, policy: PolicyName, why: str) -> None:
-        """End the run after this cycle, by another policy than on_exit."""
-        if self._given_up is None:
-            self._given_up = policy, f"{why}; {policy}: {self.plan.policies.named(policy).text}"
 
     def _wind_up(self, name: PolicyName) -> Last:
         """Go through the steps of a policy in more cycles; return how it leaves the robot."""
@@ -443,48 +410,3 @@ class Overruns:
             hook.plugin,
             f"dxlrun_overrun {why}; it is not asked again in this run",
         )
-
-
-def _unanswered(problem: str) -> None:
-    """Take what came of a policy's request for a servo: no client waits for it, events report it."""
-
-
-class LostServos:
-    """Counts the replies that each joint missed in a row; a servo that reboots by request misses none."""
-
-    def __init__(self, joints: int) -> None:
-        self.rows: frozenset[int] = frozenset()
-        """Rows of the joints that are lost now."""
-        self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
-        self._missed = np.zeros(joints, dtype=np.int64)
-        self.none = True
-        """No joint missed a reply in the cycle that was looked at last."""
-
-    def look(self, states: States) -> bool:
-        """Take the states of a cycle, all but those of cycles without a loss behind such a one; return
-        whether `rows` is another one now."""
-        valid, age_ns = states.valid, states.age_ns
-        self._missed += 1
-        self._missed[valid | (states.torque == Torque.REBOOTING)] = 0
-        self.none = not self._missed.any()
-        lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
-        rows = frozenset(np.flatnonzero(lost).tolist())
-        changed = rows != self.rows
-        self.rows = rows
-        return changed
-
-    def judge(self, policies: PolicyPlan) -> tuple[dict[PolicyName, list[int]], list[GroupPolicy]]:
-        """Return which policies end the run, for which lost rows, and which groups become limp by now."""
-        ending: dict[PolicyName, list[int]] = {}
-        limp: list[GroupPolicy] = []
-        for row in sorted(self.rows):
-            group = policies.of_lost(row)
-            if group is None:
-                if not policies.on_lost_servo.goes_on:
-                    ending.setdefault("on_lost_servo", []).append(row)
-            elif group.on_lost_servo == "stop":
-                ending.setdefault("on_fault", []).append(row)
-            elif group.on_lost_servo == "limp" and group.name not in self._limp:
-                self._limp.add(group.name)
-                limp.append(group)
-        return ending, limp

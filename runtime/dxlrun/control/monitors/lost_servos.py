@@ -1,0 +1,107 @@
+"""Lost servos: policies for servos that do not answer, of the robot and of its groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Self
+
+import numpy as np
+
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
+from dxlrun.channels.events import Severity
+from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.plan.policy_plan import GroupPolicy, PolicyName, PolicyPlan
+
+_GROUP_ACTIONS = {
+    "hold": "hold their controllers until it answers, the others go on",
+    "limp": "the group goes limp, the others go on",
+    "stop": "end the run by on_fault",
+}
+
+
+class LostServos:
+    """Applies the policies for lost servos when other servos are lost than in the cycle before."""
+
+    def __init__(self, joints: tuple[str, ...], states: States, actions: PolicyActions) -> None:
+        self._joints = joints
+        self._states = states
+        self._actions = actions
+        self._all_valid = bytes([True]) * len(joints)
+        self._missed = MissedReplies(len(joints))
+        self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
+
+    @classmethod
+    def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self:
+        """Return the monitor of all joints."""
+        return cls(tuple(one.name for one in plan.joints), record.states, actions)
+
+    def check(self, time_ns: int) -> None:
+        """Count missed replies, and apply the policies when other joints are lost than before."""
+        if self._missed.none and self._states.valid.tobytes() == self._all_valid:
+            return
+        if self._missed.count(self._states):
+            self._apply_policies()
+
+    def _apply_policies(self) -> None:
+        actions, rows = self._actions, self._missed.lost
+        ending, limp = self._judge(actions.policies)
+        for group in limp:
+            actions.make_limp(group.rows)
+            text = f"group {group.name} lost a servo: it is limp until a client requests torque"
+            actions.report(Severity.ERROR, text)
+        for policy, ending_rows in ending.items():
+            names = ", ".join(self._joints[row] for row in ending_rows)
+            actions.end_run(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
+        if not ending:
+            actions.hold_controllers(rows)
+
+    def _judge(self, policies: PolicyPlan) -> tuple[dict[PolicyName, list[int]], list[GroupPolicy]]:
+        """Return which policies end the run, for which lost rows, and which groups become limp by now."""
+        ending: dict[PolicyName, list[int]] = {}
+        limp: list[GroupPolicy] = []
+        for row in sorted(self._missed.lost):
+            group = policies.of_lost(row)
+            if group is None:
+                if not policies.on_lost_servo.goes_on:
+                    ending.setdefault("on_lost_servo", []).append(row)
+            elif group.on_lost_servo == "stop":
+                ending.setdefault("on_fault", []).append(row)
+            elif group.on_lost_servo == "limp" and group.name not in self._limp:
+                self._limp.add(group.name)
+                limp.append(group)
+        return ending, limp
+
+    @staticmethod
+    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
+        """Return the policies of groups; that of the robot is one of its four."""
+        return (
+            (f"on_lost_servo of {group.name}", _GROUP_ACTIONS[group.on_lost_servo])
+            for group in policies.groups
+        )
+
+
+class MissedReplies:
+    """Counts the replies that each joint missed in a row; a servo that reboots by request misses none."""
+
+    def __init__(self, joints: int) -> None:
+        self.lost: frozenset[int] = frozenset()
+        """Rows of the joints that are lost now."""
+        self.none = True
+        """No joint missed a reply in the last cycle that was counted."""
+        self._missed = np.zeros(joints, dtype=np.int64)
+
+    def count(self, states: States) -> bool:
+        """Count the states of a cycle, and return whether other joints are lost now.
+
+        Cycles without a missed reply may be left out while `none` is true.
+        """
+        valid, age_ns = states.valid, states.age_ns
+        self._missed += 1
+        self._missed[valid | (states.torque == Torque.REBOOTING)] = 0
+        self.none = not self._missed.any()
+        lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
+        rows = frozenset(np.flatnonzero(lost).tolist())
+        changed = rows != self.lost
+        self.lost = rows
+        return changed

@@ -1,0 +1,44 @@
+"""Needed sensors: a run ends when a sensor with `on_lost: stop` brings nothing new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
+
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
+from dxlrun.plan.policy_plan import PolicyPlan
+
+
+@dataclass(slots=True)
+class NeededSensors:
+    """Ends the run when the newest sample of a needed sensor is older than its timeout."""
+
+    needed: tuple[tuple[int, SensorPlan], ...]
+    """Sensors without which the run ends, with their rows among the sources."""
+    record: CycleRecord
+    actions: PolicyActions
+
+    @classmethod
+    def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
+        """Return a monitor of the sensors that the run needs; None: it needs none."""
+        needed = tuple(
+            (record.layout.sources.index(one.name), one) for one in plan.sensors if one.on_lost == "stop"
+        )
+        return cls(needed, record, actions) if needed else None
+
+    def check(self, time_ns: int) -> None:
+        """Compare ages with timeouts; a sensor that brought nothing until now is as old as the run."""
+        ages_ns = self.record.sources.age_ns
+        for row, sensor in self.needed:
+            age_ns = ages_ns.item(row)
+            if (age_ns if age_ns >= 0 else time_ns) > sensor.timeout_ns:
+                nothing = f"sensor {sensor.name} brought nothing for {sensor.timeout_ns / 1e6:g} ms"
+                self.actions.end_run("on_fault", nothing)
+
+    @staticmethod
+    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
+        """Return nothing: the table of sensors shows what happens when one is lost."""
+        return ()

@@ -1,0 +1,49 @@
+"""Policy actions: everything that a policy may do to a running robot."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.contract.hardware import Hardware
+from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.gate import Gate
+from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
+
+
+@dataclass(slots=True)
+class PolicyActions:
+    """End the run, take torque from joints, hold controllers, report."""
+
+    policies: PolicyPlan
+    hardware: Hardware
+    manager: Manager
+    gate: Gate
+    events: EventSink
+    ending: tuple[PolicyName, str] | None = None
+    """The policy by which the run ends after this cycle, and a sentence; None: it goes on."""
+
+    def end_run(self, policy: PolicyName, why: str) -> None:
+        """End the run after this cycle, by another policy than on_exit; the first reason counts."""
+        if self.ending is None:
+            self.ending = policy, f"{why}; {policy}: {self.policies.named(policy).text}"
+
+    def make_limp(self, rows: Iterable[int]) -> None:
+        """Switch the torque of joints off until a client requests it."""
+        for row in sorted(rows):
+            self.hardware.switch_torque(row, False, _ignore_answer)
+
+    def hold_controllers(self, lost: Collection[int]) -> None:
+        """Hold the controllers of lost joints, and let those go on slowly whose joints are back."""
+        self.gate.ease_in(self.manager.hold_lost(lost))
+
+    def report(
+        self, severity: Severity, text: str, *, source: str = "loop", code: EventCode = EventCode.POLICY
+    ) -> None:
+        """Report what a policy does, in an event."""
+        self.events.emit(code, severity, source, text)
+
+
+def _ignore_answer(problem: str) -> None:
+    """Ignore what came of a request for a servo: no client waits for it, and events report it."""

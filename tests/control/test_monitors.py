@@ -1,0 +1,89 @@
+"""Monitors of the loop: which are built, and what the loop and `check` take from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Self
+
+import pytest
+from tests.kit.loops import loop_plan
+
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import Severity
+from dxlrun.compile.report import policy_rows
+from dxlrun.control import monitors
+from dxlrun.control.monitors import MONITORS, build_monitors
+from dxlrun.control.monitors.lost_servos import LostServos
+from dxlrun.control.monitors.needed_sensors import NeededSensors
+from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SensorPlan, SourcePlan
+from dxlrun.plan.policy_plan import PolicyPlan
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: pair
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+"""
+ENDS_S = 0.5
+
+
+class FarJoints:
+    """Takes the torque of joint 0 after a while, and ends the run a little later."""
+
+    def __init__(self, actions: PolicyActions) -> None:
+        self.actions = actions
+        self.limp = False
+
+    @classmethod
+    def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self:
+        """Return a monitor for every robot."""
+        return cls(actions)
+
+    def check(self, time_ns: int) -> None:
+        """Act by the time."""
+        if time_ns > 0.5e9 * ENDS_S and not self.limp:
+            self.limp = True
+            self.actions.make_limp([0])
+            self.actions.report(Severity.WARNING, "pan is limp", source="pan")
+        if time_ns > 1e9 * ENDS_S:
+            self.actions.end_run("on_fault", "it is enough")
+            self.actions.end_run("on_exit", "the first reason counts")
+
+    @staticmethod
+    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
+        """Return one row."""
+        return [("on_far_joint", "one becomes limp, then the run ends")]
+
+
+def test_policy_of_a_new_monitor_needs_no_change_of_loop_and_check(
+    monkeypatch: pytest.MonkeyPatch, tmp_path
+) -> None:
+    monkeypatch.setattr(monitors, "MONITORS", (*MONITORS, FarJoints))
+    monkeypatch.setattr("dxlrun.compile.report.MONITORS", (*MONITORS, FarJoints))
+    path = tmp_path / "pair.yaml"
+    path.write_text(ROBOT)
+    robot, torque = simulated_robot(path, duration_s=2.0), list[bool]()
+    bus = robot.buses[0]
+    bus.at(int(0.9e9 * ENDS_S), lambda: torque.extend(bus.servo(one).torque_on for one in (3, 7)))
+    result = robot.run()
+    assert torque == [False, True]
+    assert (result.reason, result.detail) == ("fault", "it is enough; on_fault: limp")
+    assert result.cycles < 50 * (ENDS_S + 0.1)
+    rows = [row.name for row in policy_rows(robot.plan.loop.policies, robot.plan.buses)]
+    assert rows[-2:] == ["on_far_joint", "on_returned_servo"]
+
+
+@pytest.mark.parametrize(
+    ("on_lost", "built"), [("continue", [LostServos]), ("stop", [LostServos, NeededSensors])]
+)
+def test_sensors_that_a_run_does_not_need_are_not_monitored(on_lost, built) -> None:
+    imu = SensorPlan("imu", "imu", "tests 1", "{}", ("x",), 10_000_000, 50_000_000, on_lost=on_lost)
+    source = SourcePlan("imu", "sensor", ("x",))
+    plan = loop_plan([JointPlan("a", -1.0, 1.0, None)], sensors=(imu,), sources=(source,))
+    found = build_monitors(plan, CycleRecord(plan.layout), None)
+    assert [type(one) for one in found] == built
