@@ -7,10 +7,9 @@ from collections import deque
 import msgspec
 import numpy as np
 
-from dxlrun.channels.answers import CommandOutcome
-from dxlrun.channels.commands import TakenCommand
-from dxlrun.channels.events import Event, EventCode
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun import Log
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.records import CommandOutcome, Event, EventCode, TakenCommand
 
 POLICY = "policy"  # Kind of the command that the loop leaves in the log when it begins a policy's steps
 _LOOP = "loop"

@@ -14,10 +14,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.remedies import choose_remedy, free_machine
-from dxlrun.errors import counted
-from dxlrun.output.table import microseconds
+from dxlrun.tooling.output import choose_remedy, counted, free_machine, microseconds
+from dxlrun.tooling.records import EventCode
 from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.lost import invalid_joints, severe_of
 from dxlrun_analysis.rules import RULES, Needs

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
-from dxlrun.channels.events import EventCode
+from dxlrun.tooling.records import EventCode
 
 ROBOT = "robot"
 """The code of the first line: what the robot did. It accuses nothing, and stands before all others."""

@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.channels.events import EventCode, EventGroup, Severity
-from dxlrun.errors import counted
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.records import EventCode, EventGroup, Severity
 from dxlrun_analysis.finding import HURTS, Finding, Rank, cause
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals

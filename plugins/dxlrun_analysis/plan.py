@@ -9,10 +9,16 @@ from typing import NamedTuple
 import msgspec
 from msgspec import structs
 
-from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.plan.mechanics_plan import MechanicsPlan
-from dxlrun.plan.robot_plan import decode_plan
+from dxlrun import Log
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.plans import (
+    ControllerPlan,
+    JointPlan,
+    LoopPlan,
+    MechanicsPlan,
+    SchedulerPlan,
+    decode_plan,
+)
 from dxlwire.port.latency_timer import is_simulated
 
 

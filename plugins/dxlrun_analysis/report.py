@@ -11,10 +11,8 @@ from typing import TypeVar
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, EventGroup, Severity
-from dxlrun.errors import counted
-from dxlrun.log.reader import Log, LogReader, open_log
-from dxlrun.output.table import (
+from dxlrun import Log, LogReader, open_log
+from dxlrun.tooling.output import (
     Cell,
     Column,
     Columns,
@@ -23,10 +21,12 @@ from dxlrun.output.table import (
     Table,
     Tone,
     Value,
+    counted,
     flagged,
     microseconds,
 )
-from dxlrun.plan.loop_plan import ScheduleName
+from dxlrun.tooling.plans import ScheduleName
+from dxlrun.tooling.records import EventCode, EventGroup, Severity
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.causes.tables import causes_table
 from dxlrun_analysis.conduct.steering import Act, Pause

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
-from dxlrun.description.units import distance_text
-from dxlrun.errors import counted
-from dxlrun.plan.played_goals import motion_name, played_name
+from dxlrun import distance_text
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.plans import motion_name, played_name
+from dxlrun.tooling.records import EventCode, EventGroup, GoalReport, Severity
 from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
 from dxlrun_analysis.tally import RunTotals
 

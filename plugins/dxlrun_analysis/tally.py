@@ -8,18 +8,20 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from dxlrun.channels.events import (
+from dxlrun import Log
+from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun.plan.machine_load import NO_WAIT
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.plans import UnreachedGoal, find_unreached_goals
+from dxlrun.tooling.records import (
     EventCode,
     EventCounts,
     EventGroup,
     Granted,
     LostRecords,
+    SimulationWait,
     Waited,
 )
-from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
-from dxlrun.plan.machine_load import NO_WAIT, SimulationWait
-from dxlrun.plan.played_goals import UnreachedGoal, find_unreached_goals
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.sensors import Sensors

@@ -26,9 +26,8 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.errors import counted
-from dxlrun.output.table import microseconds
+from dxlrun.tooling.output import counted, microseconds
+from dxlrun.tooling.records import EventCode, Severity
 from dxlrun_analysis.causes.rules import own_work
 from dxlrun_analysis.conduct.steering import Act, Pause
 from dxlrun_analysis.evidence import accused, busy_machine

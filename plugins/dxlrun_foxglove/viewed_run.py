@@ -12,7 +12,7 @@ from dxlrun import DxlrunError, InputError, RemoteRobot, TopicMessage, connect
 from dxlrun.channels.loop_requests import Switch, TorqueRequest
 from dxlrun.log import schemas
 from dxlrun.tooling.live import LiveMessages, RobotInfo
-from dxlrun.tooling.records import MessageType
+from dxlrun.tooling.topics import MessageType
 from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
 

@@ -8,7 +8,7 @@ from collections import deque
 import msgspec
 from websockets.asyncio.server import ServerConnection
 
-from dxlrun.tooling.records import MessageType
+from dxlrun.tooling.topics import MessageType
 from dxlrun_foxglove.protocol import MESSAGE, MESSAGE_HEAD, WARNING, status
 
 MOST_BYTES = 4 << 20

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dxlrun.log.columns import PacketColumns
+from dxlrun.tooling.logs import PacketColumns
+from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.worst import CauseKind
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing, ordered
-from dxlwire.packets import PacketKind
 from dxlwire.plan.line import TIMEOUT_MARGIN_NS
 
 _NEVER = np.iinfo(np.int64).max

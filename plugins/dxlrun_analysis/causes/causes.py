@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import Log
-from dxlrun.plan.machine_load import MachineLoad
+from dxlrun import Log
+from dxlrun.tooling.logs import PacketColumns
+from dxlrun.tooling.records import MachineLoad
 from dxlrun_analysis.causes.account import Account, CauseName
 from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineSample
 from dxlrun_analysis.causes.timeline import timeline

@@ -10,11 +10,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.machine import load_sample
-from dxlrun.log.reader import Log
-from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun import Log
 from dxlrun.messages.cdr import Value
-from dxlrun.plan.machine_load import LoadMeter, LoadSample, MachineLoad
+from dxlrun.tooling.records import LoadMeter, LoadSample, MachineLoad, load_sample
+from dxlrun.tooling.topics import MACHINE_TOPIC
 
 STEAL = "steal by the host"
 OTHERS = "other processes on its core"

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dxlrun.errors import counted
-from dxlrun.output.table import microseconds
+from dxlrun.tooling.output import counted, microseconds
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.worst import Cause, CauseKind
 from dxlrun_analysis.finding import Finding, Rank

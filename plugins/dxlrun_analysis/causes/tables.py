@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dxlrun.errors import counted
-from dxlrun.output.table import Column, Table, Value, microseconds
+from dxlrun.tooling.output import Column, Table, Value, counted, microseconds
 from dxlrun_analysis.causes.causes import KEPT, Causes
 from dxlrun_analysis.cycles.worst import WorstCycle
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from dxlrun.log.columns import PacketColumns
+from dxlrun.tooling.logs import PacketColumns
+from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.worst import TimelineKind, TimelinePacket
 from dxlrun_analysis.plan import LoggedBus
-from dxlwire.packets import PacketKind
 
 _KIND_NAMES: dict[int, TimelineKind] = {
     PacketKind.INSTRUCTION: "instruction",

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, JsonOfItsOwn, check_report, write_report
-from dxlrun.errors import InputError, LogError, counted, missing_extra
-from dxlrun.output.terminal import print_error, progress_bar, show, show_json
+from dxlrun import InputError, LogError
+from dxlrun.tooling.output import counted, print_error, progress_bar, show, show_json
+from dxlrun.tooling.verbs import DebugFlag, JsonOfItsOwn, check_report, missing_extra, write_report
 
 if TYPE_CHECKING:
     from cyclopts import Token
 
-    from dxlrun.log.reader import LogReader
+    from dxlrun import LogReader
 
 MOST_WORST = 10  # Cycles of which the analysis keeps the packets
 
@@ -64,8 +64,8 @@ def analyze(
     if len(logs) > 1:
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
+    from dxlrun import open_log
     from dxlrun.cli.tools.tool_log import TOOL_NAME
-    from dxlrun.log.reader import open_log
     from dxlrun_analysis import report as analysis
     from dxlrun_analysis.causes.tables import worst_tables
     from dxlrun_analysis.latency.latency_log import is_measurement
@@ -147,9 +147,8 @@ def newest_log() -> Path:
     It is the default of `recording: {directory: ...}`, from the working directory. Raises InputError when
     there is none.
     """
-    from dxlrun.description.robot import Recording
-    from dxlrun.log.parts import is_log_directory
-    from dxlrun.log.stored import is_being_written
+    from dxlrun.tooling.logs import is_being_written, is_log_directory
+    from dxlrun.tooling.robots import Recording
 
     directory = Path(Recording().directory)
     found = [*directory.glob("*.mcap"), *(path for path in directory.glob("*/") if is_log_directory(path))]
@@ -167,7 +166,7 @@ def newest_log() -> Path:
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     """Print a line for each log, or all as JSON; one that cannot be read does not hide the others."""
-    from dxlrun.log.reader import open_log
+    from dxlrun import open_log
     from dxlrun_analysis.latency.latency_log import is_measurement, measurement
     from dxlrun_analysis.latency.tables import line
     from dxlrun_analysis.report import analyze as analyze_log

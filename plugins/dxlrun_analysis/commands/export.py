@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.errors import InputError, counted, missing_extra
-from dxlrun.output.terminal import err, show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import counted, err, show, show_json
+from dxlrun.tooling.verbs import DebugFlag, JsonFlag, missing_extra
 
 if TYPE_CHECKING:
-    from dxlrun.log.reader import LogReader
+    from dxlrun import LogReader
 
 Format = Literal["csv", "parquet", "lerobot"]
 _OF = {"csv": "row", "parquet": "row", "lerobot": "frame"}
@@ -52,8 +52,8 @@ def export(
         raise InputError(f"--topic is for csv, and {file_format} has all topics; leave it out")
     if missing := missing_extra(file_format, "logs", "pyarrow"):
         raise InputError(missing)
-    from dxlrun.log.reader import open_log
-    from dxlrun.output.target import new_target
+    from dxlrun import open_log
+    from dxlrun.tooling.output import new_target
 
     with err().status(f"exporting {log}"), new_target(output) as beside:
         reader = open_log(log)

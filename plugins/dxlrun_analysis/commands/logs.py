@@ -11,10 +11,22 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.prompt import Confirm
 
-from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag
-from dxlrun.errors import InputError, counted, missing_extra
-from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import (
+    Cell,
+    Column,
+    Table,
+    Value,
+    counted,
+    flagged,
+    microseconds,
+    print_error,
+    print_warning,
+    progress_bar,
+    show,
+    show_json,
+)
+from dxlrun.tooling.verbs import DebugFlag, Flag, JsonFlag, missing_extra
 
 if TYPE_CHECKING:
     from dxlrun_analysis.season.runs import Folder
@@ -129,7 +141,8 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
     from rich.filesize import decimal
 
     from dxlrun.description.units import size
-    from dxlrun.log.stored import delete, oldest_beyond, stored_logs
+    from dxlrun.log.stored import delete
+    from dxlrun.tooling.logs import oldest_beyond, stored_logs
 
     if not directory.is_dir():
         raise InputError(f"there is no directory {directory}; runs leave their logs in logs")

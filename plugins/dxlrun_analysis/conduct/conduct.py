@@ -16,8 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.events import Event, EventCode, GoalHistory, GoalReport, GoalTotals
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun import Log
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.records import Event, EventCode, GoalHistory, GoalReport, GoalTotals
 from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.log.reader import Log
+from dxlrun import Floats, Log
 from dxlrun_analysis.finding import Finding, Rank, listed
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.commands import TakenCommand
-from dxlrun.channels.events import Event, EventCode
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun import Log
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.records import Event, EventCode, TakenCommand
 from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun
 from dxlrun_analysis.cycles.latency import DISORDER_NS, begins, first_deadline_ns
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.ring import RING_SECONDS
-from dxlrun.log.reader import Log
+from dxlrun import Log
+from dxlrun.tooling.records import RING_SECONDS
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.plan import plan_of
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import csv
 
-from dxlrun.errors import LogError, suggestion
-from dxlrun.log.reader import LogReader
-from dxlrun.log.schemas import bus_topic
+from dxlrun import LogError, LogReader
+from dxlrun.tooling.topics import bus_topic
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABLE, tables_of
 
 

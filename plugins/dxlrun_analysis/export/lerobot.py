@@ -25,8 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dxlrun.errors import LogError
-from dxlrun.log.reader import Log, LogReader
+from dxlrun import Log, LogError, LogReader
 from dxlwire.modes import COMMAND_INTERFACES
 
 VERSION = "v3.0"

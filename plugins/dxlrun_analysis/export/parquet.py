@@ -9,8 +9,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dxlrun.log.reader import LogReader
-from dxlrun.log.schemas import BUS_PREFIX
+from dxlrun import LogReader
+from dxlrun.tooling.topics import BUS_PREFIX
 from dxlrun_analysis.export.tables import PACKETS, tables_of
 
 _NAMES = {"/cycle": "cycles"}

@@ -14,17 +14,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import Severity
-from dxlrun.errors import LogError
+from dxlrun import Log, LogError, LogReader
 from dxlrun.log import schemas
-from dxlrun.log.reader import Log, LogReader
 from dxlrun.log.reading.arrow import struct_of
-from dxlrun.log.reading.topics import LoggedTopic
-from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import parse, short_name
+from dxlrun.tooling.records import PacketKind, Severity, Torque
+from dxlrun.tooling.topics import Codec, LoggedTopic
 from dxlwire.modes import Mode
-from dxlwire.packets import PacketKind
 
 CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one

@@ -16,7 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun.output import html
 
 _COLUMNS = 900  # About as many as a figure has pixels across

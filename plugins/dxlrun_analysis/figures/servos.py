@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_analysis.figures.drawing import (
     BLUE,
     DASHED,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 
 _LONGEST_S = 0.3
 _DELAYS = 24

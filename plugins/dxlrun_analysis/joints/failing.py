@@ -23,8 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.description.units import distance_text
+from dxlrun import Floats, distance_text
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.planned import PlannedJoint
 

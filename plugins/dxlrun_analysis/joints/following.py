@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.failing import joint_finding
 from dxlrun_analysis.joints.planned import PlannedJoint

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.log.reader import Log
+from dxlrun import Floats, Log
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats, Torque
+from dxlrun import Floats
+from dxlrun.tooling.records import Torque
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.failing import (

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun.log.reader import Log
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun import Log
+from dxlrun.tooling.plans import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 from dxlwire.control_table import ControlTable, Fault, HardwareErrors, control_table
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.log.reader import Log
+from dxlrun import Floats, Log
+from dxlrun.tooling.records import Torque
 from dxlrun_analysis.joints.delay import DelayFit
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints

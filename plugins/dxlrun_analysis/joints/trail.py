@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 
 STEP_S = 0.02
 _MOST = 8_192  # Samples kept, nearly three minutes: of a longer run the first half of them, and the newest

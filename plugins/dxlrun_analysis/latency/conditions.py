@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dxlrun.errors import InputError, counted, suggestion
-from dxlrun.plan.loop_plan import Policy, SchedulerPlan
+from dxlrun import InputError
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.plans import Policy, SchedulerPlan
+from dxlrun.tooling.verbs import suggestion
 
 YARDSTICK = "c"
 POLICIES: tuple[Policy, ...] = ("other", "round_robin", "fifo")

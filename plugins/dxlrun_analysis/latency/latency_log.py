@@ -17,16 +17,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun import LogError, LogReader
 from dxlrun.channels.messages import MessageRing, Topic
 from dxlrun.channels.ring import Handover
-from dxlrun.errors import LogError
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import LogReader
 from dxlrun.log.schemas import LogHeader, LogSummary
 from dxlrun.messages import Number
-from dxlrun.messages.cdr import Codec
-from dxlrun.messages.declared import declared_message
 from dxlrun.run.run_log import epoch_offset_ns
+from dxlrun.tooling.topics import Codec, declared_message
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 

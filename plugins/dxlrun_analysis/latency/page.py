@@ -7,8 +7,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from dxlrun.errors import counted
-from dxlrun.output.html import document, footer, header, paragraph, section, table_element
+from dxlrun.tooling.html import document, footer, header, paragraph, section, table_element
+from dxlrun.tooling.output import counted
 from dxlrun_analysis.cycles.latency import late_bins
 from dxlrun_analysis.latency.statistics import Block, Figures, Result
 from dxlrun_analysis.latency.tables import blocks_table, duration, statistics_table, title

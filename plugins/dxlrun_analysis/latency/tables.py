@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dxlrun.errors import counted
-from dxlrun.output.table import Cell, Column, Part, Sentence, Table, Value, flagged, microseconds
+from dxlrun.tooling.output import Cell, Column, Part, Sentence, Table, Value, counted, flagged, microseconds
 from dxlrun_analysis.latency.statistics import Figures, Interval, Result
 
 _OVER_BLOCKS = {"mean_us": "mean", "median_us": "median", "p99_us": "99 %"}

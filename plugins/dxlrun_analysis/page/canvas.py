@@ -29,8 +29,8 @@ from bokeh.plotting import figure as bokeh_figure
 from bokeh.resources import Resources
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.output.html import data, figure, script
+from dxlrun import Floats
+from dxlrun.tooling.html import data, figure, script
 from dxlrun_analysis.page.curves import Curves
 
 PAPER = "#ffffff"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.reader import Log
+from dxlrun import Log
 from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS, STEPS, cycle_periods_ns, late_bins
 from dxlrun_analysis.page.envelope import Envelope, Rows, Samples, Times
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from bokeh.models import ColumnDataSource
 
-from dxlrun.channels.events import Event, Severity
-from dxlrun.errors import counted
-from dxlrun.log.reader import Log
+from dxlrun import Log
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.records import Event, Severity
 from dxlrun_analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
 
 MOST_EVENTS = 1500  # Of each grade the first are kept

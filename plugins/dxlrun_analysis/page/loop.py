@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from bokeh.models import Range1d
 
-from dxlrun.output.table import microseconds
+from dxlrun.tooling.output import microseconds
 from dxlrun_analysis.cycles.latency import STEPS, Duration, Latency
 from dxlrun_analysis.page.canvas import (
     BLUE,

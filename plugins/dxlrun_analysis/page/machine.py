@@ -9,9 +9,9 @@ import numpy as np
 from bokeh.models import Range1d
 from numpy.typing import NDArray
 
-from dxlrun.log.reader import Log
-from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun import Log
 from dxlrun.messages.cdr import Value
+from dxlrun.tooling.topics import MACHINE_TOPIC
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Line, Plot, many_lines
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from dxlrun.channels.events import Event, Severity
-from dxlrun.log.reader import Log, LogReader
-from dxlrun.output.html import document, folded, footer, header, paragraph, section, table_element
-from dxlrun.output.table import Cell, Column, Columns, Table, microseconds
+from dxlrun import Log, LogReader
+from dxlrun.tooling.html import document, folded, footer, header, paragraph, section, table_element
+from dxlrun.tooling.output import Cell, Column, Columns, Table, microseconds
+from dxlrun.tooling.records import Event, Severity
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.page.canvas import Canvas
 from dxlrun_analysis.page.curves import CurveCollector, Curves, CurvesOfRun

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from bokeh.models import ColumnDataSource, Range1d
 
-from dxlrun.output.table import microseconds
+from dxlrun.tooling.output import microseconds
 from dxlrun_analysis.page.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot, many_lines
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.servos.traffic import ServoTraffic

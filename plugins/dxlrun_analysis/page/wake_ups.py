@@ -13,7 +13,7 @@ import numpy as np
 from bokeh.models import Range1d
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS
 from dxlrun_analysis.page.canvas import ERROR, WARNING, Canvas, Line, Plot
 from dxlrun_analysis.page.curves import Curves

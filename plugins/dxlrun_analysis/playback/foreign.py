@@ -18,13 +18,12 @@ import msgspec
 import numpy as np
 import yaml
 
-from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import open_log
-from dxlrun.log.reading.walk import LogWalk
+from dxlrun import InputError, LogError, open_log
 from dxlrun.log.schemas import JOINT_STATE
 from dxlrun.messages import Header, JointTrajectoryPoint
-from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
-from dxlrun.messages.declared import declared_message
+from dxlrun.messages.cdr import Value
+from dxlrun.tooling.logs import LogWalk
+from dxlrun.tooling.topics import ENCAPSULATION, Codec, declared_message
 from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
 
 

@@ -11,12 +11,10 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.compile.motions import TRAJECTORY, command_kind
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun import InputError, LogError
 from dxlrun.description.motion import motion_of
-from dxlrun.errors import InputError, LogError
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
-from dxlrun.plan.robot_plan import from_json
+from dxlrun.tooling.plans import ControllerPlan, LoopPlan, from_json
+from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import PINION_M, SplinePath, fit
 from dxlrun_controllers.joints import CLOSING_SPEED

@@ -12,7 +12,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.errors import InputError, suggestion
+from dxlrun import InputError
+from dxlrun.tooling.verbs import suggestion
 
 Floats: TypeAlias = NDArray[np.float64]
 What: TypeAlias = Literal["goals", "states"]

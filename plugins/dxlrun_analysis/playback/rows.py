@@ -9,8 +9,9 @@ from typing import Self
 import msgspec
 import numpy as np
 
-from dxlrun.errors import InputError, suggestion
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun import InputError
+from dxlrun.tooling.plans import JointPlan
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import SplinePath, fit, tolerances
 

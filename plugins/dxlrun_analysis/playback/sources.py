@@ -10,8 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import open_log
+from dxlrun import InputError, LogError, open_log
 from dxlrun_analysis.plan import plan_of
 from dxlrun_analysis.playback.foreign import foreign_series, is_foreign
 from dxlrun_analysis.playback.recorded_motion import (

@@ -12,13 +12,13 @@ import yaml
 from msgspec.structs import replace
 from pydantic import ValidationError
 
-from dxlrun.compile.robot import compile_robot
-from dxlrun.control.controllers.plugins import PlugIns, mismatches
+from dxlrun import InputError
+from dxlrun.control.controllers.plugins import mismatches
 from dxlrun.description.document import confined
 from dxlrun.description.problems import sentences_of
-from dxlrun.description.reading import read_robot
-from dxlrun.errors import InputError, suggestion
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan
+from dxlrun.tooling.plans import ControllerPlan, JointPlan, LoopPlan
+from dxlrun.tooling.robots import PlugIns, compile_robot, read_robot
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 _MOST_SENTENCES = 20

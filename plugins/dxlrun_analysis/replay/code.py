@@ -10,9 +10,9 @@ from typing import Literal
 
 from msgspec.structs import replace
 
+from dxlrun import InputError
 from dxlrun.control.controllers.single_files import file_of, publisher_of
-from dxlrun.description.document import read_file
-from dxlrun.errors import InputError
+from dxlrun.tooling.robots import read_file
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 CodeChoice = Literal["current", "log"]

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import CycleRecord, Floats
+from dxlrun import Floats, LogError
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.errors import LogError
-from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.tooling.plans import LoopPlan
+from dxlrun.tooling.records import CycleRecord
 from dxlrun_analysis.replay.inputs import RecordedHardware
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 from dxlwire.modes import COMMAND_INTERFACES

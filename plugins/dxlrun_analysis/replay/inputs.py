@@ -14,14 +14,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun import LogError, PortError, States
 from dxlrun.channels.answers import Answer, Refusal
-from dxlrun.channels.commands import Command, TakenCommand
-from dxlrun.channels.cycle import CycleRecord, States
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.commands import Command
 from dxlrun.control.loop import StopFlag
-from dxlrun.errors import LogError, PortError
-from dxlrun.log.reader import UNREADABLE
-from dxlrun.plan.loop_plan import ServoLimit
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.plans import ServoLimit
+from dxlrun.tooling.records import CycleRecord, EventCode, TakenCommand
 from dxlrun_analysis.client_commands import ClientCommand
 from dxlrun_analysis.replay.recorded import RecordedInputs
 from dxlwire.modes import COMMAND_INTERFACES

@@ -18,14 +18,12 @@ from msgspec import structs
 from msgspec.structs import replace
 from pydantic import ValidationError
 
-from dxlrun.channels.commands import TakenCommand
-from dxlrun.contract.controller import Controller
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.steering import Play
-from dxlrun.description.form import ParametersModel
-from dxlrun.errors import counted
-from dxlrun.log.reader import UNREADABLE
-from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun import Controller, ParametersModel
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.plans import LoopPlan, ScheduledCommand
+from dxlrun.tooling.records import Play, TakenCommand
+from dxlrun.tooling.robots import PlugIns
 from dxlrun_analysis.replay.comparison import shown_bits
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 

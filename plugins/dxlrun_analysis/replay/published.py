@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from dxlrun.channels.events import EventCode, LostRecords
+from dxlrun import Log
 from dxlrun.channels.messages import MessageSink, Topic
-from dxlrun.errors import counted
-from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.log.schemas import MACHINE_TOPIC
-from dxlrun.messages.cdr import Codec
-from dxlrun.messages.definition import MessageType
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.records import EventCode, LostRecords
+from dxlrun.tooling.topics import MACHINE_TOPIC, Codec, MessageType
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"

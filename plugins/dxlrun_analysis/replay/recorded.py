@@ -11,17 +11,15 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.events import EventCode
+from dxlrun import CONTRACT_VERSION, Log, LogError
 from dxlrun.channels.kept import KeptStates
-from dxlrun.contract.hookspecs import CONTRACT_VERSION
-from dxlrun.control.controllers.plugins import PlugIns, distribution_name
-from dxlrun.errors import LogError
+from dxlrun.control.controllers.plugins import distribution_name
 from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key, package_of
-from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import KEPT_ATTACHMENT
-from dxlrun.plan.loop_plan import LoopPlan
-from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
-from dxlrun.plan.robot_plan import decode_plan
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.plans import LoopPlan, PolicyName, PolicyPlan, decode_plan
+from dxlrun.tooling.records import EventCode
+from dxlrun.tooling.robots import PlugIns
 from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"

@@ -8,16 +8,15 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun import PlugInError, open_log
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
-from dxlrun.errors import PlugInError, counted
-from dxlrun.log.reader import open_log
-from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.plans import LoopPlan
+from dxlrun.tooling.records import CycleRecord, EventCode, Severity
+from dxlrun.tooling.robots import PlugIns, load_plugins
 from dxlrun_analysis.replay.changes import Setting, with_arguments, with_changed_code, with_settings
 from dxlrun_analysis.replay.code import CodeChoice, with_code
 from dxlrun_analysis.replay.comparison import Comparison, JointDifferences

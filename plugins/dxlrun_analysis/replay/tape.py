@@ -10,10 +10,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.commands import TakenCommand
-from dxlrun.channels.events import Event, EventCode
-from dxlrun.errors import LogError
-from dxlrun.log.reader import Log, LogReader
+from dxlrun import Log, LogError, LogReader
+from dxlrun.tooling.records import Event, EventCode, TakenCommand
 
 _SCALARS = (
     "cycle",

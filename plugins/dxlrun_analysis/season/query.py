@@ -14,7 +14,7 @@ from contextlib import contextmanager
 import duckdb
 import pyarrow as pa
 
-from dxlrun.errors import InputError
+from dxlrun import InputError
 
 atexit.register(gc.unfreeze)  # DuckDB prints its uncollected objects at exit, and the cli freezes all objects
 TABLE = "logs"

@@ -18,11 +18,9 @@ from typing import NamedTuple, Protocol, TypeVar
 import pyarrow as pa
 from pyarrow import parquet
 
-from dxlrun.errors import InputError, LogError
+from dxlrun import InputError, Log, LogError, open_log
 from dxlrun.log.identity import HOST, IDENTITY_NAME, RUNTIME, code_hashes
-from dxlrun.log.parts import is_log_directory, log_files
-from dxlrun.log.reader import Log, open_log
-from dxlrun.log.stored import is_being_written
+from dxlrun.tooling.logs import is_being_written, is_log_directory, log_files
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.finding import ROBOT
 from dxlrun_analysis.report import Report, analyze

@@ -21,8 +21,9 @@ import msgspec
 import pyarrow as pa
 from pyarrow import json
 
-from dxlrun.errors import DxlrunError, InputError, missing_extra
-from dxlrun.log.stored import is_being_written
+from dxlrun import DxlrunError, InputError
+from dxlrun.tooling.logs import is_being_written
+from dxlrun.tooling.verbs import missing_extra
 from dxlrun_analysis.season.runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
 
 _ROW, _LOG = ".run.json", ".mcap"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dxlrun.errors import counted
+from dxlrun.tooling.output import counted
 from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import Log
+from dxlrun import Log
+from dxlrun.tooling.logs import PacketColumns
+from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos import requests
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
-from dxlwire.packets import PacketKind
 from dxlwire.transaction import BROADCAST_ID
 
 _ROWS = 40  # Bits of an exchange's index in a key; above them the servo

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from dxlrun.channels.events import Event, EventCode
-from dxlrun.channels.packets import LoggedPacket
+from dxlrun.tooling.records import Event, EventCode, LoggedPacket
 from dxlrun_analysis.finding import HURTS, listed
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlwire.control_table import control_table

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import OFFLINE, Floats
-from dxlrun.log.reader import Log
+from dxlrun import Floats, Log
+from dxlrun.tooling.records import OFFLINE
 from dxlrun_analysis.plan import LoggedPlan
 
 Numbers = NDArray[np.int64]

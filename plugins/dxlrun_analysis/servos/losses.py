@@ -24,8 +24,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE
-from dxlrun.errors import counted
+from dxlrun.tooling.output import counted
+from dxlrun.tooling.records import BEFORE_FIRST_CYCLE
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from dxlrun.errors import counted
-from dxlrun.log.columns import PacketColumns
+from dxlrun.tooling.logs import PacketColumns
+from dxlrun.tooling.output import counted
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus

@@ -22,8 +22,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from dxlrun.dynamixel.remedies import late_replies
-from dxlrun.errors import counted
+from dxlrun.tooling.output import counted, late_replies
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan import LoggedBus

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.columns import PacketColumns
+from dxlrun.tooling.logs import PacketColumns
 from dxlwire.transaction import BROADCAST_ID
 
 IDS = 256  # A servo is one number: that of its bus times this, plus its ID

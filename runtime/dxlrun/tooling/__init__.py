@@ -14,7 +14,8 @@ each module is a page of names, and each name is imported when it is first used.
 | `runs` | running a robot: in processes, on virtual time |
 | `live` | robots that run: addresses, keys, messages as they come |
 | `logs` | logs: finding, reading, following |
-| `records` | the contents of a log: cycles, packets, events, commands, messages |
+| `records` | the contents of a log: cycles, packets, events, commands |
+| `topics` | names of topics, and their messages as bytes |
 
 A verb that counts the cycles of a log, with this package's plug-in module naming it:
 

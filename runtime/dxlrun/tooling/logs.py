@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from dxlrun.log.reader import UNREADABLE as UNREADABLE
     from dxlrun.log.reader import LogFollower as LogFollower
     from dxlrun.log.reader import read_log as read_log
+    from dxlrun.log.reading.walk import LogWalk as LogWalk
     from dxlrun.log.stored import is_being_written as is_being_written
+    from dxlrun.log.stored import oldest_beyond as oldest_beyond
+    from dxlrun.log.stored import stored_logs as stored_logs
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING
 from dxlrun.contract.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.dynamixel.remedies import choose_remedy as choose_remedy
+    from dxlrun.dynamixel.remedies import free_machine as free_machine
+    from dxlrun.dynamixel.remedies import late_replies as late_replies
     from dxlrun.errors import counted as counted
     from dxlrun.output.table import Cell as Cell
     from dxlrun.output.table import Column as Column

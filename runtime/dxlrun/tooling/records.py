@@ -1,4 +1,4 @@
-"""Records: the contents of a log: cycles, packets, events, commands and the messages of topics.
+"""Records: the contents of a log: cycles, packets, events and commands.
 
 Times are nanoseconds of the run's clock; quantities are in SI units.
 
@@ -16,19 +16,31 @@ from typing import TYPE_CHECKING
 from dxlrun.contract.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.channels.answers import CommandOutcome as CommandOutcome
     from dxlrun.channels.commands import TakenCommand as TakenCommand
+    from dxlrun.channels.cycle import OFFLINE as OFFLINE
     from dxlrun.channels.cycle import CycleRecord as CycleRecord
     from dxlrun.channels.cycle import Torque as Torque
     from dxlrun.channels.events import Event as Event
     from dxlrun.channels.events import EventCode as EventCode
+    from dxlrun.channels.events import EventCounts as EventCounts
     from dxlrun.channels.events import EventGroup as EventGroup
+    from dxlrun.channels.events import GoalHistory as GoalHistory
     from dxlrun.channels.events import GoalReport as GoalReport
+    from dxlrun.channels.events import GoalTotals as GoalTotals
     from dxlrun.channels.events import Granted as Granted
     from dxlrun.channels.events import LostRecords as LostRecords
     from dxlrun.channels.events import Severity as Severity
-    from dxlrun.messages.cdr import Codec as Codec
-    from dxlrun.messages.declared import declared_message as declared_message
-    from dxlrun.messages.definition import MessageType as MessageType
+    from dxlrun.channels.events import Waited as Waited
+    from dxlrun.channels.packets import BEFORE_FIRST_CYCLE as BEFORE_FIRST_CYCLE
+    from dxlrun.channels.packets import LoggedPacket as LoggedPacket
+    from dxlrun.channels.ring import RING_SECONDS as RING_SECONDS
+    from dxlrun.control.steering import Play as Play
+    from dxlrun.log.machine import load_sample as load_sample
+    from dxlrun.plan.machine_load import LoadMeter as LoadMeter
+    from dxlrun.plan.machine_load import LoadSample as LoadSample
+    from dxlrun.plan.machine_load import MachineLoad as MachineLoad
+    from dxlrun.plan.machine_load import SimulationWait as SimulationWait
     from dxlwire.packets import PacketKind as PacketKind
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

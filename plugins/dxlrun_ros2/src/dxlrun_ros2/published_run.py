@@ -16,7 +16,7 @@ from dxlrun import DxlrunError, Floats, RemoteRobot, TopicMessage, connect
 from dxlrun.log import schemas
 from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.tooling.live import LiveMessages
-from dxlrun.tooling.records import MessageType
+from dxlrun.tooling.topics import MessageType
 from dxlrun_ros2 import CLIENT
 
 STATE = QoSProfile(depth=1)

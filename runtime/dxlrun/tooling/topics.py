@@ -1,0 +1,39 @@
+"""Topics: the names of a log's topics, and the messages in them as bytes.
+
+Own messages are dataclasses or msgspec structs; `dxlrun.messages` has those of ROS 2.
+
+    from dxlrun.messages import Header
+    from dxlrun.tooling.topics import Codec, declared_message
+
+    codec = Codec(declared_message(Header, "std_msgs").type)
+    print(codec.message.text)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.contract.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.log.reading.topics import LoggedTopic as LoggedTopic
+    from dxlrun.log.schemas import ACTIVATION_TOPIC as ACTIVATION_TOPIC
+    from dxlrun.log.schemas import BUS_PREFIX as BUS_PREFIX
+    from dxlrun.log.schemas import COMMANDS_TOPIC as COMMANDS_TOPIC
+    from dxlrun.log.schemas import CYCLE_TOPIC as CYCLE_TOPIC
+    from dxlrun.log.schemas import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
+    from dxlrun.log.schemas import EVENT_TOPIC as EVENT_TOPIC
+    from dxlrun.log.schemas import FRAMES_TOPIC as FRAMES_TOPIC
+    from dxlrun.log.schemas import JOINT_COMMANDS_TOPIC as JOINT_COMMANDS_TOPIC
+    from dxlrun.log.schemas import JOINT_STATES_TOPIC as JOINT_STATES_TOPIC
+    from dxlrun.log.schemas import MACHINE_TOPIC as MACHINE_TOPIC
+    from dxlrun.log.schemas import ROBOT_DESCRIPTION_TOPIC as ROBOT_DESCRIPTION_TOPIC
+    from dxlrun.log.schemas import ROSOUT_TOPIC as ROSOUT_TOPIC
+    from dxlrun.log.schemas import STILL_FRAMES_TOPIC as STILL_FRAMES_TOPIC
+    from dxlrun.log.schemas import bus_topic as bus_topic
+    from dxlrun.messages.cdr import ENCAPSULATION as ENCAPSULATION
+    from dxlrun.messages.cdr import Codec as Codec
+    from dxlrun.messages.declared import declared_message as declared_message
+    from dxlrun.messages.definition import MessageType as MessageType
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
