@@ -18,14 +18,11 @@ import numpy as np
 from msgspec.structs import replace
 from rich.console import Console
 
-from dxlrun.compile.robot import compile_robot
-from dxlrun.description.reading import Description
-from dxlrun.errors import ProcessFault
-from dxlrun.log.reader import read_log
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_summary import RunOptions
-from dxlrun.run.supervisor import run_robot
+from dxlrun import ProcessFault
+from dxlrun.tooling.logs import read_log
+from dxlrun.tooling.plans import Plan, RecordingPlan
+from dxlrun.tooling.robots import Description, compile_robot
+from dxlrun.tooling.runs import RunOptions, run_robot
 from dxlrun_analysis.counts import median, quantile
 from dxlrun_lab.late_servos import overruns_by_servos
 from dxlsim.bus.ledger import read_ledger

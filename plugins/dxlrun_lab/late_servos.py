@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.reader import Log
+from dxlrun import Log
+from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlsim.bus.ledger import LedgerEntry
-from dxlwire.packets import PacketKind
 
 _BITS_A_BYTE = 10
 Longs = NDArray[np.int64]

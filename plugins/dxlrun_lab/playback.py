@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from dxlrun.errors import counted
+from dxlrun.tooling.output import counted
 from dxlrun_analysis.playback.rows import Rows
 from dxlrun_lab.guided.experiment import APPROACH_RAD_S, Procedure, Situation
 from dxlrun_lab.guided.segment import Guard, Recorded, Segment

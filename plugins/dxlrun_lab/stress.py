@@ -18,7 +18,8 @@ import sys
 import time
 from typing import Self
 
-from dxlrun.errors import ProcessFault, counted
+from dxlrun import ProcessFault
+from dxlrun.tooling.output import counted
 
 MOST_MEMORY = 2 << 30
 """Bytes that one process allocates, as in the thesis; two take at most half of what is free."""

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from dxlrun import InputError
 from dxlrun.compile.simulation import INSTALL_MUJOCO, NEEDS_MUJOCO
-from dxlrun.errors import InputError
 from dxlsim.motion.coupled_joints import moved_together, parts_without_bodies, together
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import (

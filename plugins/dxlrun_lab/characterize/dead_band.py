@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_lab.characterize.measured import Measured, mean_of, not_measured
 from dxlrun_lab.characterize.trace import Trace, polynomial
 

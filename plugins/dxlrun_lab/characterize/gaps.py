@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_lab.characterize.measured import Measured, not_measured
 from dxlrun_lab.characterize.trace import Trace
 

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from dxlrun.errors import counted
-from dxlrun.output.html import document, footer, header, paragraph, section, table_element
+from dxlrun.tooling.html import document, footer, header, paragraph, section, table_element
+from dxlrun.tooling.output import counted
 from dxlrun_analysis.figures.servos import (
     Mark,
     Points,

@@ -10,8 +10,7 @@ from typing import Final, Literal, get_args
 import msgspec
 import numpy as np
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.errors import Refused
+from dxlrun import Floats, Refused
 from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
 from dxlrun_lab.characterize.measured import Measured, not_measured
 from dxlrun_lab.characterize.trace import Trace

@@ -15,7 +15,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.tooling.plans import Plan
 from dxlrun_lab.characterize.measured import Measured, not_measured
 from dxlrun_lab.guided.segment import Recorded
 

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_lab.characterize.measured import Measured, not_measured, student
 from dxlrun_lab.characterize.trace import Trace, polynomial
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from dxlrun.output.table import Cell, Column, Part, Sentence, Table
+from dxlrun.tooling.output import Cell, Column, Part, Sentence, Table
 from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import Characterized, Found
 

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 from dxlrun_lab.guided.experiment import Joint
 from dxlrun_lab.guided.segment import Recorded
 from dxlwire.bus_plan import BusPlan, ServoPlan

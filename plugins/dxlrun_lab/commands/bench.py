@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from dxlrun.cli.inputs import Assignment, DebugFlag, JsonFlag, RobotPath, Seconds, parse_assignments
-from dxlrun.errors import InputError, counted
-from dxlrun.output.terminal import show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import counted, show, show_json
+from dxlrun.tooling.verbs import Assignment, DebugFlag, JsonFlag, RobotPath, Seconds, parse_assignments
 
 if TYPE_CHECKING:
-    from dxlrun.output.table import Table
+    from dxlrun.tooling.output import Table
     from dxlrun_lab.highest_rate import HighestRate
 
 bench = App(name="bench", help="Measure a robot on this machine.")
@@ -40,7 +40,7 @@ def bench_rate(
         raise InputError(f"there is no robot file {robot}; check the path")
     if not 0.1 <= duration <= 3600:
         raise InputError(f"--duration {duration:g}: give from 0.1 to 3600")
-    from dxlrun.description.reading import read_robot
+    from dxlrun.tooling.robots import read_robot
     from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
 
     description = read_robot(robot, parse_assignments(assignments))
@@ -60,7 +60,7 @@ def bench_rate(
 
 
 def _rates(result: HighestRate) -> Table:
-    from dxlrun.output.table import Column, Table, numbers
+    from dxlrun.tooling.output import Column, Table, numbers
 
     columns = [
         Column("rate", form="{:g} Hz"),

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import check_report, write_report
-from dxlrun.errors import InputError
-from dxlrun.output.terminal import show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import show, show_json
+from dxlrun.tooling.verbs import check_report, write_report
 from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words, run_on_robot
 
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.errors import InputError, counted
-from dxlrun.output.target import check_target, write_target
-from dxlrun.output.terminal import show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import check_target, counted, show, show_json, write_target
+from dxlrun.tooling.verbs import DebugFlag, JsonFlag
 from dxlrun_lab.commands.recorded import ALL_OF_IT, RecordedPart
 
 if TYPE_CHECKING:

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Seconds, check_report, write_report
-from dxlrun.errors import InputError, missing_extra
-from dxlrun.output.target import check_target, write_target
-from dxlrun.output.terminal import err, print_error, show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import check_target, err, print_error, show, show_json, write_target
+from dxlrun.tooling.verbs import Seconds, check_report, missing_extra, write_report
 from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ def identify(
 
 
 def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot) -> tuple[JointResult, ...]:
-    from dxlrun.log.reader import read_log
+    from dxlrun.tooling.logs import read_log
     from dxlrun_lab.identify.experiment import from_log
 
     if not log.exists():

@@ -6,7 +6,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import (
+from dxlrun import InputError
+from dxlrun.tooling.output import check_target, out, print_error, progress_bar, show, show_json, unwritable
+from dxlrun.tooling.verbs import (
     DebugFlag,
     Flag,
     JsonFlag,
@@ -16,9 +18,6 @@ from dxlrun.cli.inputs import (
     terminated_as_interrupted,
     write_report,
 )
-from dxlrun.errors import InputError
-from dxlrun.output.target import check_target, unwritable
-from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun_analysis.latency.conditions import Settings
@@ -187,7 +186,7 @@ def _show(
 
 
 def _announced(settings: Settings, load: str) -> str:
-    from dxlrun.errors import counted
+    from dxlrun.tooling.output import counted
 
     names = ", ".join(condition.label for condition in settings.conditions)
     seconds = settings.seconds
@@ -222,7 +221,7 @@ def _log_place(log: Path | None, record: bool) -> Path | None:
     if not record:
         return None
     if log is None:
-        from dxlrun.description.robot import Recording
+        from dxlrun.tooling.robots import Recording
 
         return Path(Recording().directory)
     if log.suffix == ".mcap":
@@ -233,8 +232,8 @@ def _log_place(log: Path | None, record: bool) -> Path | None:
 
 
 def _new_log(place: Path) -> Path:
-    from dxlrun.plan.recording_plan import RecordingPlan
-    from dxlrun.run.run_log import new_log
+    from dxlrun.tooling.plans import RecordingPlan
+    from dxlrun.tooling.runs import new_log
 
     if place.suffix != ".mcap":
         return new_log(RecordingPlan(str(place)), "latency")

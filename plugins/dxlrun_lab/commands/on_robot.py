@@ -23,12 +23,12 @@ import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from dxlrun.cli.inputs import DebugFlag, Flag, JsonFlag, compiled
-from dxlrun.errors import DxlrunError, InputError, counted
-from dxlrun.output.terminal import err, print_error, print_warning
+from dxlrun import DxlrunError, InputError
+from dxlrun.tooling.output import counted, err, print_error, print_warning
+from dxlrun.tooling.verbs import DebugFlag, Flag, JsonFlag, compiled
 
 if TYPE_CHECKING:
-    from dxlrun.plan.robot_plan import Plan
+    from dxlrun.tooling.plans import Plan
     from dxlrun_lab.guided.experiment import Experiment, Performed, Situation
     from dxlrun_lab.guided.rig import Rig
     from dxlrun_lab.guided.segment import Segment
@@ -233,12 +233,12 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
     from dxlrun_lab.guided.rig import live_rig, require_whole
 
     if plan is None:
-        from dxlrun.remote.client import connect
+        from dxlrun import connect
 
         return live_rig(connect(options.robot, "experiment"))
     if options.virtual:
-        from dxlrun.plan.recording_plan import RecordingPlan
-        from dxlrun.run.run_log import discard_log, new_log
+        from dxlrun.tooling.plans import RecordingPlan
+        from dxlrun.tooling.runs import discard_log, new_log
         from dxlrun_lab.guided.virtual_rig import virtual_rig
 
         recording = RecordingPlan(plan.recording.directory)  # whole and in one file: it is what is measured

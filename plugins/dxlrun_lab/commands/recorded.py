@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, Seconds, compiled
-from dxlrun.errors import InputError
-from dxlrun.output.terminal import print_warning, show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import print_warning, show, show_json
+from dxlrun.tooling.verbs import Flag, Seconds, compiled
 from dxlrun_lab.commands.on_robot import Chosen, Course, OnRobot, perform_on
 
 if TYPE_CHECKING:
-    from dxlrun.output.table import Part
+    from dxlrun.tooling.output import Part
     from dxlrun_analysis.playback.recorded_motion import RecordedMotion
     from dxlrun_lab.commands.on_robot import Ran
     from dxlrun_lab.playback import PlayedBack
@@ -167,7 +167,7 @@ def _content(ran: Ran[PlayedBack]) -> dict[str, object]:
 
 
 def _parts(ran: Ran[PlayedBack], result: PlayedBack, log: Path) -> tuple[Part, ...]:
-    from dxlrun.output.table import Column, Table, numbers
+    from dxlrun.tooling.output import Column, Table, numbers
 
     end = "played" if result.whole else "played in part"
     rows = [

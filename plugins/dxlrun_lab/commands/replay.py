@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import AssignmentOfItsOwn, DebugFlag, JsonFlag, parse_assignments
-from dxlrun.errors import InputError, counted
-from dxlrun.output.terminal import print_warning, show, show_json
+from dxlrun import InputError
+from dxlrun.tooling.output import counted, print_warning, show, show_json
+from dxlrun.tooling.verbs import AssignmentOfItsOwn, DebugFlag, JsonFlag, parse_assignments
 from dxlrun_lab.commands.on_robot import Chosen
 from dxlrun_lab.commands.recorded import ALL_OF_IT, NOWHERE, PlayedOn, RecordedPart, play_recorded
 
 if TYPE_CHECKING:
-    from dxlrun.output.table import Part
+    from dxlrun.tooling.output import Part
     from dxlrun_analysis.replay import ReplayDifference, ReplayReport
 
 Settings = Annotated[
@@ -100,7 +100,7 @@ def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:
 
 
 def _replayed(report: ReplayReport) -> tuple[Part, ...]:
-    from dxlrun.output.table import Column, Table, numbers
+    from dxlrun.tooling.output import Column, Table, numbers
 
     if report.first is None:
         return (report.sentence,)

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from dxlrun.cli.inputs import (
+from dxlrun import InputError
+from dxlrun.tooling.output import err, out, print_error, print_warning, show, show_json, unblocked
+from dxlrun.tooling.verbs import (
     Assignment,
     DebugFlag,
     JsonFlag,
@@ -19,9 +21,6 @@ from dxlrun.cli.inputs import (
     terminated_as_interrupted,
     write_report,
 )
-from dxlrun.errors import InputError
-from dxlrun.output.terminal import err, out, print_error, print_warning, show, show_json
-from dxlrun.output.unblocked import unblocked
 
 if TYPE_CHECKING:
     from dxlrun_lab.tracking.experiment import Experiment

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
+from dxlrun import InputError
 from dxlrun.description.units import angle
-from dxlrun.errors import InputError, suggestion
-from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.tooling.plans import JointPlan, Plan
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
 

@@ -13,9 +13,8 @@ from typing import Final, Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from dxlrun.errors import DxlrunError, Refused
-from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.robot_plan import Plan
+from dxlrun import DxlrunError, Refused
+from dxlrun.tooling.plans import JointPlan, Plan
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunGone
 from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
 from dxlwire.bus_plan import ServoPlan

@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from dxlrun.errors import ProcessFault
-from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.sockets import SocketLink, sockets
+from dxlrun import ProcessFault, RemoteRobot
+from dxlrun.remote.sockets import sockets
+from dxlrun.tooling.live import SocketLink
 
 _CODE = """
 import ctypes, signal, sys

@@ -17,13 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun import DxlrunError, InputError, LogError, Refused, RemoteRobot
 from dxlrun.channels.answers import Code
-from dxlrun.channels.events import Event, EventCode, GoalReport
-from dxlrun.errors import DxlrunError, InputError, LogError, Refused
-from dxlrun.log.reader import LogFollower
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.plan.robot_plan import Plan, from_json
-from dxlrun.remote.client import RemoteRobot
+from dxlrun.tooling.logs import LogFollower
+from dxlrun.tooling.plans import Plan, RecordingPlan, from_json
+from dxlrun.tooling.records import Event, EventCode, GoalReport
 from dxlrun_lab.guided.own_run import OwnRun
 
 TORQUED = ("on", "doubt")

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats
 
 Interface = Literal["position", "posvel", "velocity", "effort", "pwm"]
 """What a table commands; see sample_player."""

@@ -15,23 +15,24 @@ from pathlib import Path
 import numpy as np
 from starlette.types import Message
 
+from dxlrun import RemoteRobot
 from dxlrun.channels import heartbeat, mailbox, ring
 from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
-from dxlrun.channels.events import LONGEST_EVENT, Event
+from dxlrun.channels.events import LONGEST_EVENT
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Payload, RecordKind, RingWriter
 from dxlrun.channels.tagged import decode
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote.client import RemoteRobot
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.requests.table import Role
-from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.tooling.live import Role
+from dxlrun.tooling.plans import Plan
+from dxlrun.tooling.records import Event
+from dxlrun.tooling.robots import load_plugins
+from dxlrun.tooling.runs import VirtualRobot
 from dxlrun_lab.guided.rig import Cycles, Rig, RunGone
 
 ORIGIN = b"experiment"

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from dxlrun.errors import InputError
+from dxlrun import InputError
 from dxlrun_lab.identify.model import Floats
 
 LEAST_S, LEAST_RANGE = 10.0, math.radians(5)

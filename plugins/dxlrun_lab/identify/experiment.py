@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.errors import InputError
-from dxlrun.log.reader import Log
+from dxlrun import InputError, Log
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
 from dxlrun_lab.guided.segment import Guard, Recorded, Segment

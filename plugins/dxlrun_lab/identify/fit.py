@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import optimize, signal, stats
 
-from dxlrun.errors import InputError
+from dxlrun import InputError
 from dxlrun_lab.identify.measured import Compared, Measured
 from dxlrun_lab.identify.model import ROWS, STEP_S, Floats, Numbers, Simulated, simulate
 

@@ -14,8 +14,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Torque
-from dxlrun.errors import InputError
+from dxlrun import InputError
+from dxlrun.tooling.records import Torque
 from dxlrun_lab.identify.model import STEP_S, Control, Floats, Pieces
 from dxlrun_lab.identify.servo import Servo
 from dxlwire.modes import Mode

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.output.html import document, footer, header, paragraph, section, table_element
-from dxlrun.output.table import Sentence
+from dxlrun.tooling.html import document, footer, header, paragraph, section, table_element
+from dxlrun.tooling.output import Sentence
 from dxlrun_analysis.figures.drawing import (
     BLUE,
     MUTED,

@@ -13,12 +13,11 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.errors import InputError
+from dxlrun import InputError, MotorLoad, MotorModel, Stribeck
 from dxlrun_lab.identify.fit import Fit
 from dxlrun_lab.identify.measured import Measured
 from dxlrun_lab.identify.model import ROWS, Floats
 from dxlrun_lab.identify.servo import Servo
-from dxlsim.motor_model import MotorLoad, MotorModel, Stribeck
 
 Scale = Literal["load", "current", "manual"]
 

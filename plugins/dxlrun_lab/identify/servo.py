@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun.errors import InputError, suggestion
-from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun import InputError, Log
+from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.plans import Plan, from_json
+from dxlrun.tooling.verbs import suggestion
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
 from dxlsim.motion.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from dxlrun.output.table import Cell, Column, Part, Sentence, Table
+from dxlrun.tooling.output import Cell, Column, Part, Sentence, Table
 from dxlrun_lab.identify.result import Identified, Value
 
 _NAMES = {

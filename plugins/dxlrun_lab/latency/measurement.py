@@ -20,11 +20,11 @@ from pathlib import Path
 
 import msgspec
 
+from dxlrun import InputError, ProcessFault
 from dxlrun.channels.process import memory_file, start, whole
 from dxlrun.channels.shared_memory import load
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Grant
-from dxlrun.errors import InputError, ProcessFault
 from dxlrun_analysis.latency.conditions import Condition, Settings, order
 from dxlrun_analysis.latency.statistics import Block
 from dxlrun_lab.latency.buffer import Buffer, Place

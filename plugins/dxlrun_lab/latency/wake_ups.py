@@ -20,7 +20,7 @@ from dxlrun.channels.shared_memory import store
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Pacing
 from dxlrun.control.schedule import Schedule
-from dxlrun.plan.loop_plan import SchedulerPlan
+from dxlrun.tooling.plans import SchedulerPlan
 from dxlrun_lab.latency.buffer import Buffer, Place
 from dxlwire.clock import Clock, MonotonicClock
 

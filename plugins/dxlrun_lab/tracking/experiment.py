@@ -10,13 +10,12 @@ from tempfile import TemporaryDirectory
 import msgspec
 from rich.console import Console
 
-from dxlrun.channels.events import EventCode, Granted, Severity
-from dxlrun.errors import DxlrunError
-from dxlrun.log.reader import Log, read_log
-from dxlrun.output.terminal import show
-from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_summary import RunOptions
-from dxlrun.run.supervisor import run_robot
+from dxlrun import DxlrunError, Log
+from dxlrun.tooling.logs import read_log
+from dxlrun.tooling.output import show
+from dxlrun.tooling.plans import Plan
+from dxlrun.tooling.records import EventCode, Granted, Severity
+from dxlrun.tooling.runs import RunOptions, run_robot
 from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion

@@ -15,9 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.errors import counted
-from dxlrun.output.table import microseconds
+from dxlrun import Floats
+from dxlrun.tooling.output import counted, microseconds
 from dxlrun_analysis.figures.drawing import (
     BLUE,
     DASHED,

@@ -15,8 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Floats
-from dxlrun.log.reader import Log
+from dxlrun import Floats, Log
 from dxlrun_analysis.cycles.latency import ROUGH_NS
 from dxlrun_lab.late_servos import waits_for_servos
 from dxlrun_lab.tracking.motion import DesiredMotion

@@ -9,13 +9,12 @@ import msgspec
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
-from dxlrun.channels.cycle import Floats
+from dxlrun import Floats, InputError
 from dxlrun.compile.motions import LEAD_NS, TRAJECTORY, samples_of
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample
-from dxlrun.description.motion import read_motion
-from dxlrun.errors import InputError
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.tooling.plans import Plan
+from dxlrun.tooling.robots import read_motion
 from dxlrun_controllers.laws.spline import CUBIC, solve
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 
-from dxlrun.errors import counted
-from dxlrun.output.html import document, footer, header, section, table_element
-from dxlrun.output.table import Column, Part, Sentence, Table, Value, flagged, microseconds
+from dxlrun.tooling.html import document, footer, header, section, table_element
+from dxlrun.tooling.output import Column, Part, Sentence, Table, Value, counted, flagged, microseconds
 from dxlrun_lab.tracking.experiment import Experiment
 from dxlrun_lab.tracking.measurement import Tracked
 

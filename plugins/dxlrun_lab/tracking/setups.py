@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import msgspec
 from msgspec.structs import replace
 
+from dxlrun import InputError
 from dxlrun.control.realtime import allow, guardian_priority, highest_priority
-from dxlrun.errors import InputError, suggestion
-from dxlrun.plan.loop_plan import ScheduleName
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.tooling.plans import Plan, ScheduleName
+from dxlrun.tooling.verbs import suggestion
 
 
 class Setup(msgspec.Struct, frozen=True):
