@@ -14,7 +14,7 @@ Exception
     ├── ProcessFault               a process of the run ended or hung
     ├── Refused                    a running robot refused a request; exit code 2: the request was wrong
     ├── GoalTimeout (TimeoutError) a goal has not ended in the time that was given
-    └── LogError (ValueError)      a log or a ledger cannot be read; exit code 2
+    └── LogError (ValueError)      a log cannot be read; exit code 2
 ```
 """
 
@@ -121,7 +121,7 @@ class ProcessFault(DxlrunError, RuntimeError):
 
 
 class LogError(DxlrunError, ValueError):
-    """A log or a ledger cannot be read, or is not one of dxlrun."""
+    """A log cannot be read, or is not one of dxlrun."""
 
     exit_code = 2
 

@@ -7,26 +7,26 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
-from dxlrun.channels.heartbeat import ENDLESS_NS, LineProgress, SimulationProgress
-from dxlrun.channels.process import MessageChannel
-from dxlrun.channels.slot import SlotWriter
-from dxlrun.errors import InputError
 from dxlsim.bus.ledger import FAULT, Ledger
 from dxlsim.bus.recorded_bus import RecordedBus
+from dxlsim.bus.recording import RecordedPackets
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.device.on_links import fix_to_links
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-from dxlsim.messages import Request, ServoLook, SimulationMessage
-from dxlsim.motion.body import ShaftsShown
+from dxlsim.host import ENDLESS_NS, LineProgress, Progress, Starter
+from dxlsim.messages import ServoLook, SimulationMessage
+from dxlsim.motion.body import ShaftSink, ShaftsShown
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlsim.realtime import PollBudget
 from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import SimulationConfig
+from dxlwire.errors import InputError
 
 MOST_BACKLOG_NS = 20_000_000
 """A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
@@ -54,7 +54,7 @@ _GOAL_MODES = (3, 4, 5)
 
 
 class Server:
-    """Pumps pseudo-terminals and buses until the control socket ends or SIGTERM comes.
+    """Pumps pseudo-terminals and buses until its starter closes, or the `stop` of `run` is readable.
 
     Raises InputError when a fault of the configuration could never happen, or its bodies cannot be moved,
     OSError when a terminal or a link cannot be made.
@@ -64,20 +64,30 @@ class Server:
         self,
         config: SimulationConfig,
         ledger: Ledger,
-        starter: MessageChannel[Request],
-        shafts: SlotWriter | None = None,
-        progress: SimulationProgress | None = None,
+        starter: Starter,
+        *,
+        shafts: ShaftSink | None = None,
+        progress: Progress | None = None,
+        recordings: Mapping[str, RecordedPackets] = MappingProxyType({}),
     ) -> None:
-        """`shafts` takes how the shafts move, for sensors in other processes.
+        """Make the buses and their terminals.
 
-        `progress` takes up to which time each line was served, for a host that waits for this process.
+        Args:
+            config: Buses, faults, links and bodies.
+            ledger: Takes every byte that passes the wire.
+            starter: Sends requests, and takes ports, faults that happen, and answers.
+            shafts: Takes how the shafts move, for sensors in other processes.
+            progress: Takes up to which time each line was served, for a host that waits for this process.
+            recordings: The packets of each bus that is `recorded`, by the name of the bus.
         """
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._starter = starter
         self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies, config.couplings))
         self._buses = tuple(
-            (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
+            RecordedBus(bus, ledger, self.start_ns, recordings[bus.name], self._mechanics)
+            if bus.recorded
+            else SimulatedBus(bus, ledger, self.start_ns, self._mechanics)
             for bus in config.buses
         )
         if config.sensed is not None:
@@ -101,16 +111,20 @@ class Server:
         self._held: dict[int, int] = {}
         """Terminals that are not read before a time, by descriptor."""
 
-    def run(self, granted: str = "") -> None:
-        """Report the ports and what real time was granted, then serve."""
+    def run(self, granted: str = "", stop: int = -1) -> None:
+        """Report the ports and what real time was granted, then serve.
+
+        `stop`: a descriptor that ends it when it becomes readable; -1: none does.
+        """
         self._ledger.on_note = self._report_fault
-        with _wake_on_sigterm() as wake, self._waiting as waiting:
-            waiting.register(wake, select.EPOLLIN)
+        with self._waiting as waiting:
+            if stop >= 0:
+                waiting.register(stop, select.EPOLLIN)
             waiting.register(self._starter, select.EPOLLIN)
             self._plug()
             self._tell(SimulationMessage(self._ports(), granted))
             while not self._stopped:
-                self._serve_once(wake.fileno())
+                self._serve_once(stop)
                 if self._shafts is not None:
                     self._shafts.show()
         for terminal in self._terminals:
@@ -127,7 +141,7 @@ class Server:
                     bus.excuse(now_ns - since_ns)
         return now_ns
 
-    def _serve_once(self, wake: int) -> None:
+    def _serve_once(self, stop: int) -> None:
         now_ns = self._look_at_clock()
         soonest_ns = self._find_next_delivery()
         easy_ns = None
@@ -154,7 +168,7 @@ class Server:
                 self._look_at_clock()
             )  # no host gets a reply before it wrote, though other lines take long
             for number, _ in ready:
-                self._read_ready(number, wake, now_ns)
+                self._read_ready(number, stop, now_ns)
             rounds -= 1
             ready = self._waiting.poll(0) if rounds else []  # what is reported is reported once
         self._ledger.flush_if_due(now_ns)
@@ -203,11 +217,11 @@ class Server:
             self._plug()
             self._tell(SimulationMessage(self._ports()))
 
-    def _read_ready(self, number: int, wake: int, now_ns: int) -> None:
+    def _read_ready(self, number: int, stop: int, now_ns: int) -> None:
         terminal = self._by_descriptor.get(number)
         if terminal is not None:
             self._receive(number, terminal, now_ns)
-        elif number == wake:
+        elif number == stop:
             self._stopped = True
         elif number == self._starter.fileno():
             self._answer_requests(now_ns)
@@ -302,10 +316,12 @@ class _ServedLine:
         self._progress.give(now_ns - self._bus.lateness_ns[-1], now_ns)
 
 
-def _wake_on_sigterm() -> socket.socket:
+def wake_on_signals(*numbers: signal.Signals) -> socket.socket:
+    """Return a socket that becomes readable when one of these signals comes, which does nothing else then."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
-    signal.signal(signal.SIGTERM, lambda number, frame: None)
+    for number in numbers:
+        signal.signal(number, lambda number, frame: None)
     signal.set_wakeup_fd(signalled.detach())
     return wake
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.errors import PortError
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlwire.clock import VirtualClock
+from dxlwire.errors import PortError
 
 
 class VirtualPort:

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 import pytest
 
 from dxlrun.channels.heartbeat import (
-    ENDLESS_NS,
     LineProgress,
     SimulationProgress,
     create_progress,
 )
+from dxlsim.host import ENDLESS_NS
 from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
 MS = 1_000_000

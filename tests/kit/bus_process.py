@@ -31,7 +31,7 @@ def started(
     whole = config if isinstance(config, SimulationConfig) else SimulationConfig(tuple(config))
     job = process.memory_file("bus-process", msgspec.json.encode(SimulationJob(whole, **options)))
     ours, theirs = socket.socketpair()
-    command = [sys.executable, "-m", "dxlsim", "--job-fd", str(job)]
+    command = [sys.executable, "-m", "dxlrun.run.simulation_process", "--job-fd", str(job)]
     command += ["--control-fd", str(theirs.fileno())]
     inherited = (job, theirs.fileno())
     child = subprocess.Popen(command, pass_fds=inherited, stderr=errors, start_new_session=True)

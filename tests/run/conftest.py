@@ -97,7 +97,7 @@ class Running:
             except OSError:
                 continue
             if state not in "ZX" and command != [b""]:
-                modules = [word.decode() for word in command if word.startswith((b"dxlrun.", b"dxlsim"))]
+                modules = [word.decode() for word in command if word.startswith(b"dxlrun.")]
                 found[modules[0].removeprefix("dxlrun.") if modules else "dxlrun"] = int(path.name)
         return found
 

@@ -367,7 +367,7 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(odd, wait_for):
 def test_simulated_servos_that_are_gone_end_the_run(start, wait_for):
     run = start()
     run.wait_until_moving()
-    os.kill(run.child("dxlsim"), signal.SIGKILL)
+    os.kill(run.child("run.simulation_process"), signal.SIGKILL)
     code, out, err = run.finish()
     assert code == 1
     assert "the simulated bus ended before the run did" in err

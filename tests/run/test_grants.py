@@ -136,7 +136,7 @@ def test_nothing_but_what_asked_for_it_has_the_real_time_of_the_terminal(start):
     nice = os.getpriority(os.PRIO_PROCESS, run.child("dxlrun.log.recorder"))
     run.signal(signal.SIGTERM)
     run.finish()
-    ours = {"run.guardian", "run.loop_process", "dxlsim"}
+    ours = {"run.guardian", "run.loop_process", "run.simulation_process"}
     assert found.keys() - ours == {"dxlrun", "log.recorder", "remote"}
     assert nice == max(RECORDER_NICE, min(0, lowest_nice()))
     assert all(found[name] == {os.SCHED_OTHER} for name in found.keys() - ours)

@@ -13,8 +13,8 @@ from dxlrun.cli import main
 from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.run.ledger_file import open_ledger
 from dxlrun.run.run_log import discard_log, new_log
-from dxlsim.bus.ledger import Ledger
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def _virtual_run(directory: Path) -> None:
     [
         lambda directory: new_log(RecordingPlan(str(directory)), "pair"),
         lambda directory: LogFile(directory / "log.mcap").close(),
-        lambda directory: Ledger(directory / "bus.jsonl").close(),
+        lambda directory: open_ledger(directory / "bus.jsonl").close(),
         _virtual_run,
     ],
     ids=["name", "log", "ledger", "run"],

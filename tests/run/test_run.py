@@ -66,7 +66,7 @@ def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
 def test_without_a_terminal_the_robot_becomes_limp(start, all_limp):
     run = start()
     run.wait_until_moving()
-    simulation = os.pidfd_open(run.child("dxlsim"))
+    simulation = os.pidfd_open(run.child("run.simulation_process"))
     guardian = os.pidfd_open(run.child("dxlrun.run.guardian"))
     run.signal(signal.SIGKILL)
     run.finish()

@@ -10,9 +10,10 @@ from tests.kit.judges import log_has_every_byte
 
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.ledger_file import open_ledger
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
-from dxlsim.bus.ledger import Ledger, read_ledger
+from dxlsim.bus.ledger import read_ledger
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import AdapterConfig
@@ -35,7 +36,7 @@ def run(plan: Plan, directory: Path, seed: int) -> tuple[Path, Path]:
     """Run in a storm of faults; return log and ledger."""
     directory.mkdir()
     log, ledger = directory / "run.mcap", directory / "run.ledger.jsonl"
-    robot = VirtualRobot(plan, log=log, ledger=Ledger(ledger, keep=False))
+    robot = VirtualRobot(plan, log=log, ledger=open_ledger(ledger))
     storm = parse_fault("storm faults=8 within=2s")
     FaultScript([storm], seed).attach(robot.buses, start_ns=STARTED_NS)
     robot.run()

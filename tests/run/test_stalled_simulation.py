@@ -41,7 +41,7 @@ def stop_for(run: Any, seconds: float, wait_for: Callable[..., Any]) -> None:
     wait_for(
         lambda: any(b"\x83" in (one.data[place] for place in sync_write) for one in run.ledger()), "goals"
     )
-    pid = run.child("dxlsim")
+    pid = run.child("run.simulation_process")
     for _ in range(2):
         os.kill(pid, signal.SIGSTOP)
         time.sleep(seconds)

@@ -19,6 +19,7 @@ from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log, read_log
+from dxlrun.log.recorded_packets import read_recorded_packets
 from dxlrun.run import virtual_run
 from dxlrun.run.simulation_front import Served
 from dxlsim.bus.ledger import Ledger
@@ -88,7 +89,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Log]:
         def bus(config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Any) -> SimulatedBus:
             if recorded is not None:
                 config = replace(config, servos=(), recorded=str(recorded))
-                return RecordedBus(config, ledger, start_ns, mechanics)
+                return RecordedBus(
+                    config, ledger, start_ns, read_recorded_packets(recorded, config.name), mechanics
+                )
             made = SimulatedBus(config, ledger, start_ns, mechanics)
             LAPSES[lapse](made)
             return made
@@ -132,7 +135,8 @@ class Host:
 
     def __init__(self, log: Path, protocol: float, baud_rate: int = 1_000_000) -> None:
         self.ledger = Ledger()
-        self.bus = RecordedBus(BusConfig("main", 1_000_000, (), protocol, recorded=str(log)), self.ledger, 0)
+        config = BusConfig("main", 1_000_000, (), protocol, recorded=str(log))
+        self.bus = RecordedBus(config, self.ledger, 0, read_recorded_packets(log, "main"))
         self.bus.baud_rate = baud_rate
         self._now_ns = 0
 
@@ -289,4 +293,4 @@ def test_wrong_words_and_logs_are_refused(tmp_path, capsys, words, said):
 def test_a_log_without_instructions_or_without_the_bus_is_refused(run):
     log = run("2.0")
     with pytest.raises(LogError, match="the log has no bus left"):
-        RecordedBus(BusConfig("left", 1_000_000, (), 2.0, recorded=str(log.path)), Ledger(), 0)
+        read_recorded_packets(log.path, "left")

@@ -190,7 +190,6 @@ _KEPT_STALLS = 16
 _LINES = _FIRST_STALL + 2 * _KEPT_STALLS
 _TAKEN, _SERVED, _GIVEN, _DUE = range(4)
 _LINE_WORDS = 4
-ENDLESS_NS = 1 << 62
 
 
 def create_progress(lines: int) -> int:

@@ -25,13 +25,8 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dxlrun.description.form import refuse
 from dxlrun.description.mistakes.syntax import list_text
+from dxlsim.duration import DURATION_NS, LONGEST_NS, LONGEST_QUANTITY, nanoseconds, split_quantity
 from dxlwire.joint_unit import JointUnit
-
-# at most three digits of exponent: Fraction("1e-999999999") would fill the memory
-_QUANTITY = re.compile(
-    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9% ]*)", re.ASCII
-)
-_LONGEST = 64
 
 
 class Measure(float):
@@ -239,14 +234,6 @@ seconds = Quantity(
 
 _TABLE = (angle, angular_velocity, angular_acceleration, register_time, voltage, current, torque)
 _OF_TABLES: Mapping[str, Quantity] = {one.si: one for one in (*_TABLE, temperature, fraction)}
-_DURATION_NS: Mapping[str, int] = {
-    "ns": 1,
-    "us": 1_000,
-    "ms": 1_000_000,
-    "s": 1_000_000_000,
-    "min": 60_000_000_000,
-    "h": 3_600_000_000_000,
-}
 _SIZE_BYTES: Mapping[str, int] = {
     "kB": 1_000,
     "MB": 1_000_000,
@@ -255,7 +242,6 @@ _SIZE_BYTES: Mapping[str, int] = {
     "MiB": 1 << 20,
     "GiB": 1 << 30,
 }
-_LONGEST_NS = 10**9 * _DURATION_NS["s"]  # 31 years; stays inside 64 bits when a few are added
 
 
 def duration(text: object, *, bare: str = "") -> int:
@@ -264,9 +250,9 @@ def duration(text: object, *, bare: str = "") -> int:
     `bare` is the unit of numbers without one.
     """
     written = "500 us, 1 ms, 2 s or 1 min"
-    number, unit = split(text, "a duration", _DURATION_NS, written, bare=bare)
-    value = round(Fraction(number) * _DURATION_NS[unit])  # exact: 0.1 ms is 100000 ns
-    if not 0 <= value <= _LONGEST_NS:
+    number, unit = split(text, "a duration", DURATION_NS, written, bare=bare)
+    value = nanoseconds(number, unit)
+    if value is None:
         raise refuse(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
     return value
 
@@ -304,12 +290,11 @@ def split(
         raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
         raise refuse(f"this is not {what}", f"write {what} such as {written}")
-    match = _QUANTITY.fullmatch(text.strip()) if len(text) <= _LONGEST else None
-    number = match[1].replace("_", "") if match else ""
-    if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):
-        fix = _meant(text[:_LONGEST], units) or f"write {what} such as {written}"
-        raise refuse(f"{text[:_LONGEST]!r} is not {what}", fix)
-    unit = match[2] or bare
+    parts = split_quantity(text)
+    if parts is None:
+        fix = _meant(text[:LONGEST_QUANTITY], units) or f"write {what} such as {written}"
+        raise refuse(f"{text[:LONGEST_QUANTITY]!r} is not {what}", fix)
+    number, unit = parts[0], parts[1] or bare
     if not unit:
         raise refuse(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
     if unit not in units:
@@ -371,7 +356,7 @@ def units_of(note: object) -> Mapping[str, float]:
     """
     if isinstance(note, Quantity):
         return note.units
-    return _DURATION_NS if isinstance(note, BeforeValidator) and note.func is duration else {}
+    return DURATION_NS if isinstance(note, BeforeValidator) and note.func is duration else {}
 
 
 def example_of(note: object) -> str:
@@ -389,10 +374,10 @@ def bound_text(bound: float, units: Mapping[str, float], written: object) -> str
         units: See `units_of`.
         written: The value as the file has it; where it has no unit, neither has the bound.
     """
-    match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
-    if match is None or match[2] not in units or not bound:
+    parts = split_quantity(written) if isinstance(written, str) else None
+    if parts is None or parts[1] not in units or not bound:
         return f"{bound:g}"
-    return f"{bound / units[match[2]]:g} {match[2]}"
+    return f"{bound / units[parts[1]]:g} {parts[1]}"
 
 
 def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
@@ -463,7 +448,7 @@ def _nanoseconds(value: int | str) -> str:
     return f"{value} ns" if isinstance(value, int) else value
 
 
-_DURATION_SCHEMA = text_schema("500 us", _DURATION_NS)
+_DURATION_SCHEMA = text_schema("500 us", DURATION_NS)
 Duration = Annotated[
     int,
     BeforeValidator(duration),
@@ -498,10 +483,10 @@ def size(text: str) -> int:
 def _part(value: object) -> object:
     if isinstance(value, tuple):  # as it was read before
         return value
-    units = {**_SIZE_BYTES, **_DURATION_NS}
+    units = {**_SIZE_BYTES, **DURATION_NS}
     number, unit = split(value, "a size or a duration", units, "100 MB or 10 min")
     amount = round(Fraction(number) * units[unit])
-    if not 0 <= amount <= _LONGEST_NS:
+    if not 0 <= amount <= LONGEST_NS:
         raise refuse(f"{value!r} is out of range", "write a size or a duration such as 100 MB or 10 min")
     return ("bytes" if unit in _SIZE_BYTES else "ns", amount)
 
@@ -514,6 +499,6 @@ SizeOrDuration = Annotated[
         return_type=str,
         when_used="json",
     ),
-    WithJsonSchema(text_schema("100 MB", {**_SIZE_BYTES, **_DURATION_NS})),
+    WithJsonSchema(text_schema("100 MB", {**_SIZE_BYTES, **DURATION_NS})),
 ]
 """Bytes from `100 MB` or `64 MiB`, or ns from `10 min`; with the word that says which."""

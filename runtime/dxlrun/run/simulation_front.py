@@ -42,7 +42,7 @@ def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage
     inherited = [descriptor, *(one for one in (job.shafts, job.progress) if one >= 0)]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
-        return Child("simulated bus", "dxlsim", arguments, inherited, errors, messages)
+        return Child("simulated bus", "dxlrun.run.simulation_process", arguments, inherited, errors, messages)
     finally:
         os.close(descriptor)
 

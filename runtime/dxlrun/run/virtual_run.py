@@ -29,6 +29,7 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
+from dxlrun.run.ledger_file import open_ledger
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
 from dxlsim.bus.ledger import Ledger
@@ -236,7 +237,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     log = new_log(plan.recording, plan.robot) if options.record else None
     try:
         # a command line does not need the entries afterwards: memory stays bounded
-        ledger = Ledger(options.ledger, keep=False)
+        ledger = open_ledger(options.ledger)
         kept = state_directory(plan)
         robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger, kept=kept)
     except BaseException:

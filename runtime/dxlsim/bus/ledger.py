@@ -9,13 +9,9 @@ from typing import IO, Annotated, Literal, NamedTuple
 
 import msgspec
 
-from dxlrun.errors import LogError
-from dxlrun.output.target import open_empty
+from dxlwire.errors import InputError
 
 Direction = Literal["in", "out", "note"]
-
-_MODE = 0o640  # Of a new file: it can be read by its user and group only
-_BUFFER = 1 << 16  # Bytes that are written out together
 
 FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
 
@@ -55,17 +51,16 @@ _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 class Ledger:
     """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
 
-    A full disk ends the file, never the simulation.
+    The file is open for writing, and buffered: a busy bus has thousands of entries a second.
+    `close` closes it. A full disk ends the file, never the simulation.
     """
 
-    def __init__(self, path: Path | None = None, *, keep: bool = True) -> None:
+    def __init__(self, file: IO[bytes] | None = None, *, keep: bool = True) -> None:
         self.entries: list[LedgerEntry] = []
         self.error: str | None = None  # Why the file is not complete; None: it is
         self.on_note: Callable[[str], None] | None = None  # Called with each note
         self._keep = keep
-        self._file: IO[bytes] | None = None
-        if path is not None:
-            self._file = open(open_empty(path, _MODE), "wb", _BUFFER)  # noqa: SIM115  `close` closes it
+        self._file = file
         self._unflushed_ns: int | None = None
 
     def add(
@@ -136,7 +131,7 @@ class Ledger:
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
     """Return the entries of a ledger file; a last line that was cut off in writing is left out.
 
-    Raises LogError when another line is not an entry, OSError when the file cannot be read.
+    Raises InputError when another line is not an entry, OSError when the file cannot be read.
     """
     lines = path.read_bytes().split(b"\n")
     complete = lines[:-1]  # what follows the last newline is empty, or was cut off
@@ -147,7 +142,7 @@ def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
             data = bytes.fromhex(one.bytes)
             entries.append(LedgerEntry(one.t_ns, one.bus, one.direction, data, one.note, one.late_ns))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise LogError(
+        raise InputError(
             f"{path} is not a ledger of a simulated bus: line {len(entries) + 1}: {error}"
         ) from error
     return tuple(entries)

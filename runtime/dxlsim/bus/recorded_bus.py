@@ -1,4 +1,4 @@
-"""A recorded bus: a host hears what the host of a log heard, with the delays of then.
+"""A recorded bus: a host hears what the host of a recording heard, with the delays of then.
 
 - An instruction that was sent in the recording gets what was heard after it then, bytes, errors, noise and
   silence; each time what came the next time, and behind the end of the recording the last again.
@@ -11,11 +11,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.line import Transmission
-from dxlsim.bus.recording import Heard, Recording
+from dxlsim.bus.recording import Heard, RecordedPackets, Recording
 from dxlsim.bus.simulated_bus import RATE_TOLERANCE, SimulatedBus
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.simulation_plan import BusConfig
@@ -35,14 +34,19 @@ _ANSWER_NS = 500_000  # Delay of an answer that is put together: Return Delay Ti
 
 
 class RecordedBus(SimulatedBus):
-    """The line of a recording, without servos. Raises LogError where the log cannot be read."""
+    """The line of a recording, without servos. Raises InputError where the recording has no instruction."""
 
     def __init__(
-        self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
+        self,
+        config: BusConfig,
+        ledger: Ledger,
+        start_ns: int,
+        packets: RecordedPackets,
+        mechanics: Mechanics | None = None,
     ) -> None:
         super().__init__(config, ledger, start_ns, mechanics)
         self._recorded_rate = config.baud_rate
-        self._recording = Recording(Path(config.recorded), config.name, config.baud_rate)
+        self._recording = Recording(packets, config.baud_rate)
         self._reads = tuple(self._recorded_reads())
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:

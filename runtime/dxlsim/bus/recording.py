@@ -1,18 +1,27 @@
-"""Recording of a bus: what a host asked on it, and what it heard each time, from a log of dxlrun."""
+"""Recording of a bus: what a host asked on it, and what it heard each time."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from dxlrun.errors import LogError
-from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import open_log
-from dxlwire.packets import PacketKind
+from dxlwire.errors import InputError
+
+
+class RecordedPackets(msgspec.Struct, frozen=True):
+    """Packets that passed one bus, in any order: one row each. Times are ns of one clock."""
+
+    is_instruction: NDArray[np.bool_]  # True: the host sent it; False: the host received it
+    first_ns: NDArray[np.int64]  # Before the write that sent it; after the read that brought its first byte
+    last_ns: NDArray[np.int64]  # After the write; after the read that brought its last byte
+    start: NDArray[np.int64]  # Index in `data` of its first byte
+    length: NDArray[np.int64]  # Bytes
+    data: bytes  # Of all packets, and possibly of others
 
 
 class Heard(NamedTuple):
@@ -25,22 +34,18 @@ class Heard(NamedTuple):
 class Recording:
     """Every instruction of a bus with what was heard after it, in order; each is given once, the last again.
 
-    What was heard before the next instruction belongs to the one before it. Raises LogError.
+    What was heard before the next instruction belongs to the one before it. Raises InputError where there is
+    no instruction.
     """
 
-    def __init__(self, path: Path, bus: str, baud_rate: int) -> None:
-        pieces = []
-        for piece in open_log(path).slices():
-            if bus not in piece.buses:
-                raise LogError(f"{path}: the log has no bus {bus}")
-            pieces.append(piece.packets.take(piece.packets.bus == piece.buses.index(bus)).compact())
-        packets = PacketColumns.joined(pieces)
-        packets = packets.take(np.argsort(packets.first_ns, kind="stable")).compact()
-        first_ns, last_ns, start, length = packets.first_ns, packets.last_ns, packets.start, packets.length
-        data, asked = packets.data.tobytes(), packets.kind == PacketKind.INSTRUCTION
+    def __init__(self, packets: RecordedPackets, baud_rate: int) -> None:
+        order = np.argsort(packets.first_ns, kind="stable")
+        first_ns, last_ns = packets.first_ns[order], packets.last_ns[order]
+        start, length = packets.start[order], packets.length[order]
+        data, asked = packets.data, packets.is_instruction[order]
         rows = np.flatnonzero(asked)
         if not len(rows):
-            raise LogError(f"{path}: no instruction was sent on bus {bus}, so there is nothing to answer")
+            raise InputError("no instruction was sent on the recorded bus, so there is nothing to answer")
         wire_ns = length[rows] * 10_000_000_000 // baud_rate
         behind = np.cumsum(wire_ns)
         # several that were written together pass the wire one after the other

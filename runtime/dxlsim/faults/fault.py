@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import msgspec
 
-from dxlrun.errors import InputError, suggestion
 from dxlsim.faults.kinds import DEVICE, KINDS, Kind
 from dxlsim.faults.values import READERS, Value
+from dxlwire.errors import InputError, suggestion
 
 
 class Fault(msgspec.Struct, frozen=True):

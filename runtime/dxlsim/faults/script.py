@@ -7,11 +7,11 @@ from functools import partial
 from keyword import iskeyword
 from random import Random
 
-from dxlrun.errors import InputError
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import Fault
 from dxlsim.faults.kinds import DEVICE, KINDS, SERVO, WHEN, Happening, Holds
 from dxlsim.faults.values import Value
+from dxlwire.errors import InputError
 
 
 class FaultScript:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
+from dxlsim.duration import parse_duration
+
 Value = int | float | str | bytes | tuple[str, ...]
 
 SHORTEST_PAUSE_NS = 100_000  # A babbling servo without pauses would leave the simulation no time
@@ -45,14 +47,7 @@ def _number(lowest: float, highest: float) -> Callable[[str], Value]:
 
 
 def _time(least_ns: int, asked: str) -> Callable[[str], Value]:
-    return _read(_nanoseconds, lambda value: value >= least_ns, f"a time {asked}")
-
-
-def _nanoseconds(text: str) -> int:
-    # not above: the process of the simulated buses needs pydantic for nothing else, and it is slow
-    from dxlrun.description.units import duration
-
-    return duration(text)
+    return _read(parse_duration, lambda value: value >= least_ns, f"a time {asked}")
 
 
 def _degrees(text: str) -> float:

@@ -13,7 +13,7 @@ from xml.parsers import expat
 
 import msgspec
 
-from dxlrun.errors import InputError, Mark, Problem, suggestion
+from dxlwire.errors import InputError, Mark, Problem, suggestion
 
 Vector: TypeAlias = "tuple[float, float, float]"
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]

@@ -9,11 +9,11 @@ test compares. The URDF's first link stands still at the world's origin, z up.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Protocol
 
 import msgspec
 import numpy as np
 
-from dxlrun.channels.slot import SlotWriter
 from dxlsim.geometry import urdf as frames
 from dxlsim.geometry.transform import (
     NO_TURN,
@@ -148,17 +148,27 @@ def _moved(sensed: SensedBodies) -> tuple[tuple[str, ...], Floats, Floats]:
     return tuple(names), np.array(rows).reshape(-1, count), np.array(offsets)
 
 
-class ShaftsShown:
-    """Leaves in a slot how the shafts move, for processes of sensors, after each step of the mechanics."""
+class ShaftSink(Protocol):
+    """Takes the newest state of all shafts."""
 
-    def __init__(self, mechanics: Mechanics, writer: SlotWriter) -> None:
-        self._mechanics, self._writer = mechanics, writer
-        self._values = np.zeros(writer.values).reshape(3, -1)
+    values: int
+    """Length of the arrays that it takes: angle, velocity and acceleration of each shaft."""
+
+    def write(self, t_ns: int, values: Floats) -> None:
+        """Take the angles, rad, then the velocities, rad/s, then the accelerations, rad/s^2; never waits."""
+
+
+class ShaftsShown:
+    """Gives a sink how the shafts move, for processes of sensors, after each step of the mechanics."""
+
+    def __init__(self, mechanics: Mechanics, sink: ShaftSink) -> None:
+        self._mechanics, self._sink = mechanics, sink
+        self._values = np.zeros(sink.values).reshape(3, -1)
         self._shown_ns = -1
         mechanics.sense()
 
     def show(self) -> None:
-        """Write the slot if the mechanics are further than the last time."""
+        """Write the sink if the mechanics are further than the last time."""
         mechanics, values = self._mechanics, self._values
         if mechanics.grid_ns == self._shown_ns:
             return
@@ -166,7 +176,7 @@ class ShaftsShown:
         values[0] = mechanics.plant.angle[:count]
         values[1] = mechanics.plant.velocity[:count]
         values[2] = mechanics.acceleration[:count]
-        self._writer.write(mechanics.grid_ns, values.ravel())
+        self._sink.write(mechanics.grid_ns, values.ravel())
 
 
 class SensedBody:

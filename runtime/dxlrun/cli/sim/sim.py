@@ -231,6 +231,7 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 
     Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
     """
+    from dxlrun.run.simulation_process import read_recordings
     from dxlsim.bus.ledger import Ledger
     from dxlsim.bus.recorded_bus import RecordedBus
     from dxlsim.bus.simulated_bus import SimulatedBus
@@ -238,7 +239,13 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 
     ledger = Ledger(keep=False)
     try:
-        tried = [(RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, 0) for bus in buses]
+        recordings = read_recordings(buses)
+        tried = [
+            RecordedBus(bus, ledger, 0, recordings[bus.name])
+            if bus.recorded
+            else SimulatedBus(bus, ledger, 0)
+            for bus in buses
+        ]
     except ValueError as error:
         raise InputError(f"a servo cannot be simulated: {error}") from error
     FaultScript(faults, seed).attach(tried)

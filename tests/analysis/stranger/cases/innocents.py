@@ -155,7 +155,7 @@ def compiler_beside(story: Story) -> None:
 @case("machine", "x_fast ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
 def simulation_is_starved(story: Story) -> None:
     """The process of the simulated servos gets no processor for 120 ms, again and again."""
-    story.disturb = partial(stop_for_moments, what="dxlsim", for_s=0.12, every_s=0.7)
+    story.disturb = partial(stop_for_moments, what="simulation_process", for_s=0.12, every_s=0.7)
 
 
 @case(

@@ -1,4 +1,4 @@
-"""`python -m dxlsim`: the process of the simulated buses, one pseudo-terminal each, in real time.
+"""The process of the simulated buses, one pseudo-terminal each, in real time.
 
 It runs until the other end of the control socket is closed. It sends the ports when it is ready, or an error
 and ends; then it answers requests, and reports each fault as it happens and the ports when they changed:
@@ -7,7 +7,9 @@ and ends; then it answers requests, and reports each fault as it happens and the
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from msgspec.json import Decoder
@@ -17,10 +19,12 @@ from dxlrun.channels.heartbeat import SimulationProgress
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import DxlrunError
+from dxlrun.run.ledger_file import open_ledger
 from dxlsim import realtime
-from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.recording import RecordedPackets
 from dxlsim.messages import Request, SimulationJob, SimulationMessage
-from dxlsim.server import Server
+from dxlsim.server import Server, wake_on_signals
+from dxlsim.simulation_plan import BusConfig
 from dxlwire.control_table import add_control_table
 
 
@@ -32,22 +36,38 @@ def main() -> int:
     job, starter = process.begun(SimulationJob, Decoder(Request))
     for text in dict.fromkeys(text for bus in job.config.buses for text in bus.control_tables):
         add_control_table(text)
-    with Ledger(Path(job.ledger) if job.ledger else None, keep=False) as ledger:
+    with open_ledger(Path(job.ledger) if job.ledger else None) as ledger:
         try:
             shafts = None if job.shafts < 0 else SlotWriter(mapped(job.shafts))
             progress = None if job.progress < 0 else SimulationProgress(job.progress)
-            server = Server(job.config, ledger, starter, shafts, progress)
+            recordings = read_recordings(job.config.buses)
+            server = Server(
+                job.config, ledger, starter, shafts=shafts, progress=progress, recordings=recordings
+            )
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             starter.send(SimulationMessage(error=str(error)))
             return 2
         granted = realtime.prepare(job.priority, job.core)
         if job.priority or job.core >= 0:
             ledger.add(server.start_ns, "", "note", note=f"real time: {granted}")
-        server.run(granted)
+        with wake_on_signals(signal.SIGTERM) as wake:
+            server.run(granted, wake.fileno())
     if ledger.error is None:
         return 0
     print(ledger.error, file=sys.stderr)
     return 1
+
+
+def read_recordings(buses: Iterable[BusConfig]) -> Mapping[str, RecordedPackets]:
+    """Return the packets of the buses that are recorded. Raises LogError."""
+    recorded = [bus for bus in buses if bus.recorded]
+    if not recorded:
+        return {}
+    from dxlrun.log.recorded_packets import (
+        read_recorded_packets,  # not above: no other simulation reads a log
+    )
+
+    return {bus.name: read_recorded_packets(Path(bus.recorded), bus.name) for bus in recorded}
 
 
 if __name__ == "__main__":

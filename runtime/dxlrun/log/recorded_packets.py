@@ -1,0 +1,26 @@
+"""The packets of one bus of a log, for a simulated bus that answers with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dxlrun.channels.packets import PacketKind
+from dxlrun.errors import LogError
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.reader import open_log
+from dxlsim.bus.recording import RecordedPackets
+
+
+def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
+    """Return what passed a bus. Raises LogError for a log that cannot be read, or has no such bus."""
+    pieces = []
+    for piece in open_log(path).slices():
+        if bus not in piece.buses:
+            raise LogError(f"{path}: the log has no bus {bus}")
+        pieces.append(piece.packets.take(piece.packets.bus == piece.buses.index(bus)).compact())
+    packets = PacketColumns.joined(pieces)
+    asked = packets.kind == PacketKind.INSTRUCTION
+    if not asked.any():
+        raise LogError(f"{path}: no instruction was sent on bus {bus}, so there is nothing to answer")
+    data = packets.data.tobytes()
+    return RecordedPackets(asked, packets.first_ns, packets.last_ns, packets.start, packets.length, data)
