@@ -21,7 +21,7 @@ RUN_TIME = {
     "dxlrun.control": ("gate", "loop", "realtime", "safe_motion", "steering"),
     "dxlrun.dynamixel": ("hardware", "servo/life", "servo/servos", "tools"),
     "dxlrun.log": ("recorder", "log_writer", "reader"),
-    "dxlsim": ("bus", "pseudo_terminal", "server"),
+    "dxlsim": ("bus", "serving"),
     "dxlwire": ("exchange", "port"),
 }
 """Rooms of which `check` needs the plans, and the parts that it does not."""
@@ -68,6 +68,6 @@ def test_check_imports_what_it_uses(checked: set[str]) -> None:
 
 def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
     ran = loaded("robots/bioloid_torso.yaml", "--virtual", "--duration", "0.1", "--no-record")
-    assert "dxlsim.server" not in ran
+    assert "dxlsim.serving.server" not in ran
     assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "rich", "dxlrun.remote") == set()
     assert "dxlrun.run.virtual_run" in ran

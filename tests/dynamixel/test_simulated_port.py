@@ -12,7 +12,7 @@ from dxlrun.channels.heartbeat import (
     SimulationProgress,
     create_progress,
 )
-from dxlsim.host import ENDLESS_NS
+from dxlsim.serving.host import ENDLESS_NS
 from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
 MS = 1_000_000

@@ -11,9 +11,9 @@ import pytest
 
 from dxlrun.cli import main
 from dxlrun.errors import InputError
+from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.run.ledger_file import open_ledger
 from dxlrun.run.run_log import discard_log, new_log
 
 

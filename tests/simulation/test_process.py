@@ -20,9 +20,9 @@ from tests.kit.bus_process import PATIENCE_S, bare, opened, receive
 
 from dxlsim.bus.ledger import Ledger, read_ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.realtime import PollBudget
-from dxlsim.server import _WRITTEN, lateness_us
+from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
+from dxlsim.serving.realtime import PollBudget
+from dxlsim.serving.server import _WRITTEN, lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlwire.control_table import control_table
 

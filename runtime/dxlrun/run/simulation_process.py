@@ -19,11 +19,11 @@ from dxlrun.channels.heartbeat import SimulationProgress
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import DxlrunError
-from dxlrun.run.ledger_file import open_ledger
-from dxlsim import realtime
+from dxlrun.log.ledger_file import open_ledger
 from dxlsim.bus.recording import RecordedPackets
 from dxlsim.messages import Request, SimulationJob, SimulationMessage
-from dxlsim.server import Server, wake_on_signals
+from dxlsim.serving import realtime
+from dxlsim.serving.server import Server, wake_on_signals
 from dxlsim.simulation_plan import BusConfig
 from dxlwire.control_table import add_control_table
 

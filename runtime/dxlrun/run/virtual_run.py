@@ -24,12 +24,12 @@ from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import DxlrunError, InputError, PortError
+from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
-from dxlrun.run.ledger_file import open_ledger
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
 from dxlsim.bus.ledger import Ledger

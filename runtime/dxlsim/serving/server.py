@@ -18,13 +18,13 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.device.on_links import fix_to_links
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-from dxlsim.host import ENDLESS_NS, LineProgress, Progress, Starter
 from dxlsim.messages import ServoLook, SimulationMessage
 from dxlsim.motion.body import ShaftSink, ShaftsShown
 from dxlsim.motion.mechanics import Mechanics, plant_of
-from dxlsim.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.realtime import PollBudget
 from dxlsim.registers.memory import Memory
+from dxlsim.serving.host import ENDLESS_NS, LineProgress, Progress, Starter
+from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
+from dxlsim.serving.realtime import PollBudget
 from dxlsim.simulation_plan import SimulationConfig
 from dxlwire.errors import InputError
 
