@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import open_log
 from dxlsim.bus.recording import RecordedPackets
+from dxlwire.packets import PacketKind
 
 
 def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
