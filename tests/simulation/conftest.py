@@ -1,4 +1,4 @@
-"""A host of a few lines that talks to a simulated bus; its packets are put together here, by hand."""
+"""The process of simulated buses that a run starts, and lines on virtual time."""
 
 from __future__ import annotations
 
@@ -9,235 +9,22 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, ClassVar, NamedTuple
+from typing import IO, Any
 
 import pytest
 from tests.kit.bus_process import PATIENCE_S, bare
-from tests.kit.packets import crc, packet1, packet2
+from tests.kit.simulated_line import Line2, build_line
 
-from dxlsim.bus.ledger import Ledger, LedgerEntry, read_ledger
-from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
-from dxlsim.virtual_ports import VirtualPorts
-from dxlwire.clock import VirtualClock
-
-
-class Answer(NamedTuple):
-    servo_id: int
-    error: int
-    parameters: bytes
-
-
-@dataclass
-class Line:
-    """One bus with an open port, on virtual time."""
-
-    WORD: ClassVar[int] = 1  # bytes of an address, and of a length
-
-    clock: VirtualClock
-    bus: SimulatedBus
-    ledger: Ledger
-    ports: VirtualPorts
-
-    def send(self, servo_id: int, instruction: int, *parameters: int) -> None:
-        self.ports.ports[0].write(packet1(servo_id, instruction, *parameters))
-
-    def receive(self, wait_ns: int = 10_000_000) -> bytes:
-        """Return everything that arrives in a time."""
-        deadline = self.clock.now_ns() + wait_ns
-        received = bytearray()
-        buffer = memoryview(bytearray(4096))
-        while self.ports.wait(deadline):
-            received += buffer[: self.ports.ports[0].read_into(buffer)]
-        return bytes(received)
-
-    def ask(self, servo_id: int, instruction: int, *parameters: int) -> Answer | None:
-        """Send an instruction; return the one status packet that answers it, None for silence."""
-        self.send(servo_id, instruction, *parameters)
-        received = self.receive()
-        if not received:
-            return None
-        assert received[:2] == b"\xff\xff"
-        assert received[3] == len(received) - 4
-        assert sum(received[2:]) & 0xFF == 0xFF
-        return Answer(received[2], received[4], received[5:-1])
-
-    def write(self, servo_id: int, address: int, *data: int) -> int:
-        """Write bytes and return the error byte of the answer."""
-        answer = self.ask(servo_id, 0x03, address, *data)
-        assert answer is not None
-        return answer.error
-
-    def read(self, servo_id: int, address: int, size: int) -> int:
-        """Return an item as the integer of the wire."""
-        answer = self.ask(servo_id, 0x02, address, size)
-        assert answer is not None
-        return int.from_bytes(answer.parameters, "little")
-
-    def item(self, name: str, servo_id: int = 1) -> Any:
-        """Return what the control table has about an item."""
-        return self.bus.servo(servo_id).registers.table.items[name]
-
-    def set(self, name: str, wire: int, servo_id: int = 1) -> int:
-        """Write an item by name, as the integer of the wire; return the error."""
-        item = self.item(name, servo_id)
-        return self.write(
-            servo_id, item.address, *(wire & (1 << 8 * item.size) - 1).to_bytes(item.size, "little")
-        )
-
-    def get(self, name: str, servo_id: int = 1) -> int:
-        """Read an item by name, as the integer of the wire."""
-        item = self.item(name, servo_id)
-        return self.read(servo_id, item.address, item.size)
-
-    def at(self, name: str, value: int | None = None) -> bytes:
-        """Return the parameters that read an item, or write a value into it."""
-        item = self.item(name)
-        parts = ((item.address, self.WORD), (item.size, self.WORD) if value is None else (value, item.size))
-        return b"".join(number.to_bytes(size, "little") for number, size in parts)
-
-    def request(self, servo_id: int, instruction: int, parameters: bytes = b"") -> Answer | None:
-        """Send an instruction; return the one status packet that answers it, None for silence."""
-        return self.ask(servo_id, instruction, *parameters)
-
-    def put(self, **items: int) -> None:
-        """Write items of servo 1 by name, one after the other; none may be refused."""
-        for name, value in items.items():
-            assert not self.set(name, value) & 0x7F, name
-
-    def wait(self, seconds: float) -> None:
-        self.clock.wait_until(self.clock.now_ns() + round(seconds * 1e9))
-
-    def notes(self) -> list[str]:
-        return [entry.note for entry in self.ledger.entries if entry.direction == "note"]
-
-    def servo(self, servo_id: int = 1) -> SimulatedServo:
-        self.bus.advance(self.clock.now_ns())
-        return self.bus.servo(servo_id)
-
-
-class Line2(Line):
-    """One bus of Protocol 2.0."""
-
-    WORD = 2
-
-    def instruct(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
-        self.ports.ports[0].write(packet2(servo_id, instruction, parameters))
-
-    def statuses(self, wait_ns: int = 10_000_000) -> list[Answer]:
-        """Return the status packets that arrive in a time; nothing else may."""
-        received, answers = self.receive(wait_ns), []
-        while received:
-            assert received[:4] == b"\xff\xff\xfd\x00"
-            size = 7 + int.from_bytes(received[5:7], "little")
-            status, received = received[:size], received[size:]
-            assert status[7] == 0x55
-            assert crc(status[:-2]) == int.from_bytes(status[-2:], "little")
-            parameters = status[9:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
-            answers.append(Answer(status[4], status[8], parameters))
-        return answers
-
-    def request(self, servo_id: int, instruction: int, parameters: bytes = b"") -> Answer | None:
-        """Send an instruction; return the one status packet that answers it, None for silence."""
-        self.instruct(servo_id, instruction, parameters)
-        answers = self.statuses()
-        assert len(answers) < 2
-        return answers[0] if answers else None
-
-    def write_bytes(self, servo_id: int, address: int, data: bytes) -> int:
-        """Write bytes and return the error of the answer."""
-        answer = self.request(servo_id, 0x03, address.to_bytes(2, "little") + data)
-        assert answer is not None
-        return answer.error
-
-    def read_bytes(self, servo_id: int, address: int, size: int) -> bytes:
-        answer = self.request(servo_id, 0x02, address.to_bytes(2, "little") + size.to_bytes(2, "little"))
-        assert answer is not None
-        assert not answer.error & 0x7F
-        return answer.parameters
-
-    def set(self, name: str, value: int, servo_id: int = 1) -> int:
-        """Write an item by name, in ticks; return the error."""
-        item = self.item(name, servo_id)
-        return self.write_bytes(servo_id, item.address, item.encode(value))
-
-    def get(self, name: str, servo_id: int = 1) -> int:
-        """Read an item by name, in ticks."""
-        item = self.item(name, servo_id)
-        return item.decode(self.read_bytes(servo_id, item.address, item.size))
-
-
-def build_line(
-    kind: type[Line],
-    protocol: float,
-    ids: tuple[int, ...],
-    model: str,
-    *,
-    baud_rate: int = 1_000_000,
-    position: float = 2.0,
-    return_delay_ns: int = 500_000,
-    start_ns: int = 0,
-    load: Load | None = None,
-    firmware: int | None = None,
-    write_time_ns: int = 0,
-) -> Line:
-    clock = VirtualClock(start_ns)
-    ledger = Ledger()
-    servos = tuple(
-        ServoConfig(
-            servo_id,
-            model,
-            position,
-            return_delay_ns,
-            load or Load(),
-            firmware,
-            times=ServoTimes(write_time_ns=write_time_ns),
-        )
-        for servo_id in ids
-    )
-    bus = SimulatedBus(BusConfig("main", baud_rate, servos, protocol), ledger, start_ns)
-    return kind(clock, bus, ledger, VirtualPorts(clock, (bus,)))
+from dxlsim.bus.ledger import LedgerEntry, read_ledger
+from dxlsim.simulation_plan import BusConfig
 
 
 @pytest.fixture
-def make_line() -> Callable[..., Line]:
-    def make(ids: tuple[int, ...] = (1, 2), model: str = "AX-12A", **settings: Any) -> Line:
-        return build_line(Line, 1.0, ids, model, **settings)
-
-    return make
-
-
-@pytest.fixture
-def make_line2() -> Callable[..., Line]:
-    def make(ids: tuple[int, ...] = (1, 2), model: str = "XM430-W350", **settings: Any) -> Line:
+def make_line2() -> Callable[..., Line2]:
+    def make(ids: tuple[int, ...] = (1, 2), model: str = "XM430-W350", **settings: Any) -> Line2:
         return build_line(Line2, 2.0, ids, model, **settings)
 
     return make
-
-
-@pytest.fixture
-def line_of(make_line: Callable[..., Line], make_line2: Callable[..., Line]) -> Callable[..., Line]:
-    """Return a line of Protocol 1 or 2."""
-    return lambda protocol, *ids_and_model, **settings: (make_line if protocol == 1 else make_line2)(
-        *ids_and_model, **settings
-    )
-
-
-@pytest.fixture(params=[1, 2])
-def both(request: Any, line_of: Callable[..., Line]) -> Line:
-    """A line of each protocol."""
-    return line_of(request.param)
-
-
-@pytest.fixture
-def line2(make_line2: Callable[..., Line]) -> Line:
-    return make_line2()
-
-
-@pytest.fixture
-def line(make_line: Callable[..., Line]) -> Line:
-    return make_line()
 
 
 @dataclass

@@ -230,3 +230,18 @@ def test_a_quaternion_is_brought_to_length_one_or_is_none() -> None:
 def test_of_two_quaternions_the_nearer_one_is_taken() -> None:
     assert near((0.0, 0.0, 0.6, 0.8), (0.0, 0.0, -0.6, -0.8)) == (0, 0, -0.6, -0.8)
     assert near((0.0, 0.0, 0.6, 0.8), (0.0, 0.0, 0.5, 0.1)) == (0, 0, 0.6, 0.8)
+
+
+def test_last_joint_of_a_long_chain_of_mimic_joints_moves_with_the_first() -> None:
+    names = [f"j{number}" for number in range(1500)]
+    links = "".join(f'<link name="{name}"/>' for name in ("base", *names))
+
+    def joint(name: str, followed: str) -> str:
+        mimic = f'<mimic joint="{followed}" multiplier="-1" offset="1"/>' if followed else ""
+        ends = f'<parent link="base"/><child link="{name}"/>'
+        return f'<joint name="{name}" type="revolute">{ends}{mimic}</joint>'
+
+    joints = "".join(map(joint, names, [*names[1:], ""]))
+    tree = FrameTree(read_urdf(f"<robot>{links}{joints}</robot>"), ["j1499"])
+    assert tree.position("j0", {"j1499": 0.25}) == pytest.approx(0.75)
+    assert {frame.moved_by for frame in tree.frames[1:]} == {"servo", "mimic"}

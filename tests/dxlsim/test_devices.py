@@ -7,13 +7,13 @@ import struct
 
 import pytest
 
-from dxlrun.errors import InputError
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.device.measured import on_the_wire
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import BusConfig, DeviceConfig, Shown
+from dxlwire.errors import InputError
 
 PING, READ, WRITE, REBOOT, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x08, 0x82, 0x83
 FAST_SYNC_READ, BULK_READ = 0x8A, 0x92

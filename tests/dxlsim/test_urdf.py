@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.description.frames.tree import FrameTree
-from dxlrun.errors import InputError
-from dxlsim.geometry.urdf import Mimic, UrdfLimits, read_urdf
+from dxlsim.geometry.urdf import Mimic, UrdfLimits, leader, read_urdf
+from dxlwire.errors import InputError
 
 ARM = """\
 <robot name="arm">
@@ -160,9 +159,10 @@ def test_mimic_joints_in_a_circle_are_named_once_and_a_long_chain_of_them_is_fin
         return f'<joint name="{name}" type="revolute">{ends}{mimic}</joint>'
 
     chain = "".join(map(joint, names, last))
-    tree = FrameTree(read_urdf(f"<robot>{links}{chain}</robot>"), ["j1499"])
-    assert tree.position("j0", {"j1499": 0.25}) == pytest.approx(0.75)
-    assert {frame.moved_by for frame in tree.frames[1:]} == {"servo", "mimic"}
+    joints = {each.name: each for each in read_urdf(f"<robot>{links}{chain}</robot>").joints}
+    followed, scale, offset = leader(joints, joints["j0"], ["j1499"])
+    assert followed.name == "j1499"
+    assert scale * 0.25 + offset == pytest.approx(0.75)
     circle = "".join(map(joint, names, [*names[1:], "j1497"]))
     with pytest.raises(InputError) as caught:
         read_urdf(f"<robot>{links}{circle}</robot>")
@@ -179,7 +179,7 @@ def test_a_comment_does_not_hide_a_doctype() -> None:
 
 
 def test_the_torso_has_the_tree_of_the_thesis() -> None:
-    urdf = read_urdf((Path(__file__).parents[3] / "robots" / "urdf/bioloid_torso.urdf").read_text())
+    urdf = read_urdf((Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text())
 
     assert urdf.links[:4] == ("world", "odom", "imu", "base_link")
     turning = [joint for joint in urdf.joints if joint.moves]

@@ -14,11 +14,11 @@ import numpy.typing as npt
 import pytest
 from msgspec import structs
 
-from dxlrun import MotorModel, Stribeck
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
 from dxlsim.motion.plant import IndependentJoints, PlantJoint
 from dxlsim.motion.shaft import critical_d
+from dxlsim.motor_model import MotorModel, Stribeck
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import Load, ServoConfig

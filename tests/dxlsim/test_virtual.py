@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import pytest
 
-from dxlrun.errors import PortError
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
+from dxlwire.errors import PortError
 from dxlwire.port.ports import Ports
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")

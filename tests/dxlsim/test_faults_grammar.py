@@ -7,11 +7,11 @@ import random
 import pytest
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.errors import InputError
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.kinds import DEVICE, KINDS
 from dxlsim.faults.script import FaultScript
 from dxlsim.faults.values import READERS
+from dxlwire.errors import InputError
 
 MS = 1_000_000
 VALUES: dict[str, tuple[str, ...]] = {

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from dxlrun.errors import InputError
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import parse_fault
@@ -17,6 +16,7 @@ from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
+from dxlwire.errors import InputError
 
 READ = 0x02
 MS = 1_000_000

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from dxlrun.errors import InputError
 from dxlsim.faults.fault import fault_help, parse_fault
 from dxlsim.faults.kinds import KINDS
 from dxlsim.faults.values import READERS
+from dxlwire.errors import InputError
 
 LINES = (
     "lose servo=3 at=2s",

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.packets import packet1, packet2
 
-from dxlrun.errors import PortError
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
+from dxlwire.errors import PortError
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

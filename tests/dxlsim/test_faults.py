@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.errors import InputError, PortError
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
+from dxlwire.errors import InputError, PortError
 
 PING, READ, WRITE = 0x01, 0x02, 0x03
 TORQUE_ENABLE, LED = 24, 25
