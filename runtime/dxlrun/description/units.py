@@ -25,7 +25,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dxlrun.description.form import refuse
 from dxlrun.description.mistakes.syntax import list_text
-from dxlsim.duration import DURATION_NS, LONGEST_NS, LONGEST_QUANTITY, nanoseconds, split_quantity
+from dxlsim.texts.duration import DURATION_NS, LONGEST_NS, LONGEST_QUANTITY, nanoseconds, split_quantity
 from dxlwire.joint_unit import JointUnit
 
 

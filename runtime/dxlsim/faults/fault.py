@@ -50,6 +50,9 @@ def parse_fault(text: str) -> Fault:
     """Return the fault of one line such as `silence servo=3 at=1s for=500ms`.
 
     Raises InputError with one sentence: what is wrong and how to write it.
+
+    >>> str(parse_fault("silence for=500ms servo=3 at=1.0s"))
+    'silence servo=3 at=1s for=500ms'
     """
     words = text.split()
     if not words:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
-from dxlsim.duration import parse_duration
+from dxlsim.texts.duration import parse_duration
 
 Value = int | float | str | bytes | tuple[str, ...]
 
