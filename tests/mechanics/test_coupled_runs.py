@@ -13,9 +13,9 @@ from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.compile.simulation import simulation_of
-from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
-from dxlrun.dynamixel.mechanics.joint_hardware import ServosTogether
 from dxlrun.errors import StartUpError
+from dxlrun.features.mechanics.joint_arrays import JointArrays
+from dxlrun.features.mechanics.joint_hardware import ServosTogether
 from dxlrun.log.reader import read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot

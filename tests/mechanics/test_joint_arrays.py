@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.cycle import Commands, States, Torque
-from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.features.mechanics.joint_arrays import JointArrays
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.modes import Mode

@@ -11,8 +11,8 @@ from tests.kit.rigs import Events
 
 from dxlrun.channels.cycle import Commands, States, Torque
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
-from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
+from dxlrun.features.mechanics.joint_arrays import JointArrays
+from dxlrun.features.mechanics.joint_hardware import JointHardware, ServosTogether
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.modes import Mode
 

@@ -13,6 +13,7 @@ from dxlrun.features.feature import Feature, S
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
     Feature("sensors", "dxlrun.features.sensors"),
+    Feature("mechanics", "dxlrun.features.mechanics"),
 )
 """In the order in which every stage asks them; their states are in the cycle's record in this order."""
 

@@ -22,8 +22,7 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
-from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
+from dxlrun.dynamixel.hardware_layer import HardwareLayers
 from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.clock import Clock
@@ -126,28 +125,22 @@ def assemble(
     `slots`: what the plan's sensors write into.
     """
     record = CycleRecord(plan.loop.layout)
-    states, goals = record.states, record.goals
-    arrays = together = None
-    if plan.mechanics.coupled:
-        arrays = JointArrays(plan.mechanics, record.states, record.goals)
-        together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, sinks.events)
-        states, goals = arrays.servo_states, arrays.servo_goals
-    hardware: Hardware = DynamixelHardware(
+    layers = HardwareLayers(plan, record.states, record.goals, sinks.events)
+    servos = DynamixelHardware(
         plan.buses,
         ports,
         clock,
-        states,
-        goals,
+        layers.states,
+        layers.goals,
         sinks.packets,
         sinks.events,
         beat,
         take_over=take_over,
         sources=record.sources,
         device_commands=record.device_command,
-        refusals=None if together is None else together.at_start,
+        refusals=layers.refusals,
     )
-    if arrays is not None and together is not None:
-        hardware = JointHardware(hardware, plan.mechanics, arrays, together, plan.loop.period_ns)
+    hardware = layers.build(servos)
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(
         plan.loop,

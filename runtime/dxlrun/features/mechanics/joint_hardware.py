@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import LIMP, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.contract.hardware import Hardware
-from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.dynamixel.hardware_layer import HardwareLayer
+from dxlrun.features.mechanics.joint_arrays import JointArrays
 from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlwire.bus_plan import BusPlan, ServoPlan
@@ -164,7 +165,7 @@ class ServosTogether:
         )
 
 
-class JointHardware:
+class JointHardware(HardwareLayer):
     """Joints in front of a hardware of servos; `control.loop.Hardware` has the contract.
 
     The servos' hardware works on `arrays.servo_states` and `arrays.servo_goals`. A request for a joint is one
@@ -179,7 +180,7 @@ class JointHardware:
         together: ServosTogether,
         period_ns: int,
     ) -> None:
-        self._hardware = hardware
+        super().__init__(hardware)
         self._plan = plan
         self._arrays = arrays
         self._together = together
@@ -295,22 +296,6 @@ class JointHardware:
             self._hardware.reboot(servos[0], done)
         else:
             self._ask(index, "reboot", servos, done)
-
-    def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit."""
-        self._hardware.limit_torque(fraction)
-
-    def idle(self, until_ns: int) -> None:
-        """Use the idle time of the buses."""
-        self._hardware.idle(until_ns)
-
-    def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo."""
-        return self._hardware.stop()
-
-    def release(self) -> None:
-        """Leave the robot with its torque on."""
-        self._hardware.release()
 
     def _coupling(self, row: int) -> int | None:
         """Return the coupling that moves a joint; None: it has one servo."""

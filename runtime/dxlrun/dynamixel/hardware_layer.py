@@ -1,0 +1,142 @@
+"""Hardware layers: transforms between the joints of the loop and the servos, such as couplings of servos.
+
+A layer takes the goals of the layer above and gives the one below goals in arrays of its own, and the states
+the other way round, if it changes them. Without layers the servos' hardware has the arrays of the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.events import EventSink
+from dxlrun.contract.hardware import Hardware
+from dxlrun.features import stages
+from dxlrun.plan.loop_plan import ServoLimit
+from dxlrun.plan.robot_plan import Plan
+
+
+class HardwareLayer:
+    """Passes every request on to the hardware below.
+
+    A layer overrides what it changes. One that only transforms goals needs `start`, after which the goals
+    below are where the joints are, `write` and `follow_goals`.
+    """
+
+    def __init__(self, hardware: Hardware) -> None:
+        self._hardware = hardware
+
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
+        """Run the start-up sequence to torque on."""
+        self._hardware.start(engaging)
+
+    @property
+    def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
+        """The registers that limit the goals of each joint's servos."""
+        return self._hardware.servo_limits
+
+    def read(self) -> None:
+        """Fill the state arrays."""
+        self._hardware.read()
+
+    def write(self) -> None:
+        """Send the goal arrays."""
+        self._hardware.write()
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Bring joints into modes."""
+        self._hardware.set_modes(modes)
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+        """Write a RAM item of a joint's servo."""
+        self._hardware.set_register(row, item, value, done)
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        """Read an item of a joint's servo."""
+        self._hardware.read_register(row, item, done)
+
+    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
+        """Switch the torque of a joint."""
+        self._hardware.switch_torque(row, on, done)
+
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        """Let joints that were just given torque get goals."""
+        self._hardware.follow_goals(rows)
+
+    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+        """Reboot a joint's servo."""
+        self._hardware.reboot(row, done)
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit."""
+        self._hardware.limit_torque(fraction)
+
+    def idle(self, until_ns: int) -> None:
+        """Use the idle time of the buses."""
+        self._hardware.idle(until_ns)
+
+    def stop(self) -> tuple[str, ...]:
+        """Switch torque off on every servo."""
+        return self._hardware.stop()
+
+    def release(self) -> None:
+        """Leave the robot with its torque on."""
+        self._hardware.release()
+
+
+@dataclass(frozen=True)
+class PreparedLayer:
+    """A layer of this robot, before the hardware below it is built."""
+
+    states: States
+    """Filled by the hardware below."""
+    goals: Commands
+    """Sent by the hardware below."""
+    build: Callable[[Hardware], Hardware]
+    """Puts the layer in front of that hardware."""
+    refusals: Callable[[], Sequence[str]] | None = None
+    """Returns why the robot must not start where its servos are, one sentence each; None: it always may."""
+
+
+@dataclass(frozen=True)
+class LayerStage:
+    """`STAGE` of `layer.py`: called when a robot is assembled, before the hardware of its servos is built.
+
+    Features are asked in their order: the first is next to the loop, the last next to the servos. Each gets
+    the arrays of the layer above, and returns None where the plan has nothing for it to do.
+    """
+
+    FILE: ClassVar[str] = "layer"
+
+    prepare: Callable[[Plan, States, Commands, EventSink], PreparedLayer | None]
+
+
+class HardwareLayers:
+    """The layers that a robot needs, and the arrays of its servos below them."""
+
+    def __init__(self, plan: Plan, states: States, goals: Commands, events: EventSink) -> None:
+        self.states = states
+        self.goals = goals
+        self._layers: list[PreparedLayer] = []
+        for _, stage in stages(LayerStage):
+            layer = stage.prepare(plan, self.states, self.goals, events)
+            if layer is not None:
+                self._layers.append(layer)
+                self.states, self.goals = layer.states, layer.goals
+
+    @property
+    def refusals(self) -> Callable[[], Sequence[str]] | None:
+        """What is checked before any servo gets torque, from the lowest layer up; None: nothing is."""
+        checks = [one.refusals for one in reversed(self._layers) if one.refusals is not None]
+        return (lambda: [text for check in checks for text in check()]) if checks else None
+
+    def build(self, hardware: Hardware) -> Hardware:
+        """Put the layers in front of the servos' hardware; without any it is returned as it is."""
+        for layer in reversed(self._layers):
+            hardware = layer.build(hardware)
+        return hardware

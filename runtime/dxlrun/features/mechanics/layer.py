@@ -1,0 +1,27 @@
+"""Layer between joints and servos where several servos move a joint, or several joints share servos."""
+
+from __future__ import annotations
+
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.events import EventSink
+from dxlrun.dynamixel.hardware_layer import LayerStage, PreparedLayer
+from dxlrun.features.mechanics.joint_arrays import JointArrays
+from dxlrun.features.mechanics.joint_hardware import JointHardware, ServosTogether
+from dxlrun.plan.robot_plan import Plan
+
+
+def prepare_mechanics(plan: Plan, states: States, goals: Commands, events: EventSink) -> PreparedLayer | None:
+    """Return the layer of the couplings of a robot; None: each joint has a servo of its own."""
+    if not plan.mechanics.coupled:
+        return None
+    arrays = JointArrays(plan.mechanics, states, goals)
+    together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, events)
+    return PreparedLayer(
+        arrays.servo_states,
+        arrays.servo_goals,
+        lambda servos: JointHardware(servos, plan.mechanics, arrays, together, plan.loop.period_ns),
+        together.at_start,
+    )
+
+
+STAGE = LayerStage(prepare_mechanics)
