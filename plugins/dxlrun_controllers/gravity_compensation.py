@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal
 
@@ -11,12 +11,15 @@ import numpy as np
 from pydantic import Field
 
 from dxlrun import (
+    LINEAR,
     LIVE,
+    ROTARY,
     Context,
     Controller,
     Duration,
     Floats,
     Interfaces,
+    JointUnit,
     Length,
     Mass,
     Mismatch,
@@ -35,10 +38,11 @@ from dxlrun_controllers.joints import (
     row_of,
 )
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
-from dxlrun_controllers.laws.gravity import MOVABLE, SLIDING, Bodies, bodies_of, gravity_law, up_of
+from dxlrun_controllers.laws.gravity import MOVABLE, TYPES, Bodies, bodies_of, gravity_law, up_of
 
 STATE_NS: Final = 20_000_000
 """Between two messages of the state, ns."""
+_MOVE: Final[Mapping[JointUnit, str]] = {ROTARY: "turn", LINEAR: "slide"}
 
 
 class PayloadParameters(ParametersModel):
@@ -124,8 +128,8 @@ class GravityCompensation(Controller[GravityParameters]):
             bodies = bodies_of(robot.urdf)
             found = [
                 one
-                for joint, linear in zip(robot.joints, robot.linear, strict=True)
-                for one in _of_joint(bodies, joint, linear=linear)
+                for joint, unit in zip(robot.joints, robot.units, strict=True)
+                for one in _of_joint(bodies, joint, unit)
             ]
             found += _of_payload(bodies, parameters, robot.joints)
             if not found:
@@ -221,7 +225,7 @@ def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None
     return None if payload is None else (payload.link, payload.position)
 
 
-def _of_joint(bodies: Bodies, joint: str, *, linear: bool) -> Iterator[Mismatch]:
+def _of_joint(bodies: Bodies, joint: str, unit: JointUnit) -> Iterator[Mismatch]:
     """Yield what the URDF lacks of a joint."""
     if joint not in bodies.joints:
         yield Mismatch(
@@ -235,10 +239,10 @@ def _of_joint(bodies: Bodies, joint: str, *, linear: bool) -> Iterator[Mismatch]
             f"needs {joint} to move in the URDF, where it is {kind}", "make it revolute there", joint
         )
         return
-    if (kind == SLIDING) != linear:
+    if kind not in TYPES[unit]:
         yield Mismatch(
-            f"needs the URDF to {'slide' if linear else 'turn'} {joint}, where it is {kind}",
-            f"make it {SLIDING if linear else 'revolute'} there",
+            f"needs the URDF to {_MOVE[unit]} {joint}, where it is {kind}",
+            f"make it {TYPES[unit][0]} there",
             joint,
         )
         return

@@ -22,7 +22,9 @@ from pydantic import (
 )
 
 from dxlrun import (
+    LINEAR,
     LIVE,
+    ROTARY,
     Angle,
     AngularVelocity,
     CommandModel,
@@ -33,6 +35,7 @@ from dxlrun import (
     Goal,
     GoalTolerances,
     Interfaces,
+    JointUnit,
     Length,
     LinearVelocity,
     Mismatch,
@@ -76,8 +79,8 @@ class Width(ParametersModel):
 class GripperParameters(ParametersModel):
     """Keys of a gripper_controller in the robot file."""
 
-    _lengths: frozenset[str] = PrivateAttr(frozenset())
-    """Keys about the joint that are written as lengths"""
+    _units: Mapping[str, JointUnit] = PrivateAttr({})
+    """The joints that each key about the joint fits, as it is written"""
     joint: str
     """The joint that opens and closes it."""
     effort: Annotated[float, Field(gt=0)] | None = None
@@ -104,8 +107,12 @@ class GripperParameters(ParametersModel):
             widths = data.get("widths")
             angles = [each.get("angle") for each in widths if isinstance(each, Mapping)] if widths else []
             written = [*((key, data.get(key)) for key in _OF_THE_WAY), *(("widths", one) for one in angles)]
-            found._lengths = frozenset(key for key, value in written if _is_length(value))
+            found._units = {key: LINEAR for key, value in written if _is_length(value)}
         return found
+
+    def unit_of(self, key: str) -> JointUnit:
+        """Return the unit of the joints that a key fits, as it is written or by its default."""
+        return self._units.get(key, ROTARY)
 
     def mistakes(self) -> Iterator[Mistake]:
         """Yield what keeps the widths from following from the angle."""
@@ -123,13 +130,26 @@ class GripperParameters(ParametersModel):
 
 _OF_THE_WAY = ("speed", "tolerance", "stall_speed")
 """Keys whose defaults are of a joint that turns"""
+_FIXES: Mapping[JointUnit, Mapping[str, str]] = {
+    ROTARY: {},
+    LINEAR: {
+        "speed": "lengths, such as 50 mm/s",
+        "tolerance": "lengths, such as 0.5 mm",
+        "stall_speed": "lengths, such as 50 mm/s",
+        "widths": "lengths, such as {angle: 10 mm, width: 20 mm}",
+    },
+}
+_POSITIONS: Mapping[JointUnit, str] = {
+    ROTARY: "an angle, such as 20 deg",
+    LINEAR: "a length, such as 10 mm: its joint is linear",
+}
 
 
 class GripCommand(CommandModel):
     """A goal: a position of the joint or a width, and perhaps the most effort on the way and at it."""
 
-    _length: bool | None = PrivateAttr(None)
-    """True: the position is written as a length, False: as an angle"""
+    _unit: JointUnit | None = PrivateAttr(None)
+    """The joints that the position fits, as it is written; None: it is a number"""
     position: Annotated[float, or_number(TypeAdapter(Way))] | None = None
     """rad, of a linear joint m"""
     width: Annotated[float, or_number(TypeAdapter(Length))] | None = None
@@ -142,7 +162,7 @@ class GripCommand(CommandModel):
     def _noting_length(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
         found = handler(data)
         if isinstance(data, Mapping) and isinstance(position := data.get("position"), str):
-            found._length = _is_length(position)
+            found._unit = LINEAR if _is_length(position) else ROTARY
         return found
 
     @model_validator(mode="after")
@@ -188,19 +208,10 @@ class GripperController(Controller[GripperParameters]):
         """Yield each key whose unit is not that of the joint; the defaults are of one that turns."""
         needed = (*_OF_THE_WAY, *(["widths"] if parameters.widths else []))
         for key in needed:
-            if robot.linear[0] and key not in parameters._lengths:
-                example = (
-                    "50 mm/s"
-                    if "speed" in key
-                    else "{angle: 10 mm, width: 20 mm}"
-                    if key == "widths"
-                    else "0.5 mm"
-                )
-                what = f"moves {parameters.joint}, which is linear, but its {key} is of an angle"
-                yield Mismatch(what, f"write {key} as lengths, such as {example}", key)
-            elif not robot.linear[0] and key in parameters._lengths:
-                what = f"moves {parameters.joint}, which turns, but its {key} is of a length"
-                yield Mismatch(what, f"write {key} as angles", key)
+            unit, written = robot.units[0], parameters.unit_of(key)
+            if written is not unit:
+                what = f"moves {parameters.joint}, which {unit.verb}, but its {key} is of {written.quantity}"
+                yield Mismatch(what, f"write {key} as {_FIXES[unit].get(key, 'angles')}", key)
 
     @classmethod
     def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -218,10 +229,9 @@ class GripperController(Controller[GripperParameters]):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
             raise ValueError("its joint has no limit of effort; write one as `effort` in the robot file")
-        linear = "speed" in parameters._lengths
-        if command._length is not None and command._length != linear:
-            needed = "a length, such as 10 mm: its joint is linear" if linear else "an angle, such as 20 deg"
-            raise ValueError(f"the position must be {needed}")
+        unit = parameters.unit_of("speed")
+        if command._unit is not None and command._unit is not unit:
+            raise ValueError(f"the position must be {_POSITIONS[unit]}")
         effort = command.effort or parameters.effort or np.nan
         if command.width is None:
             return np.array([command.position, effort])
@@ -246,7 +256,7 @@ class GripperController(Controller[GripperParameters]):
         self._still, self._still_ns, self._heard_ns = np.nan, 0, 0
         """Where the gripper has been since, nearer than it may go in `stall_time`; and the last reply."""
         self._cancelled = self._stalled = False
-        self._unit = "m" if "speed" in self.parameters._lengths else "rad"
+        self._unit = self.parameters.unit_of("speed").value
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the gripper is."""

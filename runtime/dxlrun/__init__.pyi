@@ -42,7 +42,6 @@ from dxlrun.description.units import RestSpeed as RestSpeed
 from dxlrun.description.units import Time as Time
 from dxlrun.description.units import Tolerance as Tolerance
 from dxlrun.description.units import Voltage as Voltage
-from dxlrun.description.units import distance_text as distance_text
 from dxlrun.errors import ControllerFault as ControllerFault
 from dxlrun.errors import DxlrunError as DxlrunError
 from dxlrun.errors import GoalTimeout as GoalTimeout
@@ -70,3 +69,6 @@ from dxlsim.motion.link_motion import LinkMotion as LinkMotion
 from dxlsim.motor_model import MotorLoad as MotorLoad
 from dxlsim.motor_model import MotorModel as MotorModel
 from dxlsim.motor_model import Stribeck as Stribeck
+from dxlwire.joint_unit import LINEAR as LINEAR
+from dxlwire.joint_unit import ROTARY as ROTARY
+from dxlwire.joint_unit import JointUnit as JointUnit

@@ -8,7 +8,7 @@ from typing import Literal
 
 import msgspec
 
-from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
+from dxlwire.joint_unit import ROTARY, JointUnit
 from dxlwire.modes import Mode
 from dxlwire.transaction import Transaction
 
@@ -177,11 +177,6 @@ class ServoPlan(msgspec.Struct, frozen=True):
     def own_name(self) -> str:
         """A name that no other servo has."""
         return self.name or self.joint
-
-    @property
-    def linear(self) -> bool:
-        """True: its positions are lengths."""
-        return self.unit is LINEAR
 
     @property
     def position_per_tick(self) -> float:

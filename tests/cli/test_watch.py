@@ -19,6 +19,7 @@ from dxlrun.cli.steering.steer import Chosen
 from dxlrun.output.table import Sentence
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.named.joints import states_of
+from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 
 
@@ -73,7 +74,7 @@ class Robot:
             record.sources.valid[:], record.sources.age_ns[:] = (False, True), (1_250_000_000, 2_000_000)
         record.controller_ns[1] = 25_000
         plan: Any = SimpleNamespace(
-            loop=SimpleNamespace(joints=[SimpleNamespace(linear=False)] * rows), servos_by_joint={}
+            loop=SimpleNamespace(joints=[SimpleNamespace(unit=ROTARY)] * rows), servos_by_joint={}
         )
         found = states_of(plan, record, {name: place for place, name in enumerate(layout.controllers)})
         return replace(found, effort_units=("A",) * rows)

@@ -10,7 +10,10 @@ import pytest
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
+from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
+
+NEAR = ARRIVED[ROTARY]
 
 PERIOD_NS = 20_000_000
 POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")
@@ -81,10 +84,10 @@ def test_a_policy_does_not_wait_for_modes_for_ever(robot):
     ("off", "valid_after_ns", "lasts_ns"),
     [
         (0.0, 0, STAND_NS),
-        (0.9 * ARRIVED, 0, STAND_NS),
-        (-0.9 * ARRIVED, 0, STAND_NS),
-        (1.1 * ARRIVED, 0, SETTLE_NS),
-        (-1.1 * ARRIVED, 0, SETTLE_NS),
+        (0.9 * NEAR, 0, STAND_NS),
+        (-0.9 * NEAR, 0, STAND_NS),
+        (1.1 * NEAR, 0, SETTLE_NS),
+        (-1.1 * NEAR, 0, SETTLE_NS),
         (0.0, 1 << 60, SETTLE_NS),  # an old position is none
         (0.0, 200_000_000, 200_000_000),
     ],

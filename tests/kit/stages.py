@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, ServoModel, States
+from dxlrun import (
+    ROTARY,
+    Commands,
+    Context,
+    Controller,
+    JointLimits,
+    JointUnit,
+    MotorModel,
+    Outcome,
+    ServoModel,
+    States,
+)
 from dxlrun.channels.cycle import Torque
 from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
@@ -78,7 +89,7 @@ class Stage:
     motors: tuple[MotorModel | None, ...] = ()
     servos: tuple[ServoModel | None, ...] = ()
     wrap: bool = False
-    linear: bool = False
+    unit: JointUnit = ROTARY
     urdf: str | None = None
     kept: bytes = b""
     others: tuple[str, ...] = ()
@@ -120,7 +131,7 @@ class Stage:
             motors=self.motors,
             servos=self.servos,
             wrap=(self.wrap,) * count,
-            linear=(self.linear,) * count,
+            units=(self.unit,) * count,
             urdf=self.urdf,
             provided=np.full(len(self.interfaces.provides), np.nan),
             device_commands=np.full(len(self.interfaces.device_commands), np.nan),

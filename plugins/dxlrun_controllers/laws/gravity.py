@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 import numpy as np
 
-from dxlrun import Floats
+from dxlrun import LINEAR, ROTARY, Floats, JointUnit
 from dxlrun_controllers.joints import finite_or
 
 if TYPE_CHECKING:
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.80665
 """m/s^2, standard"""
-SLIDING = "prismatic"
-MOVABLE = ("revolute", "continuous", SLIDING)
+TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: ("revolute", "continuous"), LINEAR: ("prismatic",)}
+"""Types of joints of a URDF whose positions have this unit."""
+MOVABLE = (*TYPES[ROTARY], *TYPES[LINEAR])
 _PAYLOAD = "payload of gravity_compensation"
 _LEAST_MASS = 1e-12
 """kg of a link without mass: MuJoCo refuses a moving body without. Its weight is 1e-11 N."""

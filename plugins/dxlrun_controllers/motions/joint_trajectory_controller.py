@@ -26,7 +26,6 @@ from dxlrun import (
     ParametersModel,
     SpeedPeak,
     Tolerance,
-    distance_text,
 )
 from dxlrun_controllers.joints import (
     CLOSING_SPEED,
@@ -546,9 +545,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return int(np.where(beyond, self._error, -1.0).argmax()) if beyond.any() else -1
 
     def _off_path_text(self, row: int) -> str:
-        joint, linear = self.context.joints[row], self.context.linear[row]
+        joint, unit = self.context.joints[row], self.context.units[row]
         if self._error[row] > self._within.path[row]:
-            return f"joint {joint} is {distance_text(float(self._error[row]), linear)} off its path"
+            return f"joint {joint} is {unit.text(float(self._error[row]))} off its path"
         speeds = (self.context.states.velocity, self._desired.velocity, self._within.path_velocity)
-        actual, desired, allowed = (f"{distance_text(float(of[row]), linear)}/s" for of in speeds)
+        actual, desired, allowed = (unit.speed_text(float(of[row])) for of in speeds)
         return f"joint {joint} moves at {actual} instead of {desired}, {allowed} allowed"

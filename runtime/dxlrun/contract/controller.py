@@ -17,6 +17,7 @@ from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import ControllerFault
 from dxlsim.motor_model import MotorModel
+from dxlwire.joint_unit import JointUnit
 from dxlwire.modes import CommandName
 
 
@@ -100,8 +101,8 @@ class RobotModel(msgspec.Struct, frozen=True):
     """None: several servos move the joint"""
     motors: tuple[MotorModel | None, ...]
     """None: the robot file names no motor file"""
-    linear: tuple[bool, ...]
-    """True: positions are lengths, m"""
+    units: tuple[JointUnit, ...]
+    """Units of positions"""
     urdf: str | None
     """Text of the URDF that the robot file names"""
 
@@ -285,8 +286,8 @@ class Context(msgspec.Struct, frozen=True):
     """Its joints' servos, by the manual; None: several servos move the joint."""
     wrap: tuple[bool, ...] = ()
     """True: a continuous joint to which a turn more is the same place; goals take the shorter way"""
-    linear: tuple[bool, ...] = ()
-    """True for each joint whose positions are lengths, m."""
+    units: tuple[JointUnit, ...] = ()
+    """Units of the positions of its joints."""
     urdf: str | None = None
     """Text of the URDF that the robot file names; None: it names none."""
     provided: Floats = msgspec.field(default_factory=_none)

@@ -5,7 +5,7 @@ Decided by the record of the cycle, so that a replay decides the same.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ from dxlrun.channels.cycle import CycleRecord, Floats, Torque
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.control.gate import Gate
-from dxlrun.control.halt import STILL, STILL_LINEAR
+from dxlrun.control.halt import STILL_SPEEDS
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
-MOVED = 0.0873
-"""rad; 5 deg: a joint that was moved farther in a pause begins again where it is. One that follows an effort
-coasts or sags by less. [i]"""
-MOVED_LINEAR = 0.005  # m; the same for a linear joint [i]
+MOVED_DISTANCES: Mapping[JointUnit, float] = {ROTARY: 0.0873, LINEAR: 0.005}
+"""5 deg or 5 mm: a joint that was moved farther in a pause begins again where it is. One that follows an
+effort coasts or sags by less. [i]"""
 _HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
 """Modes in which a servo with torque keeps its goal while the controllers stand still."""
 
@@ -38,12 +38,12 @@ class Anchoring:
         record: CycleRecord,
     ) -> None:
         self._names = tuple(joint.name for joint in joints)
-        self._moved = np.array([MOVED_LINEAR if joint.linear else MOVED for joint in joints])
+        self._moved = np.array([MOVED_DISTANCES[joint.unit] for joint in joints])
         self._hardware = hardware
         self._switching = switching
         self._gate = gate
         self._record = record
-        self._still = np.array([STILL_LINEAR if joint.linear else STILL for joint in joints])
+        self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
         self._paused_at: Floats = record.states.position.copy()
         """Where each joint stood first in the pause."""
         self._coasts = np.zeros(len(self._names), dtype=np.bool_)

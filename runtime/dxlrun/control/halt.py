@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -10,13 +10,12 @@ from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
-STILL = 0.1
-"""rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,
-with noise of some steps. [i]"""
-STILL_LINEAR = 0.003
-"""m/s; the same of a linear joint. [i]"""
+STILL_SPEEDS: Mapping[JointUnit, float] = {ROTARY: 0.1, LINEAR: 0.003}
+"""A slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less, with
+noise of some steps. [i]"""
 STILL_NS = 100_000_000
 """For how long all joints must be that slow, with goals at rest."""
 HALT_NS = 5_000_000_000
@@ -45,7 +44,7 @@ class Halt:
         """`answer` sends a client an answer, by the number of its command."""
         self._joints = tuple(joint.name for joint in joints)
         self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
-        self._still = np.where([joint.linear for joint in joints], STILL_LINEAR, STILL)
+        self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
         """As fast as that a joint stands still, rad/s or m/s."""
         self._switching = switching
         self._record = record

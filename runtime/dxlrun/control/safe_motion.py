@@ -5,6 +5,7 @@ Nothing here reads a clock: times are those of the cycles, so that a replay does
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,12 +15,11 @@ from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
 from dxlrun.contract.hardware import Hardware
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
-ARRIVED = 0.05
-"""rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
-ARRIVED_LINEAR = 0.002
-"""m; the same of a linear joint. [i]"""
+ARRIVED: Mapping[JointUnit, float] = {ROTARY: 0.05, LINEAR: 0.002}
+"""So near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
@@ -60,7 +60,8 @@ class SafeMotion:
     """How long joints are given to stand before the robot holds."""
     _reach: Floats = field(init=False)
     """How far ahead of a goal its command may be, as a part of the step's way in a cycle."""
-    _linear: NDArray[np.bool_] = field(init=False)
+    _speeds: list[Floats] = field(init=False)
+    """How fast each joint moves toward its target in each step, rad/s or m/s."""
     _arrived: Floats = field(init=False)
     """How near to its target each joint has arrived, rad or m."""
 
@@ -76,8 +77,10 @@ class SafeMotion:
         self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
         # one that brakes within its limit must know its target, not only the next step to it
         self._reach = np.array([1.0 if joint.acceleration is None else np.inf for joint in self.joints])
-        self._linear = np.array([joint.linear for joint in self.joints])
-        self._arrived = np.where(self._linear, ARRIVED_LINEAR, ARRIVED)
+        self._speeds = [
+            np.array([step.speed_of(joint.unit) for joint in self.joints]) for step in self.policy.steps
+        ]
+        self._arrived = np.array([ARRIVED[joint.unit] for joint in self.joints])
         self.over = not self.policy.steps and not self._wait_ns
 
     def begin(self) -> None:
@@ -147,7 +150,7 @@ class SafeMotion:
             if over:
                 self._judge(step, np.flatnonzero(posed).tolist(), target, away)
             return over
-        speed = np.where(self._linear, step.linear_speed or 0.0, step.speed)
+        speed = self._speeds[self._index]
         reach = self._reach * (speed * max(record.period_ns, 1) * 1e-9)
         np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
         commands.velocity[named] = speed[named]
@@ -160,7 +163,7 @@ class SafeMotion:
         if found is None and away.any():
             row = int(np.where(away, np.abs(target - states.position), 0.0).argmax())
             off = abs(target.item(row) - states.position.item(row))
-            found = row, f"is {off:.3g} {'m' if self.joints[row].linear else 'rad'} off"
+            found = row, f"is {off:.3g} {self.joints[row].unit.value} off"
         if found is not None:
             row, why = found
             self.unfinished = (

@@ -50,6 +50,7 @@ from dxlrun.description.units import (
 )
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
+from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""
@@ -367,23 +368,27 @@ def _fraction(value: object) -> object:
     return value
 
 
-QUANTITIES: Mapping[str, Callable[[object], object]] = {
-    "positions": angle,
-    "velocities": angular_velocity,
-    "accelerations": angular_acceleration,
+_OF_ALL_JOINTS: Mapping[str, Callable[[object], object]] = {
     "efforts": _effort,
     "pwm": _fraction,
     "time": _seconds,
     "start_in": _seconds,
 }
-"""Keys of commands -> what makes rad, rad/s, rad/s^2 or s of a quantity with its unit."""
-_LINEAR: Mapping[str, Callable[[object], object]] = {
-    **QUANTITIES,
-    "positions": length,
-    "velocities": linear_velocity,
-    "accelerations": linear_acceleration,
+_QUANTITIES: Mapping[JointUnit, Mapping[str, Callable[[object], object]]] = {
+    ROTARY: {
+        **_OF_ALL_JOINTS,
+        "positions": angle,
+        "velocities": angular_velocity,
+        "accelerations": angular_acceleration,
+    },
+    LINEAR: {
+        **_OF_ALL_JOINTS,
+        "positions": length,
+        "velocities": linear_velocity,
+        "accelerations": linear_acceleration,
+    },
 }
-"""The same of linear joints, in m."""
+"""By the unit of a joint: keys of commands, and what makes a number in SI of a quantity with its unit."""
 
 
 def _of_motions(kind: str, model: type[BaseModel]) -> bool:
@@ -403,7 +408,7 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     except (msgspec.MsgspecError, RecursionError) as error:
         raise invalid(f"{what} is no JSON: {error}") from error
     mistaken: list[tuple[str, str]] = []
-    plain = _plain(data, (), mistaken, _linear(data, joints))
+    plain = _plain(data, (), mistaken, _units_of(data, joints))
     if mistaken:
         paths, problems = zip(*mistaken[:_MOST_QUANTITIES], strict=True)
         raise refused(
@@ -412,12 +417,12 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     return msgspec.json.encode(plain)
 
 
-def _linear(data: object, joints: Sequence[JointPlan]) -> tuple[bool, ...]:
-    """Return which values of a command's lists are those of linear joints."""
-    linear = {joint.name: joint.linear for joint in joints}
+def _units_of(data: object, joints: Sequence[JointPlan]) -> tuple[JointUnit, ...]:
+    """Return the unit of the joint of each value in a command's lists; that of an unknown joint is ROTARY."""
+    units = {joint.name: joint.unit for joint in joints}
     named = data.get("joints") if isinstance(data, dict) else None
-    names = named if isinstance(named, list) else [*linear]
-    return tuple(isinstance(name, str) and linear.get(name, False) for name in names)
+    names = named if isinstance(named, list) else [*units]
+    return tuple(units.get(name, ROTARY) if isinstance(name, str) else ROTARY for name in names)
 
 
 def plain_quantities(
@@ -427,12 +432,12 @@ def plain_quantities(
 
     Raises RefusedRequest as `in_si`.
     """
-    linear = {joint.name for joint in joints if joint.linear}
+    units = {joint.name: joint.unit for joint in joints}
     plain: dict[str, object] = {}
     mistaken: dict[str, str] = {}
     for joint, value in values.items():
         try:
-            quantity = (_LINEAR if joint in linear else QUANTITIES)[field]
+            quantity = _QUANTITIES[units.get(joint, ROTARY)][field]
             plain[joint] = quantity(value)
         except ValueError as error:
             mistaken[joint] = f"{joint}: {error}"
@@ -446,15 +451,15 @@ def plain_quantities(
 
 
 def _plain(
-    value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]], linear: Sequence[bool]
+    value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]], units: Sequence[JointUnit]
 ) -> object:
     if isinstance(value, dict):
-        return {key: _plain(inner, (*path, key), mistaken, linear) for key, inner in value.items()}
+        return {key: _plain(inner, (*path, key), mistaken, units) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_plain(inner, (*path, index), mistaken, linear) for index, inner in enumerate(value)]
+        return [_plain(inner, (*path, index), mistaken, units) for index, inner in enumerate(value)]
     key = next((step for step in reversed(path) if isinstance(step, str)), "")
     place = path[-1] if path and isinstance(path[-1], int) else -1
-    quantity = (_LINEAR if 0 <= place < len(linear) and linear[place] else QUANTITIES).get(key)
+    quantity = _QUANTITIES[units[place] if 0 <= place < len(units) else ROTARY].get(key)
     if quantity is None or value is None:
         return value
     try:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.stages import Stage
 
-from dxlrun import Outcome
+from dxlrun import LINEAR, Outcome
 from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.motions.joint_trajectory_controller import (
     CLOSING_SPEED,
@@ -618,7 +618,7 @@ def test_a_speed_off_the_path_is_named_with_the_desired_and_the_allowed_one():
 
 
 def test_a_linear_joint_off_its_path_is_named_in_millimetres():
-    robot = Stage(JointTrajectoryController, ONE | {"tolerances": {"path": "10 mm"}}, linear=True).activate()
+    robot = Stage(JointTrajectoryController, ONE | {"tolerances": {"path": "10 mm"}}, unit=LINEAR).activate()
     robot.send(0.0, "trajectory", points=one(1.3))
     robot.update(0.02, follow=False)
     assert [end[1] for end in robot.goal.ended] == [

@@ -14,6 +14,7 @@ from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show, show_json
+from dxlwire.joint_unit import JointUnit
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
@@ -122,9 +123,7 @@ def _meant(info: Mapping[str, Any], name: str) -> Sequence[str]:
 def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
     """Print the positions of joints; one that was never read is not in the pose."""
     states = robot.states()
-    ways = {
-        name: "mm" if unit == "m" else "deg" for name, unit in zip(states.joints, states.units, strict=True)
-    }
+    ways = {name: JointUnit(unit).shown for name, unit in zip(states.joints, states.units, strict=True)}
     found = {name: states.joint(name)["position"] for name in names}
     pose = {name: position for name, position in found.items() if position is not None}
     if chosen.as_json:
@@ -176,7 +175,7 @@ def source_facts(found: Mapping[str, object]) -> list[tuple[str, str]]:
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
     """Return the state of a joint in words, with its units."""
     unit = state["effort_unit"]
-    way = "mm" if state["unit"] == "m" else "deg"
+    way = JointUnit(state["unit"]).shown
     found = [
         ("position", written(state["position"], way)),
         ("velocity", written(state["velocity"], f"{way}/s")),

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from dxlrun.cli.inputs import Flag
-from dxlrun.cli.steering.joints import DEGREES
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, robot_of, state
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
 from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json
+from dxlwire.joint_unit import JointUnit
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
@@ -214,11 +214,11 @@ def joints(watched: Watched) -> Table:
     states = watched.states
     rows = zip(states.joints, states.effort_units, states.units, strict=True)
     return Table.of(
-        "", columns, (_joint(name, states.joint(name), unit, linear=way == "m") for name, unit, way in rows)
+        "", columns, (_joint(name, states.joint(name), unit, JointUnit(way)) for name, unit, way in rows)
     )
 
 
-def _joint(name: str, row: Row, unit: str, *, linear: bool) -> list[Cell | str]:
+def _joint(name: str, row: Row, effort: str, unit: JointUnit) -> list[Cell | str]:
     torque = str(row["torque"])
     tone = _TONES.get(torque, "plain")
     if error := row["hardware_error"]:
@@ -226,13 +226,13 @@ def _joint(name: str, row: Row, unit: str, *, linear: bool) -> list[Cell | str]:
     elif not row["valid"] and torque != "lost":
         torque, tone = f"{torque} silent", "warning"
     goal, speed = row["goal_position"], row["goal_velocity"]
-    factor, way = (1e3, " mm") if linear else (DEGREES, "")
+    factor, way = unit.factor, unit.suffix
     return [
         name,
         _number(goal, factor, 1, way) if goal is not None else _number(speed, factor, 1, f"{way}/s"),
         _number(row["position"], factor, 1, way),
         _number(row["velocity"], factor, 1, way and f"{way}/s"),
-        _number(row["effort"], 1.0, 2, f" {unit}") if unit else _number(row["effort"], 100.0, 0, " %"),
+        _number(row["effort"], 1.0, 2, f" {effort}") if effort else _number(row["effort"], 100.0, 0, " %"),
         _number(row["temperature"], 1.0, 0),
         _number(row["voltage"], 1.0, 1),
         Cell(torque, tone),

@@ -19,9 +19,9 @@ from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats, To
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
-from dxlrun.description.units import distance_text
 from dxlrun.messages import Header
 from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
+from dxlwire.joint_unit import ROTARY
 
 FEEDBACK_NS = 100_000_000
 """Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""
@@ -366,13 +366,13 @@ class Goals:
                 commanded = abs(velocities.item(target.column))
             rank, off, reason = 0, 0.0 if math.isnan(error) else error, ""
             if error > target.tolerance:
-                rank, reason = 2, f"joint {plan.name} is {distance_text(error, plan.linear)} off"
+                rank, reason = 2, f"joint {plan.name} is {plan.unit.text(error)} off"
             elif speed > target.rest_speed:
                 rank, off = 1, speed
-                reason = f"joint {plan.name} still moves at {distance_text(speed, plan.linear)}/s"
+                reason = f"joint {plan.name} still moves at {plan.unit.speed_text(speed)}"
             elif commanded > 0 and target.rest_speed < UNLIMITED:
                 rank, off = 1, commanded
-                shown = f"{distance_text(commanded, plan.linear)}/s"
+                shown = plan.unit.speed_text(commanded)
                 reason = f"joint {plan.name} is left with a commanded velocity of {shown}"
             if (rank, off) > worst[:2]:
                 name = "" if math.isnan(error) and not reason else plan.name
@@ -410,15 +410,15 @@ class Goals:
         targets = () if judgement is None else judgement.targets
         position = next((target.position for target in targets if target.row == row), math.nan)
         error = abs(plan.way(self._record.states.position.item(row), position))
-        off = "" if math.isnan(error) else f"; it is {distance_text(error, plan.linear)} off"
+        off = "" if math.isnan(error) else f"; it is {plan.unit.text(error)} off"
         return error, f"joint {plan.label} {why}{off}"
 
     def _close(self, goal: RunningGoal, outcome: Outcome, text: str, joint: str, error: float) -> None:
         goal.outcome, goal.judgement = outcome, None
         goal.error, goal.joint, goal.text = error, _writable(joint), _writable(text)
         if not goal.text and goal.joint and math.isfinite(error):
-            linear = goal.joint in self._joints and self._joints[goal.joint][1].linear
-            goal.text = f"joint {goal.joint} is {distance_text(error, linear)} off"
+            unit = self._joints[goal.joint][1].unit if goal.joint in self._joints else ROTARY
+            goal.text = f"joint {goal.joint} is {unit.text(error)} off"
         if outcome is Outcome.REACHED:
             goal.progress = 1.0
         del self.running[goal.number]

@@ -187,7 +187,7 @@ class Managed:
             motors=tuple(joint.motor for joint in joints),
             servos=tuple(joint.servo_model for joint in joints),
             wrap=tuple(joint.wrap for joint in joints),
-            linear=tuple(joint.linear for joint in joints),
+            units=tuple(joint.unit for joint in joints),
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             device_commands=self._outputs.devices,

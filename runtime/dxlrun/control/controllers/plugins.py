@@ -593,7 +593,7 @@ def mismatches(
         tuple(joint.name for joint in joints),
         tuple(joint.servo_model for joint in joints),
         tuple(joint.motor for joint in joints),
-        tuple(joint.linear for joint in joints),
+        tuple(joint.unit for joint in joints),
         urdf,
     )
     return list(controller.mismatches(parameters, robot))

@@ -162,9 +162,7 @@ def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimi
         elif interface == "pwm" or table.effort_unit == "1":
             written = f"{value:.1%}".replace("%", " %")
         else:
-            written = (
-                f"{value:.3g} {'N' if servo.linear and table.effort_unit == 'Nm' else table.effort_unit}"
-            )
+            written = f"{value:.3g} {servo.unit.effort_unit(table.effort_unit)}"
         found.append(ServoLimit(interface, value, f"{table.items[limit.name].title} = {raw}, {written}"))
     return tuple(found)
 

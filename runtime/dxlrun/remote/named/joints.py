@@ -47,7 +47,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         time_ns=record.woken_ns,
         late_ns=record.woken_ns - record.scheduled_ns,
         joints=layout.joints,
-        units=tuple("m" if joint.linear else "rad" for joint in plan.loop.joints),
+        units=tuple(joint.unit.value for joint in plan.loop.joints),
         effort_units=tuple(efforts.get(name, "") for name in layout.joints),
         references=layout.references,
         source_states=layout.source_states,
@@ -68,19 +68,16 @@ def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
 
 def effort_units(plan: Plan) -> dict[str, str]:
     """Return the unit in which each joint's servos measure effort; empty: the fraction of their maximum."""
-    units = {"Nm": "N", "1": ""}
     return {
-        joint: units.get(unit, unit) if servos[0][1].linear else unit.replace("1", "")
+        joint: servo.unit.effort_unit(control_table(servo.model, bus.protocol).effort_unit).replace("1", "")
         for joint, servos in plan.servos_by_joint.items()
-        if servos
         for bus, servo in servos[:1]
-        for unit in (control_table(servo.model, bus.protocol).effort_unit,)
     }
 
 
 def position_unit(plan: Plan, joint: str) -> str:
     """Return the unit of a joint's positions."""
-    return "m" if plan.loop.joints[joint_row(plan, joint)].linear else "rad"
+    return plan.loop.joints[joint_row(plan, joint)].unit.value
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
