@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from dxlrun import ROTARY
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import EventCode, EventGroup, Severity
 from dxlrun_analysis.finding import HURTS, Finding, Rank, cause
@@ -66,7 +67,7 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
-    lost_at = {one.name: one.lost_at for one in totals.tracking if one.unit == "rad"}
+    lost_at = {one.name: one.lost_at for one in totals.tracking if one.unit is ROTARY}
     if len(by_source) == 1 and (at := lost_at.get(ordered[0][0])) is not None:
         sentence = f"{sentence[:-1]}, at {math.degrees(at):.0f} deg."
     if len(by_source) <= _FEWEST_OF_BUS:  # of more it is what they share

@@ -187,7 +187,7 @@ def parts(report: Report) -> tuple[Part, ...]:
 
 def tables(report: Report) -> dict[str, Table]:
     """Return every table that has rows by its name, in the order of the report."""
-    mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
+    mm = ", of linear joints in mm" if any(joint.unit.suffix for joint in report.joints) else ""
     acts = report.steering
     more = f" (the first {_MOST_ACTS} of {len(acts)})" if len(acts) > _MOST_ACTS else ""
     errors = f"Joints (errors in deg{mm}, of position minus what was reachable)"
@@ -251,9 +251,9 @@ def _error(name: str) -> Callable[[JointTracking], Value]:
 
     def error(joint: JointTracking) -> Value:
         value = getattr(joint, name)
-        if value is None or joint.unit == "rad":
+        if value is None or not joint.unit.suffix:
             return value and math.degrees(value)
-        return Cell(f"{value * 1e3:.2f} mm")
+        return Cell(joint.unit.text(value))
 
     return error
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from dxlrun import distance_text
+from dxlrun import JointUnit
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.plans import motion_name, played_name
 from dxlrun.tooling.records import EventCode, EventGroup, GoalReport, Severity
@@ -121,7 +121,7 @@ def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
         else:
             status = "missed its goal" if report.status == "missed" else report.status
             joint = totals.plan.joint(report.joint)
-            yield f"{_goal(report)} {status}{_off(report, linear=joint.linear)}"
+            yield f"{_goal(report)} {status}{_off(report, joint.unit)}"
     unbegun = [goal for goal in totals.unreached_goals if goal.report is None]
     yield from (f"{goal.name} never began" for goal in unbegun[:_MOST_NAMED])
 
@@ -132,12 +132,12 @@ def _goal(report: GoalReport) -> str:
     return f"{report.kind} of {report.controller}"
 
 
-def _off(report: GoalReport, *, linear: bool) -> str:
+def _off(report: GoalReport, unit: JointUnit) -> str:
     if not report.joint:
         return ""
     if report.error is None:
         return f" ({report.joint})"
-    return f" ({report.joint} {distance_text(abs(report.error), linear, digits=1)} off)"
+    return f" ({report.joint} {unit.text(abs(report.error), digits=1)} off)"
 
 
 def _takeovers(totals: RunTotals) -> Iterator[str]:
@@ -181,5 +181,4 @@ def _within(totals: RunTotals) -> str:
     )
     if worst is None or worst.worst_rad is None or worst.worst_rad < _NOTICED_RAD:
         return ""
-    shown = distance_text(worst.worst_rad, worst.unit != "rad", digits=1)
-    return f" within {shown} ({worst.name})"
+    return f" within {worst.unit.text(worst.worst_rad, digits=1)} ({worst.name})"

@@ -8,11 +8,11 @@ positive the direction, and the two ends the limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun import distance_text
+from dxlrun import LINEAR, ROTARY, JointUnit
 from dxlrun.compile.joints.limits import degrees
 from dxlrun.compile.joints.servos import servo_travel
 from dxlrun.description.document import KeyPath
@@ -29,7 +29,7 @@ from dxlwire.control_table import ControlTable
 
 LEAST_WAY = math.radians(5.0)
 """Of the servo between both ends: less may be a hand that slipped."""
-_STEP_RAD, _STEP_M = math.radians(0.1), 1e-4
+_STEPS: Mapping[JointUnit, float] = {ROTARY: math.radians(0.1), LINEAR: 1e-4}
 """To which limits are rounded, towards the inside: beyond them the joint is at its stop."""
 _READINGS = 5
 """Of a joint at rest, whose middle one counts."""
@@ -51,7 +51,7 @@ class Measured(msgspec.Struct, frozen=True):
     direction: int
     limits: tuple[float, float] | None
     """rad, or m of a linear joint; None: it turns without end."""
-    linear: bool
+    unit: JointUnit
     tick: float
     """rad of the servo"""
     ratio: float
@@ -169,8 +169,8 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
     limits = None
     if not servo.continuous:
         ends = [direction * (angle - zero) * servo.ratio for angle in (min(lowest, zero), max(highest, zero))]
-        limits = _inside(min(ends), max(ends), servo.linear)
-    return Measured(joint.name, zero, direction, limits, servo.linear, joint.table.rad_per_tick, servo.ratio)
+        limits = _inside(min(ends), max(ends), servo.unit)
+    return Measured(joint.name, zero, direction, limits, servo.unit, joint.table.rad_per_tick, servo.ratio)
 
 
 def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
@@ -197,8 +197,8 @@ def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, fl
     return positive, now, seen[0], seen[1]
 
 
-def _inside(lower: float, upper: float, linear: bool) -> tuple[float, float]:
-    step = _STEP_M if linear else _STEP_RAD
+def _inside(lower: float, upper: float, unit: JointUnit) -> tuple[float, float]:
+    step = _STEPS[unit]
     return math.ceil(lower / step - 1e-6) * step, math.floor(upper / step + 1e-6) * step
 
 
@@ -222,21 +222,21 @@ def replacements(
     reference, direction, *position = keys_of(found.joint, continuous=servo.continuous)
     changes: list[Replacement] = []
     if abs(servo.reference - found.reference) > found.tick:
-        changes.append(Replacement(reference, _written(found.reference, False, text.unit(reference))))
+        changes.append(Replacement(reference, _written(found.reference, ROTARY, text.unit(reference))))
     if servo.direction != found.direction:
         changes.append(Replacement(direction, found.direction))
     if found.limits is not None:
-        step = found.tick * found.ratio + (_STEP_M if found.linear else _STEP_RAD)
+        step = found.tick * found.ratio + _STEPS[found.unit]
         if limits is None or any(
             abs(old - new) > step for old, new in zip(limits, found.limits, strict=True)
         ):
-            unit = text.unit(position[0])
-            ends = [_written(end, found.linear, unit) for end in found.limits]
+            given = text.unit(position[0])
+            ends = [_written(end, found.unit, given) for end in found.limits]
             changes.append(Replacement(position[0], ends))
     return changes
 
 
-def _written(value: float, linear: bool, unit: str) -> str:
-    if unit == "rad":
+def _written(value: float, unit: JointUnit, given: str) -> str:
+    if given == "rad":
         return f"{value + 0.0:.4f} rad"
-    return distance_text(value, linear, trim=True)
+    return unit.text(value, trim=True)

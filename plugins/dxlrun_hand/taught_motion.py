@@ -9,13 +9,14 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from dxlrun import JointUnit
 from dxlrun.tooling.plans import ControllerPlan
 from dxlrun_analysis.playback.motion_file import motion_file
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion, What
-from dxlrun_analysis.playback.spline_path import PINION_M, fit, tolerances
+from dxlrun_analysis.playback.spline_path import TURN_SIZES, fit, tolerances
 
 MOVED_RAD = np.radians(1.0)
-"""A joint that is nearer to where it was stands still; a linear one by what a pinion of `PINION_M` moves."""
+"""A joint that is nearer to where it was stands still; a linear one by that times its `TURN_SIZES`."""
 REST_S = 0.2
 """Of standstill that is left at both ends, so that a motion begins and ends at rest."""
 WINDOW_S = 0.2
@@ -40,7 +41,7 @@ class Taught(msgspec.Struct, frozen=True):
     """The joints that were shown, and how they may move."""
 
     joints: tuple[str, ...]
-    linear: tuple[bool, ...]
+    units: tuple[JointUnit, ...]
     lower: Floats
     """rad or m, of each joint; infinite without a limit, as `upper` and `speed`"""
     upper: Floats
@@ -51,7 +52,7 @@ class Taught(msgspec.Struct, frozen=True):
     @property
     def size(self) -> Floats:
         """How much of each joint is as much as 1 rad of one that turns."""
-        return np.where(self.linear, PINION_M, 1.0)
+        return np.array([TURN_SIZES[unit] for unit in self.units])
 
     def trimmed(self, shown: Shown) -> Shown:
         """Return a motion without the standstill at both ends; one that stands still throughout is a pose."""
@@ -93,7 +94,7 @@ class Taught(msgspec.Struct, frozen=True):
         positions.append(positions[-1])
         states: list[What] = ["states" for _ in self.joints]
         return RecordedMotion(
-            path, self.joints, tuple(states), np.array(times), np.array(positions), 0.0, self.linear
+            path, self.joints, tuple(states), np.array(times), np.array(positions), 0.0, self.units
         )
 
     def slowed(self, motion: RecordedMotion) -> tuple[RecordedMotion, float]:

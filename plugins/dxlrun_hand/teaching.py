@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from dxlrun import GoalState, InputError, Refused, RemoteRobot
+from dxlrun import GoalState, InputError, JointUnit, Refused, RemoteRobot
 from dxlrun.cli.steering.goals import cancelled, sentence
 from dxlrun.errors import ServoFault
 from dxlrun.tooling.output import write_target
@@ -57,7 +57,7 @@ class Teaching:
         self._asked = [joint for joint in joints if joint in asked]
         self._taught = Taught(
             joints,
-            tuple(info["units"][joint] == "m" for joint in joints),
+            tuple(JointUnit(info["units"][joint]) for joint in joints),
             np.array([lower for lower, _ in ends]),
             np.array([upper for _, upper in ends]),
             np.array([info["speeds"][joint] or math.inf for joint in joints]),
@@ -188,8 +188,8 @@ class Teaching:
 
     def _positions(self) -> str:
         written = (
-            f"{value * 1e3:.1f} mm" if linear else f"{math.degrees(value):.1f}"
-            for value, linear in zip(self._now()[1].tolist(), self._taught.linear, strict=True)
+            f"{unit.number(value, digits=1, trim=False)}{unit.suffix}"
+            for value, unit in zip(self._now()[1].tolist(), self._taught.units, strict=True)
         )
         return "  " + "  ".join(written)
 

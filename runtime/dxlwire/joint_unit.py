@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import Enum
-from typing import Self
+from typing import TypeAlias
+
+_Texts: TypeAlias = tuple[str, float, int, str, str, str, str]
+_TEXTS: Mapping[str, _Texts] = {
+    "rad": ("deg", math.degrees(1.0), 1, "", "Nm", "turns", "an angle"),
+    "m": ("mm", 1e3, 2, " mm", "N", "is linear", "a length"),
+}
+"""Attributes of the units, in the order in which `JointUnit` declares them."""
 
 
 class JointUnit(Enum):
@@ -14,9 +22,10 @@ class JointUnit(Enum):
     needs something else of each kind of joint, such as a threshold, has a table with units as keys.
     """
 
-    ROTARY = ("rad", "deg", math.degrees(1.0), 1, "", "Nm", "turns", "an angle")
-    LINEAR = ("m", "mm", 1e3, 2, " mm", "N", "is linear", "a length")
+    ROTARY = "rad"
+    LINEAR = "m"
 
+    si: str  # SI unit of positions, which is the value
     shown: str  # Unit that people read
     factor: float  # A position as people read it, for 1 in SI
     digits: int  # After the decimal point of a position that a servo measures
@@ -25,33 +34,20 @@ class JointUnit(Enum):
     verb: str  # What the joint does, in sentences
     quantity: str  # What a position is, in sentences
 
-    def __new__(  # noqa: PLR0917  the columns of the table above
-        cls,
-        value: str,
-        shown: str,
-        factor: float,
-        digits: int,
-        suffix: str,
-        torque: str,
-        verb: str,
-        quantity: str,
-    ) -> Self:
-        """Make one unit; its value is the SI unit of positions."""
-        self = object.__new__(cls)
-        self._value_ = value
-        self.shown, self.factor, self.digits, self.suffix = shown, factor, digits, suffix
-        self.torque, self.verb, self.quantity = torque, verb, quantity
-        return self
+    def __init__(self, si: str) -> None:
+        self.si = si
+        texts = _TEXTS[si]
+        self.shown, self.factor, self.digits, self.suffix, self.torque, self.verb, self.quantity = texts
 
     @property
     def speed(self) -> str:
         """SI unit of speeds."""
-        return f"{self.value}/s"
+        return f"{self.si}/s"
 
     @property
     def acceleration(self) -> str:
         """SI unit of accelerations."""
-        return f"{self.value}/s^2"
+        return f"{self.si}/s^2"
 
     def effort_unit(self, measured: str) -> str:
         """Return the unit of a joint's effort, by the unit in which its servo measures: N in place of Nm."""
@@ -92,7 +88,7 @@ class JointUnit(Enum):
             LookupError: No joint has a quantity in this unit.
         """
         for unit in cls:
-            if si_unit in {unit.value, unit.speed, unit.acceleration, unit.torque}:
+            if si_unit in {unit.si, unit.speed, unit.acceleration, unit.torque}:
                 return unit
         raise LookupError(f"no joint has a quantity in {si_unit}")
 

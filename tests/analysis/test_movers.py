@@ -41,7 +41,7 @@ def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> Non
         [(1, 0.25)],
         [(2, 0.25)],
     ]
-    assert {one.unit for one in tracking(read_log(path))} == {"m"}
+    assert {one.unit for one in tracking(read_log(path))} == {LINEAR}
     table = tables(analyze(read_log(path)))["joints"]
     assert "of linear joints in mm" in table.title
 

@@ -13,6 +13,7 @@ import pytest
 from msgspec import structs
 from tests.kit.totals import totals_of
 
+from dxlrun import LINEAR, ROTARY, JointUnit
 from dxlrun.channels.events import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.loop_plan import ScheduledCommand, ScheduledGoal
@@ -41,7 +42,7 @@ PLAN = LoggedPlan(
 )
 
 
-def tracked(name: str, worst_rad: float | None, unit: str = "rad") -> JointTracking:
+def tracked(name: str, worst_rad: float | None, unit: JointUnit = ROTARY) -> JointTracking:
     return JointTracking(name, 0, 0.0, 0, None, worst_rad, None, None, None, unit=unit)
 
 
@@ -85,7 +86,7 @@ def test_only_motions_that_began_were_played() -> None:
 
 
 def test_a_linear_joint_is_in_millimetres() -> None:
-    assert "within 3.2 mm (jaw)" in line(tracking=(tracked("jaw", 0.0032, "m"),))
+    assert "within 3.2 mm (jaw)" in line(tracking=(tracked("jaw", 0.0032, LINEAR),))
 
 
 def test_what_fails_comes_before_what_was_played() -> None:

@@ -24,7 +24,7 @@ def test_numbers_have_no_sign_before_zero() -> None:
 
 @pytest.mark.parametrize("unit", JointUnit)
 def test_a_unit_is_found_by_each_of_its_quantities(unit: JointUnit) -> None:
-    quantities = (unit.value, unit.speed, unit.acceleration, unit.effort_unit("Nm"))
+    quantities = (unit.si, unit.speed, unit.acceleration, unit.effort_unit("Nm"))
     assert [JointUnit.find_by_quantity(one) for one in quantities] == [unit] * 4
     assert [unit.effort_unit(measured) for measured in ("A", "1")] == ["A", "1"]
 

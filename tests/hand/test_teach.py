@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.hands import LiveRobot, Script, interrupt, written
 
-from dxlrun import RemoteRobot, connect
+from dxlrun import ROTARY, RemoteRobot, connect
 from dxlrun.description.motion import Motion, read_motion
 from dxlrun.errors import InputError, Refused, ServoFault
 from dxlrun_hand.taught_motion import Shown, Taught
@@ -214,7 +214,7 @@ def motion_of(seconds: float, position: Callable[[np.ndarray], np.ndarray]) -> S
 
 def two(speed: float = math.inf, way_speed: float = 1.0) -> Taught:
     ends = np.array([-1.0, -1.0])
-    return Taught(("a", "b"), (False, False), ends, -ends, np.array([speed, math.inf]), way_speed)
+    return Taught(("a", "b"), (ROTARY, ROTARY), ends, -ends, np.array([speed, math.inf]), way_speed)
 
 
 def test_standstill_is_cut_off_at_both_ends() -> None:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats, distance_text
+from dxlrun import Floats
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.planned import PlannedJoint
 
@@ -115,8 +115,8 @@ def joint_finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, 
 
 
 def distance(joint: PlannedJoint, way: float) -> str:
-    """Return a distance of a joint in the unit of its kind."""
-    return distance_text(way, joint.logged.linear, digits=1)
+    """Return a distance of a joint as people read it."""
+    return joint.logged.unit.text(way, digits=1)
 
 
 def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun import Log
+from dxlrun import LINEAR, Log
 from dxlrun.tooling.plans import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 from dxlwire.control_table import ControlTable, Fault, HardwareErrors, control_table
@@ -82,7 +82,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share * _register(one, _ACCELERATIONS, math.inf) for one in mine),
                 sum(one.share * one.servo.rad_per_tick for one in mine),
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
-                sum(one.share for one in mine) if joint.linear else 1.0,
+                sum(one.share for one in mine) if joint.unit is LINEAR else 1.0,
                 max(_softness(one) for one in mine),
                 ", ".join(sorted(f"{one.servo.model} {one.servo.registers}" for one in mine)),
                 joint.continuous and any(_counts_one_turn(one) for one in mine),

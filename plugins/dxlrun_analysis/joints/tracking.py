@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats, Log
+from dxlrun import ROTARY, Floats, JointUnit, Log
 from dxlrun.tooling.records import Torque
 from dxlrun_analysis.joints.delay import DelayFit
 from dxlrun_analysis.joints.movement import Movement
@@ -56,7 +56,7 @@ class JointTracking:
     rest_rad: float | None  # The greatest error with which it came to rest; None where it never did
     delay_ms: float | None = None
     """The delay with which the joint follows the goals as they were sent; None where none explains it."""
-    unit: str = "rad"  # In which its errors are; m of a linear joint, whatever their names say
+    unit: JointUnit = ROTARY  # Of its errors, whatever their names say
     lost_at: float | None = None
     """Where it was when its servo was lost for the first time; None: it was not, or it is not known."""
 
@@ -374,6 +374,6 @@ class _Row:
             settling_ms=None if self.settled_s is None else self.settled_s * 1e3,
             rest_rad=self.rest_rad,
             delay_ms=None if delay_s is None else delay_s * 1e3,
-            unit="m" if self.limits.logged.linear else "rad",
+            unit=self.limits.logged.unit,
             lost_at=self.lost_at,
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from dxlrun_analysis.joints.tracking import JointTracking
@@ -20,7 +19,7 @@ _ALL = (
 
 def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) -> list[Plot]:
     """Return the plots of one joint that have anything in them."""
-    unit, scale = shown_in(joint.unit)
+    unit, scale = joint.unit.shown, joint.unit.factor
     position = canvas.timed(f"joint-{row}", joint.name, f"position, {unit}", 210)
     canvas.curves(position, cycles, _lines(joint.name, "position"), unit, _LEAST, scale)
     canvas.marks(
@@ -38,7 +37,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
     for quantity, label, lines, least, times in (
         ("error", unit, error, _LEAST_ERROR, scale),
         ("velocity", f"{unit}/s", speed, _LEAST_SPEED, scale),
-        ("effort", f"{'Nm' if joint.unit == 'rad' else 'N'} or share", effort, _LEAST_EFFORT, 1.0),
+        ("effort", f"{joint.unit.torque} or share", effort, _LEAST_EFFORT, 1.0),
     ):
         # all loads are in a plot of their own
         if any(line.curve in cycles for line in (lines[1:] if quantity == "effort" else lines)):
@@ -47,11 +46,6 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
             plot.label = f"{joint.name}: {quantity}, {label}"
             plots.append(plot)
     return plots
-
-
-def shown_in(unit: str) -> tuple[str, float]:
-    """Return the unit in which rad or m are shown, and how many of it they are."""
-    return ("deg", math.degrees(1.0)) if unit == "rad" else ("mm", 1000.0)
 
 
 def _lines(joint: str, quantity: str) -> list[Line]:
@@ -67,7 +61,7 @@ def _followed(joint: JointTracking) -> str:
     """Return error, lag, settling and error at rest in words, as far as they are known."""
     if joint.rms_rad is None or joint.worst_rad is None:
         return "No goal was sent, or no position was read."
-    unit, scale = shown_in(joint.unit)
+    unit, scale = joint.unit.shown, joint.unit.factor
     parts = [
         f"Error rms {joint.rms_rad * scale:.2f} {unit}, worst {joint.worst_rad * scale:.2f} {unit} "
         "(position minus what was reachable)"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -11,12 +11,12 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun import InputError, LogError
+from dxlrun import InputError, JointUnit, LogError
 from dxlrun.description.motion import motion_of
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan, from_json
 from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
-from dxlrun_analysis.playback.spline_path import PINION_M, SplinePath, fit
+from dxlrun_analysis.playback.spline_path import TURN_SIZES, SplinePath, fit
 from dxlrun_controllers.joints import CLOSING_SPEED
 
 LEAD_S = 1.0  # Before the first point: controllers lead their joints there meanwhile, as in the thesis
@@ -67,9 +67,11 @@ def motion_file(
     lines += [f"name: {name}", "", "motions:"]
     points: dict[str, int] = {}
     for part in parts:
-        linear = {joint for joint, slides in zip(motion.joints, motion.linear, strict=True) if slides}
-        closing = [_closing_speed(joint, linear, speeds) for joint in part.joints]
-        rows = list(_points(part, _path_of(part, motion, allowed), linear, closing))
+        units = [motion.units[motion.joints.index(joint)] for joint in part.joints]
+        closing = [
+            _closing_speed(joint, unit, speeds) for joint, unit in zip(part.joints, units, strict=True)
+        ]
+        rows = list(_points(part, _path_of(part, motion, allowed), units, closing))
         points[part.controller] = len(rows)
         lines += [f"  - controller: {part.controller}", "    points:", *rows]
     text = "\n".join(lines) + "\n"
@@ -82,13 +84,15 @@ def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath
     return fit(replace(motion, joints=part.joints, position=motion.position[:, columns]), allowed[columns])
 
 
-def _closing_speed(joint: str, linear: Set[str], speeds: Mapping[str, float]) -> float:
+def _closing_speed(joint: str, unit: JointUnit, speeds: Mapping[str, float]) -> float:
     """Return the least speed given with a position: a slower servo would not be there within the step."""
-    speed = CLOSING_SPEED * (PINION_M if joint in linear else 1.0)
+    speed = CLOSING_SPEED * TURN_SIZES[unit]
     return min(speed, speeds.get(joint, speed))
 
 
-def _points(part: _Part, path: SplinePath, linear: Set[str], closing: Sequence[float]) -> Iterator[str]:
+def _points(
+    part: _Part, path: SplinePath, units: Sequence[JointUnit], closing: Sequence[float]
+) -> Iterator[str]:
     times, positions, velocities = path.time_s, path.position, path.velocity
     if not part.trajectory:
         times = np.linspace(0.0, path.duration_s, max(2, round(path.duration_s / _STEP_S) + 1))
@@ -101,18 +105,19 @@ def _points(part: _Part, path: SplinePath, linear: Set[str], closing: Sequence[f
     for time, position, velocity in zip(times, positions, velocities, strict=True):
         given = velocity if part.trajectory or part.speeds else None
         at = f"{LEAD_S + time:.9f}".rstrip("0").rstrip(".")
-        yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, linear)}}}}}"
+        yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, units)}}}}}"
 
 
-def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, linear: Set[str]) -> str:
-    units = ["m" if joint in linear else "rad" for joint in joints]
+def _targets(
+    joints: Sequence[str], position: Floats, velocity: Floats | None, units: Sequence[JointUnit]
+) -> str:
     if velocity is None:
         return ", ".join(
-            f"{joint}: {{position: {value:.6f} {unit}}}"
+            f"{joint}: {{position: {value:.6f} {unit.si}}}"
             for joint, value, unit in zip(joints, position, units, strict=True)
         )
     return ", ".join(
-        f"{joint}: {{position: {value:.6f} {unit}, velocity: {speed:.6f} {unit}/s}}"
+        f"{joint}: {{position: {value:.6f} {unit.si}, velocity: {speed:.6f} {unit.speed}}}"
         for joint, value, speed, unit in zip(joints, position, velocity, units, strict=True)
     )
 

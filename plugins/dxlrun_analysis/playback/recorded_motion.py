@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun import InputError
+from dxlrun import ROTARY, InputError, JointUnit
 from dxlrun.tooling.verbs import suggestion
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -31,7 +31,7 @@ class Series(msgspec.Struct, frozen=True, eq=False):
     what: What  # Goals that it was sent, or states that were measured
     continued: bool = False
     """True: between two moments the joint goes from one to the other, however far apart they are."""
-    linear: bool = False  # Its positions are m
+    unit: JointUnit = ROTARY  # Of its positions
 
     def ordered(self) -> Series:
         """Return the finite ones in order of time; of several at one time the last."""
@@ -57,7 +57,7 @@ class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
     time_s: Floats  # Shape (moments,), growing, from 0
     position: Floats  # Shape (moments, joints), rad
     begin_s: float  # Of the recording, where the motion begins
-    linear: tuple[bool, ...]  # Which of the joints are in m, by the plan of the run
+    units: tuple[JointUnit, ...]  # Of the joints, by the plan of the run
     remarks: tuple[str, ...] = ()  # A sentence for each thing that could not be read
     plan: bytes | None = None  # The plan of the run, as JSON; None: a foreign recording
 
@@ -165,8 +165,8 @@ def _joined(path: Path, series: Mapping[str, Series], stretch: Stretch) -> Recor
         )
     position = np.stack([np.interp(times, one.time_s, one.position) for one in series.values()], axis=1)
     what = tuple(one.what for one in series.values())
-    linear = tuple(one.linear for one in series.values())
-    return RecordedMotion(path, tuple(series), what, times - begin_s, position, begin_s, linear)
+    units = tuple(one.unit for one in series.values())
+    return RecordedMotion(path, tuple(series), what, times - begin_s, position, begin_s, units)
 
 
 def _check_holes(

@@ -128,14 +128,14 @@ def _beyond(
     Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way. Before and
     behind the rows the joint is at rest.
     """
-    unit = "m" if plan.linear else "rad"
+    unit = plan.unit
     if plan.bounded:
         off = np.maximum(positions - plan.upper, plan.lower - positions)
         row = int(off.argmax())
         if off[row] > tolerance:
-            factor, shown = (1e3, "mm") if plan.linear else (math.degrees(1.0), "deg")
-            limits = f"{plan.lower * factor:.4g} to {plan.upper * factor:.4g} {shown}"
-            yield row, f"is at {positions[row] * factor:.4g} {shown}, beyond its limits of {limits}"
+            limits = f"{plan.lower * unit.factor:.4g} to {plan.upper * unit.factor:.4g} {unit.shown}"
+            where = f"{positions[row] * unit.factor:.4g} {unit.shown}"
+            yield row, f"is at {where}, beyond its limits of {limits}"
     count = max(1, round(WINDOW_S / period_s))
     window_s = count * period_s
     path = np.pad(positions, count, mode="edge")
@@ -143,14 +143,15 @@ def _beyond(
     row = int(np.abs(velocity).argmax())
     speed, most = abs(float(velocity[row])), plan.highest_speed
     if speed > most + tolerance / window_s:
-        yield max(row - count, 0), f"moves at {speed:.4g} {unit}/s, more than its {most:.4g} {unit}/s"
+        yield max(row - count, 0), f"moves at {speed:.4g} {unit.speed}, more than its {most:.4g} {unit.speed}"
     if plan.acceleration is None:
         return
     change = (velocity[count:] - velocity[:-count]) / window_s
     row = int(np.abs(change).argmax())
     rate, most = abs(float(change[row])), plan.acceleration
     if rate > most + tolerance / window_s**2:
-        yield row, f"accelerates with {rate:.4g} {unit}/s^2, more than its {most:.4g} {unit}/s^2"
+        limit = f"{most:.4g} {unit.acceleration}"
+        yield row, f"accelerates with {rate:.4g} {unit.acceleration}, more than its {limit}"
 
 
 def _slow_enough(

@@ -85,5 +85,5 @@ def _own_series(
     for row, joint in enumerate(joints):
         known: What = what or ("goals" if np.all(led[inside, row]) else "states")
         values = (goals if known == "goals" else measured)[:, row]
-        found[joint] = Series(time_s, values, known, linear=plan.joint(joint).linear)
+        found[joint] = Series(time_s, values, known, unit=plan.joint(joint).unit)
     return found, reader.damage, reader.attachments.get("plan.json")

@@ -10,15 +10,18 @@ its ends (F. N. Fritsch, R. E. Carlson, "Monotone Piecewise Cubic Interpolation"
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun import LINEAR, ROTARY, JointUnit
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 
 GOAL_TOLERANCE = math.radians(0.1)
-PINION_M = 0.01  # Radius: 1 rad is 10 mm. [i]
+TURN_SIZES: Mapping[JointUnit, float] = {ROTARY: 1.0, LINEAR: 0.01}
+"""Movement of a joint, rad or m, that counts as much as 1 rad: 10 mm, as of a pinion with this radius. [i]"""
 STATE_TOLERANCE = math.radians(0.5)
 """More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
 _OVERSHOOT = 27 / 8
@@ -55,11 +58,11 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
     """Return the tolerance of each joint, rad: the given one, or what suits goals and measured states.
 
-    That of a linear joint is in m, as much as a pinion of `PINION_M` moves it.
+    That of a linear joint is in m, as much as it moves in such a turn (`TURN_SIZES`).
     """
     usual = [GOAL_TOLERANCE if what == "goals" else STATE_TOLERANCE for what in motion.what]
     found = np.array(usual) if given is None else np.full(len(motion.what), given)
-    return np.where(motion.linear, found * PINION_M, found)
+    return found * [TURN_SIZES[unit] for unit in motion.units]
 
 
 def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:

@@ -18,7 +18,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import pyarrow as pa
 from pyarrow import parquet
 
-from dxlrun import InputError, Log, LogError, open_log
+from dxlrun import ROTARY, InputError, Log, LogError, open_log
 from dxlrun.log.identity import HOST, IDENTITY_NAME, RUNTIME, code_hashes
 from dxlrun.tooling.logs import is_being_written, is_log_directory, log_files
 from dxlrun_analysis.cycles.latency import on_virtual_time
@@ -64,7 +64,7 @@ def _lowest_voltage(report: Report) -> float | None:
 
 
 def _farthest(report: Report) -> tuple[float | None, str | None]:
-    turning = [one for one in report.joints if one.unit == "rad" and one.worst_rad is not None]
+    turning = [one for one in report.joints if one.unit is ROTARY and one.worst_rad is not None]
     return max(((one.worst_rad, one.name) for one in turning), default=(None, None))
 
 

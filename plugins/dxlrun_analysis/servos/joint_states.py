@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats, Log
+from dxlrun import LINEAR, Floats, Log
 from dxlrun.tooling.records import OFFLINE
 from dxlrun_analysis.plan import LoggedPlan
 
@@ -52,7 +52,7 @@ class JointStates:
             for bus, servo, share in movers:
                 if 0 <= servo.servo_id < _IDS and bus.name in indices:
                     self.joint_of[indices[bus.name] * _IDS + servo.servo_id] = rows.get(name, -1)
-                if name in rows and plan.joint(name).linear:
+                if name in rows and plan.joint(name).unit is LINEAR:
                     self.share[rows[name]] = share
 
     def take(self, log: Log) -> None:

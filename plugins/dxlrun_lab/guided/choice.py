@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from dxlrun import InputError
+from dxlrun import LINEAR, InputError
 from dxlrun.description.units import angle
 from dxlrun.tooling.plans import JointPlan, Plan
 from dxlrun.tooling.verbs import suggestion
@@ -135,7 +135,7 @@ def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears:
         servos = plan.servos_by_joint[joint.name] if joint.name in names else ()
         if len(servos) > 1:
             mistakes.append(f"{joint.name} has {len(servos)} servos ({joint.servo}); {alone}")
-        elif servos and joint.linear:
+        elif servos and joint.unit is LINEAR:
             mistakes.append(f"{joint.name} is linear; {alone} that turns")
         elif servos and servos[0][1].ratio != 1.0 and not gears:
             mistakes.append(

@@ -259,7 +259,7 @@ def _right_units(
                     problems.error(
                         motion.marks.value("motions", index, "points", number, "joints", joint, quantity),
                         f"{joint} {unit.verb}, and its {quantity} is in {value.unit}",
-                        f"write {unit.shown} or {unit.value}, as in {_EXAMPLES[unit][quantity]}",
+                        f"write {unit.shown} or {unit.si}, as in {_EXAMPLES[unit][quantity]}",
                     )
                     good = False
     return good

@@ -163,7 +163,7 @@ class SafeMotion:
         if found is None and away.any():
             row = int(np.where(away, np.abs(target - states.position), 0.0).argmax())
             off = abs(target.item(row) - states.position.item(row))
-            found = row, f"is {off:.3g} {self.joints[row].unit.value} off"
+            found = row, f"is {off:.3g} {self.joints[row].unit.si} off"
         if found is not None:
             row, why = found
             self.unfinished = (

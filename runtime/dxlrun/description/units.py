@@ -257,22 +257,6 @@ def duration(text: object, *, bare: str = "") -> int:
     return value
 
 
-def distance_text(distance: float, linear: bool, *, digits: int = 2, trim: bool = False) -> str:
-    """Return a distance, or a position, in the unit in which users write it.
-
-    Args:
-        distance: rad, or m of a linear joint.
-        linear: True for a length.
-        digits: Digits after the decimal point.
-        trim: Leave out zeros after the last digit that counts: `30 deg`, not `30.00 deg`.
-    """
-    value = round(distance * 1e3 if linear else math.degrees(distance), digits) + 0.0  # no minus before zero
-    text = f"{value:.{digits}f}"
-    if trim and "." in text:
-        text = text.rstrip("0").rstrip(".")
-    return f"{text} {'mm' if linear else 'deg'}"
-
-
 def quantity(text: str, unit: str) -> float:
     """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
 

@@ -108,11 +108,6 @@ class JointPlan(msgspec.Struct, frozen=True):
     """Registers of its servos that limit goals; empty in the plan, as they are read at the start."""
 
     @property
-    def linear(self) -> bool:
-        """True: its positions are lengths."""
-        return self.unit is LINEAR
-
-    @property
     def label(self) -> str:
         """The joint with its servo, as sentences name it."""
         return f"{self.name} ({self.servo})" if self.servo else self.name
@@ -219,7 +214,7 @@ class JointProperty(msgspec.Struct, frozen=True):
 
 
 JOINT_PROPERTIES: tuple[JointProperty, ...] = (
-    JointProperty("unit", lambda joint: joint.unit.value, listed="units"),
+    JointProperty("unit", lambda joint: joint.unit.si, listed="units"),
     JointProperty(
         "limits", lambda joint: (joint.lower, joint.upper) if joint.bounded else None, listed="limits"
     ),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from tests.kit.answers import result_of
 
+from dxlrun import ROTARY
 from dxlrun.description.motion import read_motion as read_motion_file
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -103,7 +104,7 @@ def test_posvel_joint_reaches_the_end_of_a_motion_that_becomes_slow() -> None:
     time = np.linspace(0.0, 2.0, 101)
     position = np.stack([0.5 * np.sin(time * np.pi / 4), np.zeros(101)], axis=1)  # at rest at its end
     motion = RecordedMotion(
-        Path("log"), ("pan", "wheel"), ("states", "states"), time, position, 0.0, (False, False)
+        Path("log"), ("pan", "wheel"), ("states", "states"), time, position, 0.0, (ROTARY, ROTARY)
     )
     group = ControllerPlan(
         name="head",

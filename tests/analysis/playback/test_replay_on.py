@@ -14,6 +14,7 @@ import pytest
 from tests.kit.anew import put, written_anew
 from tests.kit.answers import result_of
 
+from dxlrun import ROTARY
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.loop_plan import JointPlan
@@ -222,7 +223,7 @@ def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
 
 def motion(position: np.ndarray, seconds: float) -> RecordedMotion:
     times = np.linspace(0.0, seconds, len(position))
-    return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0, (False,))
+    return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0, (ROTARY,))
 
 
 def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> Rows:

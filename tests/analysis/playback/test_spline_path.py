@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dxlrun import ROTARY
 from dxlrun_analysis.playback.recorded_motion import RecordedMotion
 from dxlrun_analysis.playback.spline_path import STATE_TOLERANCE, fit
 
@@ -22,7 +23,7 @@ def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:
         times,
         np.stack(columns, 1),
         0.0,
-        (False,) * len(names),
+        (ROTARY,) * len(names),
     )
 
 

@@ -211,7 +211,7 @@ class RecordedRobot:
         joints, controllers = plan.loop.joints, {one.name: one for one in plan.loop.controllers}
         return msgspec.structs.replace(
             info,
-            units={joint.name: "m" for joint in joints if joint.linear},
+            units={joint.name: joint.unit.si for joint in joints},
             effort_units={
                 joint.name: joint.servo_model.effort_unit.replace("1", "")
                 for joint in joints

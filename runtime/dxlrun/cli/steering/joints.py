@@ -175,7 +175,7 @@ def source_facts(found: Mapping[str, object]) -> list[tuple[str, str]]:
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
     """Return the state of a joint in words, with its units."""
     unit = state["effort_unit"]
-    way = JointUnit(state["unit"]).shown
+    way = JointUnit(str(state["unit"])).shown
     found = [
         ("position", written(state["position"], way)),
         ("velocity", written(state["velocity"], f"{way}/s")),

@@ -22,6 +22,15 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: TURNING, LINEAR: (SLIDING,)}
 """Types of joints of a URDF whose positions have this unit."""
+_UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
+    ROTARY: (
+        "slides",
+        "angles",
+        "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
+    ),
+    LINEAR: ("turns", "lengths", "make it prismatic there"),
+}
+"""Of a joint with this unit that the URDF moves in the other way: what it does there, positions, and fix."""
 
 
 class CompiledUrdf(msgspec.Struct, frozen=True):
@@ -120,20 +129,11 @@ def _check_names(
         file.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
     unlike = [name for name in joints if name in drawn and drawn[name].moves]
     unlike = [name for name in unlike if not _alike(joints[name], drawn[name])]
-    sliding = [name for name in unlike if joints[name].plan.unit is ROTARY]
-    if sliding:
-        file.warning(
-            mark,
-            f"the URDF slides {', '.join(sliding)}, whose positions are angles, so frames show it at rest",
-            "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
-        )
-    turning = [name for name in unlike if joints[name].plan.unit is LINEAR]
-    if turning:
-        file.warning(
-            mark,
-            f"the URDF turns {', '.join(turning)}, whose positions are lengths, so frames show it at rest",
-            "make it prismatic there",
-        )
+    for unit, (moves, positions, fix) in _UNLIKE.items():
+        names = ", ".join(name for name in unlike if joints[name].plan.unit is unit)
+        if names:
+            what = f"the URDF {moves} {names}, whose positions are {positions}, so frames show it at rest"
+            file.warning(mark, what, fix)
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None
         if mimic is not None:

@@ -47,7 +47,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         time_ns=record.woken_ns,
         late_ns=record.woken_ns - record.scheduled_ns,
         joints=layout.joints,
-        units=tuple(joint.unit.value for joint in plan.loop.joints),
+        units=tuple(joint.unit.si for joint in plan.loop.joints),
         effort_units=tuple(efforts.get(name, "") for name in layout.joints),
         references=layout.references,
         source_states=layout.source_states,
@@ -77,7 +77,7 @@ def effort_units(plan: Plan) -> dict[str, str]:
 
 def position_unit(plan: Plan, joint: str) -> str:
     """Return the unit of a joint's positions."""
-    return plan.loop.joints[joint_row(plan, joint)].unit.value
+    return plan.loop.joints[joint_row(plan, joint)].unit.si
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
