@@ -57,7 +57,7 @@ SAMPLED = (
     "cli/test_streams.py",
     "cli/test_tutorial.py",
     "control/test_long_runs.py",
-    "dynamixel/control_table/test_plugin_models.py",
+    "dynamixel/test_plugin_models.py",
     "hand/test_terminal.py",
     "lab/characterize/test_command.py",
     "lab/characterize/test_known_servos.py",

@@ -5,6 +5,6 @@ loaded for a command line that only prints its help. The names stand in `__init_
 Packages with verbs find the names of their trade in `dxlrun.tooling`.
 """
 
-from dxlrun.contract.faces import lazy_face
+from dxlwire.faces import lazy_face
 
 __all__, __getattr__, __dir__ = lazy_face(__name__, f"{__file__.rpartition('.')[0]}.pyi")

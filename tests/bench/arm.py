@@ -37,7 +37,8 @@ BINFMT = Path("/proc/sys/fs/binfmt_misc")
 RUN = "dxlrun robots/bioloid_torso.yaml --play robots/motions/three_parts.yaml"
 TESTS = (
     "tests/run/channels tests/sensors/test_slot.py tests/compile/test_cross_checks.py "
-    "tests/dynamixel/test_{kernel,kernel_rules,protocol1,protocol2,receiver,goals,samples,bus}.py "
+    "tests/dxlwire/test_{protocol1,protocol2,receiver,bus}.py "
+    "tests/dynamixel/test_{kernel,kernel_rules,goals,samples}.py "
     "tests/control/test_{gate,gate_law,loop,manager}.py "
     "tests/log/test_{schemas_and_cdr,packet_messages,log,recorder}.py"
 )

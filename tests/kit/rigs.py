@@ -1,6 +1,7 @@
 """Rigs: the hardware of a robot on simulated buses, stepped by hand on virtual time.
 
-`make_plan` and `make_x` plan a bus, `make_rig` puts hardware on simulated servos, `start_rig` starts it, too:
+`make_plan` (in `tests.kit.plans`) and `make_x` plan a bus, `make_rig` puts hardware on simulated servos,
+`start_rig` starts it, too:
 
     rig = start_rig(make_x((11, 12)))
     rig.buses[0].servo(12).silence()
@@ -25,6 +26,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from tests.kit.decoded import decode_packets
 from tests.kit.line_faults import corrupt_next, truncate_next
+from tests.kit.plans import make_plan
 
 from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
 from dxlrun.channels.events import EventCode, Severity
@@ -38,13 +40,9 @@ from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.clock import VirtualClock
-from dxlwire.control_table import control_table
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketKind
-from dxlwire.plan.planning import Wiring, bus_plan
-from dxlwire.port.ports import OwnProcessors
 
-MIDDLE = math.radians(150)
 X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 WRITE, SYNC_WRITE = 0x03, 0x83
 
@@ -222,40 +220,6 @@ class Rig:
         return [servo.torque_on for servo in self.buses[index].servos]
 
 
-class ScriptedLine(OwnProcessors):
-    """Port and Ports in one: after the n-th write it says what the script has, at times since that write."""
-
-    polling = None
-
-    def __init__(self, *script: Sequence[tuple[int, bytes]]) -> None:
-        self.clock = VirtualClock(1_000)
-        self.script = list(script)
-        self.coming: list[tuple[int, bytes]] = []
-        self.written: list[bytes] = []
-
-    @property
-    def ports(self) -> list[ScriptedLine]:
-        return [self]
-
-    def write(self, data: bytes) -> None:
-        self.written.append(bytes(data))
-        said = self.script.pop(0) if self.script else ()
-        self.coming = sorted(
-            self.coming + [(self.clock.now_ns() + delay_ns, data) for delay_ns, data in said]
-        )
-
-    def read_into(self, buffer: memoryview) -> int:
-        due = [data for at, data in self.coming if at <= self.clock.now_ns()]
-        self.coming = self.coming[len(due) :]
-        data = b"".join(due)
-        buffer[: len(data)] = data
-        return len(data)
-
-    def wait(self, deadline_ns: int) -> list[int]:
-        self.clock.wait_until(min([deadline_ns, *(at for at, _ in self.coming)]))
-        return [0] if self.coming and self.coming[0][0] <= self.clock.now_ns() else []
-
-
 class VirtualLine:
     """The line of a tool, with one simulated bus; `cannot`: rates that its adapter does not have."""
 
@@ -292,48 +256,6 @@ def goals_in(packet: bytes, protocol: float) -> tuple[int, list[int]] | None:
         return None
     width = (packet[10] | packet[11] << 8) + 1
     return packet[8] | packet[9] << 8, list(packet[12:-2:width])
-
-
-def make_plan(
-    ids: Sequence[int] = (1, 3, 5, 6, 2, 4, 20, 21),
-    *,
-    name: str = "main",
-    first_row: int = 0,
-    latency_ns: int = 0,
-    return_delay_ns: int = 500_000,
-    **change: Any,
-) -> BusPlan:
-    """Return a plan; references in the middle, directions -1, +1, -1, ...; AX-12 if nothing else is said."""
-    protocol = change.get("protocol", 1.0)
-    models = change.get("models") or [change.get("model", "AX-12A")] * len(ids)
-    names = change.get("joints", [f"{name}_{servo_id}_joint" for servo_id in ids])
-    wiring = [
-        Wiring(
-            joint=names[index],
-            row=first_row + index,
-            servo_id=servo_id,
-            table=control_table(models[index], protocol),
-            reference=change.get("reference", MIDDLE),
-            direction=1 if index % 2 else -1,
-            lower=change.get("lower", -MIDDLE),
-            upper=change.get("upper", MIDDLE),
-            continuous=change.get("continuous", False),
-            start_mode=change.get("start_mode"),
-            ratio=change.get("ratio", 1.0),
-        )
-        for index, servo_id in enumerate(ids)
-    ]
-    plan = bus_plan(
-        name=name,
-        port="sim",
-        baud_rate=1_000_000,
-        latency_ns=latency_ns,
-        return_delay_ns=return_delay_ns,
-        joints=wiring,
-        protocol=protocol,
-        devices=change.get("devices", ()),
-    )
-    return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))
 
 
 def make_x(ids: Sequence[int] = X_IDS, **change: Any) -> BusPlan:

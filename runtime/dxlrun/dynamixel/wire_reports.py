@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlwire.reports import Reason
+from dxlwire.exchange.reports import Reason
 
 _EVENTS = {
     Reason.IMPLAUSIBLE: (EventCode.IMPLAUSIBLE, Severity.WARNING),

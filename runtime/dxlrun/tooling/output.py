@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dxlrun.contract.faces import lazy_face
+from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
     from dxlrun.dynamixel.remedies import choose_remedy as choose_remedy

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dxlrun.contract.faces import lazy_face
+from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
     from dxlrun.cli.inputs import Assignment as Assignment

@@ -42,6 +42,10 @@ def control_table(model: str, protocol: float | None = None) -> ControlTable:
     return listing.build()
 
 
+find_table = control_table
+"""Name of the function at the face of dxlwire, where `control_table` is the package."""
+
+
 def protocols_of(model: str) -> tuple[float, ...]:
     """Return the protocols of a model, by whatever name it is understood; none: there is no such model."""
     return tuple(each for each in (1.0, 2.0) if understood(model, each) is not None)

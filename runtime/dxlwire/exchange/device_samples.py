@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlwire.arrays import Floats, SourceArrays
 from dxlwire.bus_plan import BusPlan
-from dxlwire.reports import Reason, ReportSink
+from dxlwire.exchange.arrays import Floats, SourceArrays
+from dxlwire.exchange.reports import Reason, ReportSink
 
 REPORT_AGAIN_NS = 1_000_000_000  # One device has at most one event in this time
 

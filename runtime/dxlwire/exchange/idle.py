@@ -13,8 +13,8 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlwire.exchange.bus import NEVER, Bus
+from dxlwire.exchange.reports import Reason, ReportSink
 from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
-from dxlwire.reports import Reason, ReportSink
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000

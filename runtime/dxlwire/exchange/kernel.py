@@ -18,10 +18,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlwire.arrays import Floats
 from dxlwire.bus_plan import BusPlan, Field
 from dxlwire.compiled import array_of, load_compiled, parse_structs
 from dxlwire.errors import PortError
+from dxlwire.exchange.arrays import Floats
 from dxlwire.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.goals import GoalArrays, SyncWrite

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlwire.arrays import Floats, JointArrays, SourceArrays
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import control_table
+from dxlwire.exchange.arrays import Floats, JointArrays, SourceArrays
 from dxlwire.exchange.device_samples import DeviceSamples
+from dxlwire.exchange.reports import Reason, ReportSink
 from dxlwire.modes import Mode
-from dxlwire.reports import Reason, ReportSink
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 

@@ -1,6 +1,6 @@
 import msgspec
 import pytest
-from tests.kit.rigs import make_plan
+from tests.kit.plans import make_plan
 
 from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import control_table, model_names

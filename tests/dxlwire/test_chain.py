@@ -1,7 +1,7 @@
 """Several statuses after one instruction: each counts by ID and length, whatever became of the others."""
 
 import pytest
-from tests.kit.rigs import ScriptedLine, make_plan
+from tests.kit.plans import ScriptedLine, make_plan
 
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketLog

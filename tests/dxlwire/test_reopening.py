@@ -2,14 +2,10 @@
 
 import os
 import select
-import socket
 
 import pytest
-from msgspec.json import Decoder
 
-from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
-from dxlrun.errors import PortError
-from dxlrun.run.line_reopener import LineReopener
+from dxlwire.errors import PortError
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.port.reopening import KeptLines, Wanted, lasting_name
 
@@ -109,31 +105,21 @@ def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
     KeptLines([Wanted(left, 1_000_000, 0)]).close()
 
 
-def test_whoever_asks_gets_the_line_in_the_place_of_the_old_one(adapters, kept):
-    ours, theirs = socket.socketpair()
-    keeper = MessageChannel(theirs, Decoder(LineLost))
+def test_reopened_line_takes_the_place_of_the_lost_one(adapters, kept):
+    back = []
     ports = SerialPorts(
         [SerialPort(os.dup(one), "a line") for one in kept.descriptors],
-        LineReopener(MessageChannel(ours, Decoder(LineReturned))),
+        lambda _: back.pop() if back else None,
     )
     adapters[0].unplug()
     assert not ports.reopen(0)
-    assert not ports.reopen(0)
-    assert keeper.receive() == [LineLost(0)]  # asked once
     kept.lost(0)
     adapters[0].plug_in()
     assert returned(kept) == [0]
-    keeper.send(LineReturned(0), [kept.descriptors[0]])
+    back.append(os.dup(kept.descriptors[0]))
     assert ports.reopen(0)
     ports.ports[0].write(b"again")
     assert adapters[0].heard() == b"again"
-    adapters[0].unplug()
-    assert not ports.reopen(0)
-    assert keeper.receive() == [LineLost(0)]  # it was lost anew
-    adapters[0].plug_in()
-    keeper.close()
-    assert not ports.reopen(0)  # nothing is there to ask
-    ours.close()
 
 
 def test_the_name_by_which_an_adapter_is_found_again(tmp_path):

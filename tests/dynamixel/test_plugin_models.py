@@ -11,12 +11,14 @@ from pathlib import Path
 import pytest
 from tests.kit.answers import result_of
 
+import dxlwire.control_table
 import dxlwire.control_table.devices
 import dxlwire.control_table.models
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import read_log
 from dxlwire.control_table import added_control_tables, control_table
 
+TABLES = Path(dxlwire.control_table.__file__).parent / "tables"
 PLUGIN = """
 from pathlib import Path
 from dxlrun import hookimpl
@@ -45,9 +47,9 @@ MAIN = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 @pytest.fixture
-def table(data_files: Path, tmp_path: Path) -> Path:
+def table(tmp_path: Path) -> Path:
     """The data file of a servo that dxlrun does not know."""
-    text = (data_files / "protocol1" / "AX-12A.toml").read_text("utf-8")
+    text = (TABLES / "protocol1" / "AX-12A.toml").read_text("utf-8")
     text = text.replace('model = "AX-12A"', 'model = "Mine-1"').replace('["AX-12", "AX-12+"]', "[]")
     path = tmp_path / "mine.toml"
     path.write_text(text.replace("model_number = 12\n", "model_number = 60001\n"))

@@ -1,7 +1,7 @@
 import pytest
-from tests.kit.rigs import ScriptedLine, make_plan
+from tests.kit.plans import ScriptedLine, make_plan
 
-from dxlrun.errors import PortError
+from dxlwire.errors import PortError
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketKind
 from dxlwire.plan.line import Line, listen

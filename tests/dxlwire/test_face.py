@@ -1,0 +1,94 @@
+"""The face of dxlwire: its names, its examples, and that nothing of the runtime is needed."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import os
+import pty
+import re
+import subprocess
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dxlwire
+from dxlwire import dialect_of
+
+README = Path(dxlwire.__file__).with_name("README.md")
+OWN = Path(__file__).parent
+KIT = OWN.parent / "kit/plans.py"
+
+
+@pytest.fixture
+def servo() -> Iterator[str]:
+    """Path of a line with one servo that answers every request with position 1024."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    reply = dialect_of(2.0).status_packet(1, 0, (1024).to_bytes(4, "little"))
+
+    def answer() -> None:
+        if os.read(ours, 64) == bytes.fromhex("ff ff fd 00 01 07 00 02 84 00 04 00 1d 15"):
+            os.write(ours, reply)
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    yield os.ttyname(theirs)
+    os.close(theirs)
+    thread.join(10)
+    os.close(ours)
+
+
+def test_every_public_name_exists() -> None:
+    assert dxlwire.__all__
+    for name in dxlwire.__all__:
+        assert getattr(dxlwire, name) is not None
+    assert set(dxlwire.__all__) <= set(dir(dxlwire))
+    with pytest.raises(AttributeError, match="has no attribute 'robots'"):
+        dxlwire.robots  # noqa: B018  the access is what raises
+
+
+def test_examples_of_docstring_and_readme_are_right() -> None:
+    assert doctest.testmod(dxlwire).failed == 0
+    result = doctest.testfile(str(README), module_relative=False)
+    assert result.failed == 0
+    assert result.attempted > 5
+
+
+def test_example_reads_a_position(servo: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code = re.findall(r"```python\n(import.*?)```", README.read_text(), re.DOTALL)[-1]
+    exec(code.replace("/dev/ttyUSB0", servo), {})  # noqa: S102  the README of this repository
+    value, unit = capsys.readouterr().out.split()
+    assert (round(float(value), 4), unit) == (1.5708, "rad")
+
+
+def test_import_loads_neither_numpy_nor_dxlrun() -> None:
+    code = """
+import sys, dxlwire
+assert not {"numpy", "msgspec"} & set(sys.modules)
+for name in dxlwire.__all__:
+    getattr(dxlwire, name)
+import dxlwire.exchange.kernel, dxlwire.exchange.idle, dxlwire.plan.planning, dxlwire.port.reopening
+print(sorted(name for name in sys.modules if name.split(".")[0] in ("dxlrun", "dxlsim", "pydantic")))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "[]\n"
+
+
+def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
+    found: dict[str, set[str]] = {}
+    for path in (*OWN.rglob("*.py"), KIT):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = {one.name for one in node.names}
+            else:
+                names = {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            found.setdefault(path.name, set()).update(names)
+    own = {name for names in found.values() for name in names if name.split(".")[0] in ("dxlrun", "dxlsim")}
+    assert own == set()
+    kit = {name for names in found.values() for name in names if name.startswith("tests.")}
+    assert kit == {"tests.kit.plans"}
