@@ -9,17 +9,10 @@ import numpy as np
 
 from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
-from dxlrun.tooling.records import CommandOutcome, Event, EventCode, TakenCommand
+from dxlrun.tooling.records import ClientCommand, CommandOutcome, Event, EventCode, TakenCommand
 
 POLICY = "policy"  # Kind of the command that the loop leaves in the log when it begins a policy's steps
 _LOOP = "loop"
-
-
-class ClientCommand(msgspec.Struct, frozen=True):
-    """One command that is not in the plan."""
-
-    command: TakenCommand
-    refusal: str  # Why nothing was done; empty where it was done, or where the event with the refusal is lost
 
 
 def client_commands(log: Log) -> tuple[ClientCommand, ...]:

@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from dxlrun import Log
-from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
-from dxlrun.plan.machine_load import NO_WAIT
-from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.logs import FAILURES_NAME, SUMMARY_NAME, UNREADABLE
 from dxlrun.tooling.plans import UnreachedGoal, find_unreached_goals
 from dxlrun.tooling.records import (
     EventCode,
@@ -70,7 +68,9 @@ class RunTotals:
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
     failures: tuple[str, ...] = ()  # What failed outside of the loop, one sentence each
-    wait: SimulationWait = NO_WAIT  # Of the loop, for simulated servos whose process did not run
+    wait: SimulationWait = field(
+        default_factory=SimulationWait
+    )  # Of the loop, for simulated servos whose process did not run
     gaps: int = 0  # Records that the recorder did not get
     damage: tuple[str, ...] = ()
     tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
@@ -119,7 +119,7 @@ class Tally:
         self._returns: dict[str, list[str]] = {}
         self._granted = False
         self._unread = 0
-        self._wait = NO_WAIT
+        self._wait = SimulationWait()
 
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""

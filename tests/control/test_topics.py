@@ -11,7 +11,7 @@ from tests.kit.loops import on_update
 
 from dxlrun import ControllerFault, Floats
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.messages import LONGEST_MESSAGE, Topic
+from dxlrun.channels.messages import LONGEST_MESSAGE, PublishedTopic
 from dxlrun.control.controllers.topics import MOST_PER_CYCLE, TopicLog
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
@@ -28,10 +28,10 @@ class State:
 
 class Sink:
     def __init__(self) -> None:
-        self.topics: list[Topic] = []
+        self.topics: list[PublishedTopic] = []
         self.messages: list[tuple[int, int, bytes]] = []
 
-    def announce(self, topic: Topic) -> int:
+    def announce(self, topic: PublishedTopic) -> int:
         self.topics.append(topic)
         return len(self.topics) - 1
 

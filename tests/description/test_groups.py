@@ -9,7 +9,7 @@ from tests.kit import desk
 from tests.kit.robots import robot_text
 
 from dxlrun.description.joints.groups import NAMING, without_groups
-from dxlrun.description.motion import motion_of
+from dxlrun.description.motion import parse_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import Mark
 
@@ -80,7 +80,7 @@ def test_motions_name_groups() -> None:
         "name: m\nmotions:\n- controller: all_joints\n  points:\n"
         "  - {time: 1 s, joints: {left: {position: 0 rad}, knee: {position: 1 rad}}}\n"
     )
-    motion = motion_of(text, Path("m.yaml"), groups)
+    motion = parse_motion(text, Path("m.yaml"), groups)
 
     assert list(motion.motion.motions[0].points[0].joints) == ["shoulder", "elbow", "knee"]
     where = motion.marks.key("motions", 0, "points", 0, "joints", "elbow")

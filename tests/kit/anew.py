@@ -18,7 +18,7 @@ from msgspec import structs
 
 from dxlrun.channels.commands import CommandRing
 from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.messages import MessageRing, Topic
+from dxlrun.channels.messages import MessageRing, PublishedTopic
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
@@ -52,7 +52,7 @@ def written_anew(path: Path, target: Path, *changes: Change, gaps: Sequence[tupl
         ring.emit(EventCode(event.code), Severity(event.severity), event.source, event.text, event.data)
     published = MessageRing(take)
     for topic in log.topics.values():
-        number = published.announce(Topic(topic.name, topic.type))
+        number = published.announce(PublishedTopic(topic.name, topic.type))
         for t_ns, data in zip(topic.t_ns.tolist(), topic.data, strict=True):
             published.message(number, t_ns, data)
     for source, lost in gaps:

@@ -59,7 +59,7 @@ def test_the_oldest_logs_of_runs_go_first_and_one_that_is_being_written_stays(lo
     ):
         assert names(0) == ["a_20260101_000000.mcap", "a_20260103_000000_2.mcap"]
     for one in stored.oldest_beyond(logs, 100):
-        stored.delete(one)
+        one.delete()
     assert sorted(path.name for path in logs.iterdir()) == [
         "a_20260101_000000.txt",
         "a_20260104_000000.mcap",

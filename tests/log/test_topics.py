@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from dxlrun import Floats, LogError
-from dxlrun.channels.messages import MessageRing, Topic
+from dxlrun.channels.messages import MessageRing, PublishedTopic
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import open_log, read_log
@@ -45,7 +45,9 @@ def path(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
     """50 cycles with messages of two topics, one in every fifth; the first one has nothing in its arrays."""
     ring, offset_ns = MessageRing(Handover(log.take)), log.header.epoch_offset_ns
     kinds = {"state": declared_message(WaveState, "my_robotics"), "odometry": declared_message(Odometry, "")}
-    numbers = {name: ring.announce(Topic(f"/wave/{name}", kind.type)) for name, kind in kinds.items()}
+    numbers = {
+        name: ring.announce(PublishedTopic(f"/wave/{name}", kind.type)) for name, kind in kinds.items()
+    }
 
     def publish(name: str, t_ns: int, message: object) -> None:
         stamp = divmod(t_ns + offset_ns, 10**9)

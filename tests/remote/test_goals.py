@@ -13,7 +13,7 @@ import dxlrun
 from dxlrun.channels.answers import Code, Done, Refusal
 from dxlrun.channels.events import EventCode, GoalReport, Severity
 from dxlrun.channels.heartbeat import Phase
-from dxlrun.channels.messages import Topic
+from dxlrun.channels.messages import PublishedTopic
 from dxlrun.control.controllers.goals import GoalStatus as LoopStatus
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.controllers.topics import TopicLog
@@ -125,7 +125,7 @@ def test_a_result_is_kept_and_listed(arm):
 
 
 def test_progress_is_that_of_the_topic(arm):
-    topic = Topic("/goals", declared_message(LoopStatus, "dxlrun_msgs").type)
+    topic = PublishedTopic("/goals", declared_message(LoopStatus, "dxlrun_msgs").type)
     publisher = TopicLog(arm.record, arm.messages).open("/goals", LoopStatus)
     assert publisher.topic == topic
     report(arm, 1, "accepted")

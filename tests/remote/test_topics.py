@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun import Floats
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.channels.messages import Topic
+from dxlrun.channels.messages import PublishedTopic
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
@@ -27,7 +27,7 @@ class State:
 
 
 DECLARED = declared_message(State, "mine")
-TOPIC = Topic("/left/state", DECLARED.type, ("pan", "tilt"))
+TOPIC = PublishedTopic("/left/state", DECLARED.type, ("pan", "tilt"))
 
 
 def publish(desk, number, first, last, text=""):
@@ -105,7 +105,7 @@ def test_of_much_a_part_is_taken_at_once_so_that_others_are_served(desk, number)
 
 def test_the_numbers_show_exactly_what_a_client_that_slept_has_missed(desk, number):
     """The ring has room for less than what is published meanwhile; other topics share it."""
-    other = desk.messages.announce(Topic("/right/state", DECLARED.type))
+    other = desk.messages.announce(PublishedTopic("/right/state", DECLARED.type))
     publish(desk, number, 1, 1)
     stream = desk.link.listen(["/left/state"], newest=False)
     assert numbers(desk, stream) == [1]

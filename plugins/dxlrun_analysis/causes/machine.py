@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Log
-from dxlrun.messages.cdr import Value
 from dxlrun.tooling.records import LoadMeter, LoadSample, MachineLoad, load_sample
 from dxlrun.tooling.topics import MACHINE_TOPIC
 
@@ -57,7 +56,7 @@ class MachineHistory:
             meter.add(sample)
         return meter.load()
 
-    def _sample(self, message: Mapping[str, Value]) -> MachineSample:
+    def _sample(self, message: Mapping[str, object]) -> MachineSample:
         end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
         self.load_samples.append(load_sample(message))
         core = cast("int", message["loop_core"])
@@ -72,7 +71,7 @@ class MachineHistory:
         self.slow += self._is_slow(message)
         return MachineSample(end_ns - interval_ns, end_ns, tuple(max(0, round(one)) for one in taken))
 
-    def _is_slow(self, message: Mapping[str, Value]) -> bool:
+    def _is_slow(self, message: Mapping[str, object]) -> bool:
         frequency = cast("NDArray[np.float64]", message["frequency"])
         known = frequency[np.isfinite(frequency)]
         if not len(known):
@@ -81,7 +80,7 @@ class MachineHistory:
         return float(known.max()) < THROTTLED_SHARE * self._fastest and _number(message["temperature"]) >= HOT
 
 
-def _of_core(values: Value, core: int) -> float:
+def _of_core(values: object, core: int) -> float:
     """Return the share of one core, or where that is not known the greatest of all; 0: not known."""
     shares = np.nan_to_num(cast("NDArray[np.float64]", values))
     if 0 <= core < len(shares):
@@ -89,6 +88,6 @@ def _of_core(values: Value, core: int) -> float:
     return float(shares.max(initial=0.0))
 
 
-def _number(value: Value) -> float:
+def _number(value: object) -> float:
     number = cast("float", value)
     return number if math.isfinite(number) else 0.0

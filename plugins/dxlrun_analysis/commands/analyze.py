@@ -65,7 +65,7 @@ def analyze(
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
     from dxlrun import open_log
-    from dxlrun.cli.tools.tool_log import TOOL_NAME
+    from dxlrun.tooling.logs import TOOL_NAME
     from dxlrun_analysis import report as analysis
     from dxlrun_analysis.causes.tables import worst_tables
     from dxlrun_analysis.latency.latency_log import is_measurement

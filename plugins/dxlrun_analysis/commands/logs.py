@@ -26,7 +26,7 @@ from dxlrun.tooling.output import (
     show,
     show_json,
 )
-from dxlrun.tooling.verbs import DebugFlag, Flag, JsonFlag, missing_extra
+from dxlrun.tooling.verbs import DebugFlag, Flag, JsonFlag, missing_extra, parse_size
 
 if TYPE_CHECKING:
     from dxlrun_analysis.season.runs import Folder
@@ -140,16 +140,11 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
     """Show which logs are beyond a size, and delete them if the answer is yes."""
     from rich.filesize import decimal
 
-    from dxlrun.description.units import size
-    from dxlrun.log.stored import delete
     from dxlrun.tooling.logs import oldest_beyond, stored_logs
 
     if not directory.is_dir():
         raise InputError(f"there is no directory {directory}; runs leave their logs in logs")
-    try:
-        keep_bytes = size(keep)
-    except ValueError as error:
-        raise InputError(f"--keep {keep}: {error}") from None
+    keep_bytes = parse_size("--keep", keep)
     logs, oldest = stored_logs(directory), oldest_beyond(directory, keep_bytes)
     names = [str(one.path) for one in oldest]
     freed, whole = sum(one.bytes for one in oldest), sum(one.bytes for one in logs)
@@ -174,7 +169,7 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
         return 0
     for one in oldest:
         try:
-            delete(one)
+            one.delete()
         except OSError as error:
             raise InputError(f"{one.path} cannot be deleted: {error.strerror or error}") from None
     show(f"deleted {counted(len(oldest), 'log', 'logs')}, {decimal(freed)}")

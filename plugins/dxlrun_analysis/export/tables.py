@@ -15,24 +15,37 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dxlrun import Log, LogError, LogReader
-from dxlrun.log import schemas
-from dxlrun.log.reading.arrow import struct_of
-from dxlrun.messages.definition import parse, short_name
 from dxlrun.tooling.records import PacketKind, Severity, Torque
-from dxlrun.tooling.topics import Codec, LoggedTopic
+from dxlrun.tooling.topics import (
+    ACTIVATION_TOPIC,
+    COMMANDS_TOPIC,
+    CYCLE_TOPIC,
+    DIAGNOSTICS_TOPIC,
+    EVENT_TOPIC,
+    FRAMES_TOPIC,
+    JOINT_COMMANDS_TOPIC,
+    JOINT_STATES_TOPIC,
+    ROBOT_DESCRIPTION_TOPIC,
+    ROSOUT_TOPIC,
+    STILL_FRAMES_TOPIC,
+    Codec,
+    LoggedTopic,
+    bus_topic,
+    message_struct,
+)
 from dxlwire.modes import Mode
 
-CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
+CYCLES, EVENTS, COMMANDS = CYCLE_TOPIC, EVENT_TOPIC, COMMANDS_TOPIC
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one
 WITHOUT_TABLE: Mapping[str, str] = {
-    schemas.JOINT_STATES_TOPIC: "the states are in /cycle",
-    schemas.JOINT_COMMANDS_TOPIC: "the goals are in /cycle",
-    schemas.DIAGNOSTICS_TOPIC: "temperatures, voltages, hardware errors and modes are in /cycle",
-    schemas.FRAMES_TOPIC: "the URDF and the positions in /cycle give the frames",
-    schemas.STILL_FRAMES_TOPIC: "the URDF has these frames",
-    schemas.ROBOT_DESCRIPTION_TOPIC: "it is one text, the URDF",
-    schemas.ROSOUT_TOPIC: "the same events are in /events",
-    schemas.ACTIVATION_TOPIC: "it is one message, the states and goals before the first cycle",
+    JOINT_STATES_TOPIC: "the states are in /cycle",
+    JOINT_COMMANDS_TOPIC: "the goals are in /cycle",
+    DIAGNOSTICS_TOPIC: "temperatures, voltages, hardware errors and modes are in /cycle",
+    FRAMES_TOPIC: "the URDF and the positions in /cycle give the frames",
+    STILL_FRAMES_TOPIC: "the URDF has these frames",
+    ROBOT_DESCRIPTION_TOPIC: "it is one text, the URDF",
+    ROSOUT_TOPIC: "the same events are in /events",
+    ACTIVATION_TOPIC: "it is one message, the states and goals before the first cycle",
 }
 """Topics of a log that no table has, and the reason."""
 _ROWS = 4096
@@ -122,9 +135,7 @@ def _first_ns(log: Log) -> int | None:
 
 def _packets(log: Log, begin_ns: int, only: Container[str] | None) -> Iterator[Rows]:
     asked = only is None or PACKETS in only
-    buses = [
-        number for number, bus in enumerate(log.buses) if only is not None and schemas.bus_topic(bus) in only
-    ]
+    buses = [number for number, bus in enumerate(log.buses) if only is not None and bus_topic(bus) in only]
     if not (asked or buses) or not len(log.packets):
         return
     table = _packet_table(log, begin_ns)
@@ -133,7 +144,7 @@ def _packets(log: Log, begin_ns: int, only: Container[str] | None) -> Iterator[R
     for index in buses:
         rows = np.flatnonzero(log.packets.bus == index)
         if len(rows):
-            yield Rows(schemas.bus_topic(log.buses[index]), table.take(pa.array(rows)))
+            yield Rows(bus_topic(log.buses[index]), table.take(pa.array(rows)))
 
 
 def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> pa.Table:
@@ -250,11 +261,10 @@ def _messages(log: Log, topic: LoggedTopic, begin_ns: int) -> pa.Table:
     """Return messages with a column for each of their fields; those of nested messages by `a.b`."""
     try:
         codec = Codec(topic.type)
-        definitions = parse(topic.type)
         values = [codec.unpack(data) for data in topic.data]
     except ValueError as error:
         raise LogError(f"{log.path}: a message of {topic.name} cannot be read: {error}") from error
-    whole = pa.array(values, struct_of(short_name(topic.type.name), definitions))
+    whole = pa.array(values, message_struct(topic.type))
     columns = dict(_times(topic.t_ns, begin_ns))
     for name, column in _flat("", whole):
         columns[f"{name}_" if name in columns else name] = column

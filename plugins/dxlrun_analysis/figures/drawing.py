@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dxlrun import Floats
-from dxlrun.output import html
+from dxlrun.tooling import html
 
 _COLUMNS = 900  # About as many as a figure has pixels across
 WIDTH = 9.0  # Inches of 72 points; the page scales it

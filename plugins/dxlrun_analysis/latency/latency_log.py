@@ -6,10 +6,8 @@
 from __future__ import annotations
 
 import platform
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -18,23 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LogError, LogReader
-from dxlrun.channels.messages import MessageRing, Topic
-from dxlrun.channels.ring import Handover
-from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.schemas import LogHeader, LogSummary
 from dxlrun.messages import Number
-from dxlrun.run.run_log import epoch_offset_ns
-from dxlrun.tooling.topics import Codec, declared_message
+from dxlrun.tooling.logs import LogSummary, TopicWriter
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 
 ROBOT = "latency"  # Stands where the logs of runs have the robot's name
 METADATA_NAME = "latency"  # The metadata record that makes a log one of a measurement
 _TOPIC = "/latency/"
-_PACKAGE = "dxlrun_msgs"
 _AT_ONCE = 10_000
 """Wake-ups that become Python's integers at a time: ten millions of them take over a gigabyte."""
-_LIBRARIES = ("dxlrun", "mcap", "numpy")
 
 
 @dataclass(slots=True)
@@ -62,32 +53,14 @@ def write(
     """Write the log of what was measured into a new or empty file. Raises OSError where it cannot begin."""
     processes = tuple((one.condition, one.number, one.cpu_ns, one.wall_ns, one.margin_ns) for one in blocks)
     about = About(settings, load, tuple(remarks), processes)
-    here = platform.uname()
-    header = LogHeader(
-        robot=ROBOT,
-        joints=(),
-        buses=(),
-        controllers=(),
-        period_ns=settings.period_ns,
-        epoch_offset_ns=epoch_offset_ns(),
-        metadata={
-            METADATA_NAME: {"about": msgspec.json.encode(about).decode()},
-            "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in _LIBRARIES},
-            "kernel": {"system": here.system, "release": here.release, "version": here.version}
-            | {"machine": here.machine},
-        },
-    )
-    log = LogWriter(path, header)
-    ring = MessageRing(Handover(log.take))
-    codec = Codec(declared_message(WakeUp, _PACKAGE).type)
-    topics = {
-        one.name: ring.announce(Topic(f"{_TOPIC}{one.name}", codec.message)) for one in settings.conditions
-    }
+    metadata = {METADATA_NAME: {"about": msgspec.json.encode(about).decode()}}
+    log = TopicWriter(path, ROBOT, settings.period_ns, metadata)
+    topics = {one.name: log.open_topic(f"{_TOPIC}{one.name}", WakeUp) for one in settings.conditions}
     for block in blocks:
         topic = topics[block.condition]
         for begin in range(0, len(block.times), _AT_ONCE):
             for scheduled_ns, woken_ns in block.times[begin : begin + _AT_ONCE].tolist():
-                ring.message(topic, woken_ns, codec.pack_row((scheduled_ns, woken_ns, block.number)))
+                log.append(topic, woken_ns, (scheduled_ns, woken_ns, block.number))
     return log.close()
 
 

@@ -10,7 +10,6 @@ from bokeh.models import Range1d
 from numpy.typing import NDArray
 
 from dxlrun import Log
-from dxlrun.messages.cdr import Value
 from dxlrun.tooling.topics import MACHINE_TOPIC
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Line, Plot, many_lines
 from dxlrun_analysis.page.curves import Curves
@@ -60,7 +59,7 @@ class MachineCollector:
         order = sorted(range(self._cores), key=lambda core: (-self._loop.get(core, 0), -busy[core], core))
         return Curves.of(rows, names), tuple(order[:MOST_CORES])
 
-    def _add(self, message: Mapping[str, Value]) -> None:
+    def _add(self, message: Mapping[str, object]) -> None:
         t_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
         cores = {name: cast("Numbers", message[name]) for name in ("user", "system", "irq", "softirq")}
         interrupts = cores["irq"] + cores["softirq"]

@@ -19,9 +19,7 @@ import numpy as np
 import yaml
 
 from dxlrun import InputError, LogError, open_log
-from dxlrun.log.schemas import JOINT_STATE
-from dxlrun.messages import Header, JointTrajectoryPoint
-from dxlrun.messages.cdr import Value
+from dxlrun.messages import Header, JointState, JointTrajectoryPoint
 from dxlrun.tooling.logs import LogWalk
 from dxlrun.tooling.topics import ENCAPSULATION, Codec, declared_message
 from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
@@ -36,6 +34,7 @@ class JointTrajectory(msgspec.Struct):
     points: tuple[JointTrajectoryPoint, ...]
 
 
+JOINT_STATE = declared_message(JointState, "").type
 JOINT_TRAJECTORY = declared_message(JointTrajectory, "").type
 _TYPES: Mapping[str, tuple[What, Codec]] = {
     JOINT_STATE.name: ("states", Codec(JOINT_STATE)),
@@ -137,22 +136,22 @@ def _moments(message: _Found) -> _Moments:
     if message.data[: len(_CDR)] != _CDR:
         raise ValueError(f"{message.topic} is not CDR, little-endian")
     values = codec.unpack(ENCAPSULATION + message.data[len(ENCAPSULATION) :])
-    start_ns = _time_ns(cast("Mapping[str, Value]", values["header"])["stamp"]) or message.t_ns
+    start_ns = _time_ns(cast("Mapping[str, object]", values["header"])["stamp"]) or message.t_ns
     names = cast("Sequence[str]", values["name" if what == "states" else "joint_names"])
     if what == "states":
-        rows = [values["position"]] if len(cast("Floats", values["position"])) else []
+        rows = [cast("Floats", values["position"])] if len(cast("Floats", values["position"])) else []
         after_s = np.zeros(len(rows))
     else:
-        points = cast("Sequence[Mapping[str, Value]]", values["points"])
-        rows = [point["positions"] for point in points]
+        points = cast("Sequence[Mapping[str, object]]", values["points"])
+        rows = [cast("Floats", point["positions"]) for point in points]
         after_s = np.array([_time_ns(point["time_from_start"]) * 1e-9 for point in points])
-    if any(len(cast("Floats", row)) != len(names) for row in rows):
+    if any(len(row) != len(names) for row in rows):
         raise ValueError(f"{message.topic} has not one position for each joint of a message")
     positions = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
     return _Moments(message.topic, what, start_ns, tuple(map(str, names)), after_s, positions)
 
 
-def _time_ns(stamp: Value) -> int:
+def _time_ns(stamp: object) -> int:
     values = cast("Mapping[str, int]", stamp)
     return int(values["sec"]) * 1_000_000_000 + int(values["nanosec"])
 

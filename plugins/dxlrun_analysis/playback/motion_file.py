@@ -12,9 +12,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun import InputError, JointUnit, LogError
-from dxlrun.description.motion import motion_of
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan, from_json
-from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins
+from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins, parse_motion
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, SplinePath, fit
 from dxlrun_controllers.joints import CLOSING_SPEED
@@ -75,7 +74,7 @@ def motion_file(
         points[part.controller] = len(rows)
         lines += [f"  - controller: {part.controller}", "    points:", *rows]
     text = "\n".join(lines) + "\n"
-    motion_of(text, target)  # what was written is read as every motion file
+    parse_motion(text, target)  # what was written is read as every motion file
     return MotionFile(text, points)
 
 

@@ -11,8 +11,7 @@ from typing import Literal
 from msgspec.structs import replace
 
 from dxlrun import InputError
-from dxlrun.control.controllers.single_files import file_of, publisher_of
-from dxlrun.tooling.robots import read_file
+from dxlrun.tooling.robots import published_by, read_file
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 CodeChoice = Literal["current", "log"]
@@ -40,12 +39,7 @@ def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPl
     if missing:
         raise InputError("\n".join(f"--code current: {folder / name} cannot be read" for name in missing))
     texts = {**plan.included, **{name: text for name, text in now.items() if text is not None}}
-    controllers = tuple(
-        replace(one, distribution=publisher_of(file, texts[file]))
-        if (file := file_of(one.type)) in changed
-        else one
-        for one in plan.loop.controllers
-    )
+    controllers = published_by(plan.loop.controllers, {name: texts[name] for name in changed})
     return replace(plan, included=texts, loop=replace(plan.loop, controllers=controllers)), ()
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Floats, LogError
-from dxlrun.control.controllers.manager import Manager
-from dxlrun.tooling.plans import LoopPlan
+from dxlrun.tooling.plans import ControllerPlan, LoopPlan
 from dxlrun.tooling.records import CycleRecord
-from dxlrun_analysis.replay.inputs import RecordedHardware
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 from dxlwire.modes import COMMAND_INTERFACES
 
@@ -42,17 +40,18 @@ class JointDifferences(msgspec.Struct, frozen=True):
 
 
 class Comparison:
-    """The sink of a replayed loop: compares each cycle as it comes; NaN and zero by their bits too."""
+    """Compares each cycle of a replay with the recorded one; NaN and zero by their bits too."""
 
     def __init__(
-        self, plan: LoopPlan, inputs: RecordedInputs, manager: Manager, hardware: RecordedHardware
+        self, plan: LoopPlan, inputs: RecordedInputs, controllers: Callable[[], Sequence[ControllerPlan]]
     ) -> None:
+        """`controllers` returns the plans of those that run, by their bits in the masks."""
         self.first: ReplayDifference | None = None
         self.compared = 0  # Cycles
         self.different = 0  # Cycles in which anything differs
         self._plan = plan
         self._inputs = inputs
-        self._manager, self._hardware = manager, hardware
+        self._controllers = controllers
         count = len(plan.joints)
         self._counts = {name: np.zeros(count, np.int64) for name in ("reference", "command", "goal")}
         self._joint_of = np.array(
@@ -73,15 +72,8 @@ class Comparison:
         )
         return tuple(one for one in found if one.commands or one.goals or one.references)
 
-    def wake(self, cycle: int) -> None:
-        """Nothing is exchanged."""
-
-    def begin(self, record: CycleRecord) -> None:
-        """Nothing was commanded yet."""
-
-    def append(self, record: CycleRecord) -> None:
+    def compare(self, record: CycleRecord, row: np.void, index: int) -> None:
         """Compare one finished cycle. Raises LogError when its inputs are not the recorded ones."""
-        index, row = self._hardware.index, self._hardware.recorded()
         if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
             raise LogError(
                 f"cycle {record.cycle} was due {self._since_start(int(row['scheduled_ns']))} in the run and "
@@ -114,7 +106,6 @@ class Comparison:
             self._count(differs)
         self.different += bool(differ or differs)
         self.compared += 1
-        self._hardware.next()
 
     def _count(self, differs: Mapping[str, NDArray[np.bool_]]) -> None:
         for what, names in (("command", _COMMANDS), ("goal", _GOALS)):
@@ -128,7 +119,7 @@ class Comparison:
         changed = recorded ^ active
         bit = (changed & -changed).bit_length() - 1
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
-        plans = self._manager.plans
+        plans = self._controllers()
         # one that the replay could not load has no name here
         name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
         return self._inputs.difference(index, "active", None, name, *states)
@@ -136,7 +127,7 @@ class Comparison:
     def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:
         """Return what a place in a field of a cycle is called, its joint, and the controller that commands
         it; `active`: those that were, in the run or in the replay."""
-        layout, plans = self._plan.layout, self._manager.plans
+        layout, plans = self._plan.layout, self._controllers()
         if field in _OF_NO_JOINT:
             name = (layout.source_states if field == "source_state" else layout.device_commands)[place]
             owners = [

@@ -10,11 +10,10 @@ import msgspec
 import numpy as np
 
 from dxlrun import Log
-from dxlrun.channels.messages import MessageSink, Topic
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import EventCode, LostRecords
-from dxlrun.tooling.topics import MACHINE_TOPIC, Codec, MessageType
+from dxlrun.tooling.topics import MACHINE_TOPIC, Codec, MessageSink, MessageType, PublishedTopic
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"
@@ -45,7 +44,7 @@ class MessageComparison(MessageSink):
         self.compared = 0
         self.different = 0
         self._topics: dict[str, _Pending] = {}
-        self._announced: list[Topic] = []
+        self._announced: list[PublishedTopic] = []
         self._inputs = inputs
         self._until_ns = int(inputs.log.cycles["woken_ns"][inputs.end - 1])
         self._whole = inputs.end == len(inputs.log.cycles) and any(
@@ -70,7 +69,7 @@ class MessageComparison(MessageSink):
             pending = self._topics.setdefault(name, _Pending(logged.type))
             pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
 
-    def announce(self, topic: Topic) -> int:
+    def announce(self, topic: PublishedTopic) -> int:
         """Take a topic; return its number."""
         self._announced.append(topic)
         return len(self._announced) - 1
@@ -125,7 +124,9 @@ def _lost(log: Log) -> int:
     return lost
 
 
-def _where(logged: MessageType, now: Topic, recorded: bytes, replayed: bytes) -> tuple[str, str, str]:
+def _where(
+    logged: MessageType, now: PublishedTopic, recorded: bytes, replayed: bytes
+) -> tuple[str, str, str]:
     """Return the first field that differs, and its values."""
     if (logged.name, logged.text) != (now.type.name, now.type.text):
         return "", f"type {logged.name}", f"another definition of {now.type.name}"

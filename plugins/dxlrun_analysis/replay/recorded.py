@@ -12,15 +12,12 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun import CONTRACT_VERSION, Log, LogError
-from dxlrun.channels.kept import KeptStates
-from dxlrun.control.controllers.plugins import distribution_name
-from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key, package_of
-from dxlrun.log.schemas import KEPT_ATTACHMENT
-from dxlrun.tooling.logs import UNREADABLE
+from dxlrun.tooling.logs import IDENTITY_NAME, UNREADABLE, changed_code
 from dxlrun.tooling.plans import LoopPlan, PolicyName, PolicyPlan, decode_plan
 from dxlrun.tooling.records import EventCode
 from dxlrun.tooling.robots import PlugIns
-from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
+from dxlrun.tooling.runs import RunInputs, kept_states_of
+from dxlrun_analysis.client_commands import client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")  # A different version of these may change a command
@@ -57,20 +54,10 @@ class ReplayDifference(msgspec.Struct, frozen=True):
     replayed: str
 
 
-class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
-    """The inputs of one run."""
+class RecordedInputs(RunInputs, frozen=True, eq=False):
+    """The inputs of one run, and what a replay says about them."""
 
-    log: Log  # All that the log has, but packets and topics; of its cycles the scalars
     plan: RecordedPlan
-    loop: LoopPlan
-    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
-    policy where the run did, not by itself."""
-    activation: np.void  # States and goals when the controllers were activated
-    start_ns: int  # Deadline of cycle 0
-    steered: tuple[ClientCommand, ...]  # The commands from outside
-    end: int  # How many cycles can be compared, from the first on; one at least
-    ends: int  # Index of the first cycle that is a policy's; in those the controllers are not active
-    kept: KeptStates  # What controllers began with that they had kept in earlier runs
     stopped: str  # Why some cycles cannot be compared; empty when all can
 
     def difference(  # noqa: PLR0917  what a difference is made of
@@ -104,7 +91,7 @@ def recorded(log: Log) -> RecordedInputs:
         steered=client_commands(log),
         end=end,
         ends=ends,
-        kept=_kept(log),
+        kept=kept_states_of(log),
         stopped=stopped,
     )
 
@@ -149,23 +136,8 @@ def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]
 
 def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
     """Return a sentence for each plug-in of these controllers whose files have changed, and dxlrun itself."""
-    then = inputs.log.metadata.get(IDENTITY_NAME, {})
-    if not then:
-        return ()
-    used = {distribution_name(plan.distribution) for plan in inputs.plan.loop.controllers}
-    packages = {package_of(key) for key in then if key.startswith(file_key(PLUGIN, ""))}
-    now = code_hashes(one for one in packages if one[1] in used)
-    sentences = []
-    if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
-        sentences.append("dxlrun itself has changed since the run")
-    for name in sorted(used):
-        prefix = file_key(f"{PLUGIN} {name}", "")
-        own = sorted(key for key in {*then, *now} if key.startswith(prefix))
-        changed = [key.removeprefix(prefix) for key in own if then.get(key) != now.get(key)]
-        if changed:
-            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-            sentences.append(f"the plug-in {name} has changed since the run (file {changed[0]}{more})")
-    return tuple(sentences)
+    publishers = [plan.distribution for plan in inputs.plan.loop.controllers]
+    return changed_code(inputs.log.metadata.get(IDENTITY_NAME, {}), publishers)
 
 
 def _plan(log: Log) -> RecordedPlan:
@@ -197,15 +169,6 @@ def _plan(log: Log) -> RecordedPlan:
         raise LogError(f"{log.path}: the plan in the log has other devices and sensors than its cycles")
     _check_controllers(log, plan.loop)
     return plan
-
-
-def _kept(log: Log) -> KeptStates:
-    """Return what controllers began with; in logs from before kept states that is nothing."""
-    data = log.attachments.get(KEPT_ATTACHMENT)
-    try:
-        return KeptStates() if data is None else msgspec.json.decode(data, type=KeptStates)
-    except UNREADABLE as error:
-        raise LogError(f"{log.path}: {KEPT_ATTACHMENT} in the log cannot be read: {error}") from error
 
 
 def _check_controllers(log: Log, loop: LoopPlan) -> None:

@@ -9,29 +9,17 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun import PlugInError, open_log
-from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.plans import LoopPlan
-from dxlrun.tooling.records import CycleRecord, EventCode, Severity
 from dxlrun.tooling.robots import PlugIns, load_plugins
+from dxlrun.tooling.runs import RecordedRun
 from dxlrun_analysis.replay.changes import Setting, with_arguments, with_changed_code, with_settings
 from dxlrun_analysis.replay.code import CodeChoice, with_code
 from dxlrun_analysis.replay.comparison import Comparison, JointDifferences
-from dxlrun_analysis.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
 from dxlrun_analysis.replay.prepared import PreparedComparison
 from dxlrun_analysis.replay.published import MessageComparison
 from dxlrun_analysis.replay.recorded import ReplayDifference, code_remarks, recorded, version_remarks
 from dxlrun_analysis.replay.tape import Tape, overview
-
-
-class _Silence:
-    """The events of a replay: the recorded ones are in the log."""
-
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        """Forget it."""
 
 
 class ReplayReport(msgspec.Struct, frozen=True):
@@ -113,38 +101,9 @@ def replay_log(
     messages = MessageComparison(inputs)
     tape = Tape(reader, woken_ns, messages.feed)
 
-    record, stop, events = CycleRecord(plan.layout), StopFlag(), _Silence()
-    clock = RecordedClock(inputs.start_ns - plan.period_ns)
-    hardware = RecordedHardware(inputs, tape.row, record, clock, stop)
-    manager = Manager(
-        plan,
-        plugins,
-        record,
-        events,
-        clock,
-        commands=PlannedCommands(inputs.log.commands, str(reader.path)),
-        topics=TopicLog(record, messages, read.header.epoch_offset_ns),
-        kept=inputs.kept,
-    )
-    comparison = Comparison(plan, inputs, manager, hardware)
-    inbox = RecordedInbox(inputs.steered, record, lambda taken: prepared.of_client(taken, manager.controller))
-    loop = Loop(
-        clock=clock,
-        hardware=hardware,
-        manager=manager,
-        gate=Gate(plan, record, events),
-        record=record,
-        sink=comparison,
-        events=events,
-        plan=plan,
-        beat=lambda: None,
-        stop=stop,
-        inbox=inbox,
-    )
-    tape.row(0)  # what is published before the first cycle finds its messages
-    manager.configure()
-    hardware.start()
-    result = loop.run()
+    run = RecordedRun(inputs, plan, plugins, row=tape.row, messages=messages, prepare=prepared.of_client)
+    comparison = Comparison(plan, inputs, lambda: run.controllers)
+    result = run.run(comparison.compare)
 
     early = comparison.compared < inputs.end
     messages.finish((int(woken_ns[comparison.compared - 1]) if comparison.compared else -1) - early)
@@ -167,7 +126,7 @@ def replay_log(
             *version_remarks(inputs, plugins),
             *code_remarks(inputs),
             *code_changes,
-            *inbox.remarks,
+            *run.remarks,
             *messages.remarks,
         ),
         messages=messages.compared,

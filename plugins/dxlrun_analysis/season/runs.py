@@ -19,8 +19,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from dxlrun import ROTARY, InputError, Log, LogError, open_log
-from dxlrun.log.identity import HOST, IDENTITY_NAME, RUNTIME, code_hashes
-from dxlrun.tooling.logs import is_being_written, is_log_directory, log_files
+from dxlrun.tooling.logs import IDENTITY_NAME, is_being_written, is_log_directory, log_files, runtime_hash
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.finding import ROBOT
 from dxlrun_analysis.report import Report, analyze
@@ -98,7 +97,7 @@ COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "complete": (_YES, lambda report, _: report.complete),
     "being_written": (_YES, lambda report, _: report.being_written),
     "virtual": (_YES, lambda _, log: on_virtual_time(log)),
-    "host": (_TEXT, lambda _, log: log.metadata.get(IDENTITY_NAME, {}).get(HOST)),
+    "host": (_TEXT, lambda _, log: log.metadata.get(IDENTITY_NAME, {}).get("host")),
     "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),
     "version": (_TEXT, lambda _, log: log.metadata.get("versions", {}).get("dxlrun")),
 }
@@ -231,7 +230,7 @@ def kept_table(
     Raises OSError when the table cannot be kept for the next time.
     """
     name = blake2b(place, digest_size=16).hexdigest()
-    kept_at = cache_directory() / code_hashes()[RUNTIME][:16] / f"{name}.parquet"
+    kept_at = cache_directory() / runtime_hash()[:16] / f"{name}.parquet"
     kept_at.parent.mkdir(parents=True, exist_ok=True)
     known: dict[str, Row] = {}
     with suppress(OSError, pa.ArrowException):  # there is none yet, or it is damaged: all are read again

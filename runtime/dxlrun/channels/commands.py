@@ -90,6 +90,13 @@ class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
         return np.frombuffer(data if len(data) % _NUMBER == 0 else b"", dtype="<f8")
 
 
+class ClientCommand(msgspec.Struct, frozen=True):
+    """One command that is not in the plan."""
+
+    command: TakenCommand
+    refusal: str  # Why nothing was done; empty where it was done, or where the event with the refusal is lost
+
+
 def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
     """Return a command's data from its text and its array in the log. Raises ValueError when neither fits."""
     if controller and text:

@@ -19,7 +19,7 @@ LEAST_CAPACITY = 1 << 20
 MOST_CAPACITY = 64 << 20
 
 
-class Topic(msgspec.Struct, frozen=True):
+class PublishedTopic(msgspec.Struct, frozen=True):
     """A topic that the loop publishes: its name, its type, and the joints that rows of its arrays are of."""
 
     name: str
@@ -35,7 +35,7 @@ class OpenedTopic(msgspec.Struct, frozen=True, array_like=True, tag_field="is", 
     """By which its messages name it, in the order of announcement."""
     before: int
     """How many messages its name has had."""
-    topic: Topic
+    topic: PublishedTopic
 
 
 class TopicMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=4):
@@ -56,7 +56,7 @@ class MessageSink:
 
     __slots__ = ()
 
-    def announce(self, topic: Topic) -> int:
+    def announce(self, topic: PublishedTopic) -> int:
         """Take a topic; return its number."""
         return 0
 
@@ -76,7 +76,7 @@ class MessageRing(MessageSink):
         self._numbers: dict[str, int] = {}
         """Of each name the newest topic."""
 
-    def announce(self, topic: Topic) -> int:
+    def announce(self, topic: PublishedTopic) -> int:
         """Append a topic; return its number. The messages of a name are counted on."""
         number, before = len(self._counts), self._numbers.get(topic.name)
         count = 0 if before is None else self._counts[before]

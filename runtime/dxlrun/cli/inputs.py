@@ -140,6 +140,16 @@ def _assignment_for(word: str) -> str:
     return f"{match[1]}:={match[2] or 'VALUE'}" if match else "name:=value"
 
 
+def parse_size(option: str, text: str) -> int:
+    """Return the bytes of a size such as `10GB`; raises InputError with the name of the option."""
+    from dxlrun.description.units import size  # not above: as in `_of`
+
+    try:
+        return size(text)
+    except ValueError as error:
+        raise InputError(f"{option} {text}: {error}") from None
+
+
 def parse_pair(word: str, example: str) -> tuple[str, str]:
     """Return key and value of a word `key=value`. Raises InputError with an example for another one."""
     key, sign, value = (part.strip() for part in word.partition("="))

@@ -178,7 +178,7 @@ def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
     """Delete the oldest logs if the robot file says so; return what was done, or how much there is."""
     from rich.filesize import decimal
 
-    from dxlrun.log.stored import MUCH_BYTES, delete, oldest_beyond, stored_logs
+    from dxlrun.log.stored import MUCH_BYTES, oldest_beyond, stored_logs
 
     folder = log.parent
     if recording.keep_bytes is None:
@@ -192,7 +192,7 @@ def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
     lines, deleted = [], 0
     for one in oldest_beyond(folder, recording.keep_bytes, [log]):
         try:
-            delete(one)
+            one.delete()
         except OSError as error:
             lines.append(f"{one.path} is kept: {error.strerror or error}")
         else:

@@ -144,10 +144,10 @@ class MotionDescription(msgspec.Struct, frozen=True):
 
 def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
     """Read a motion file that may name groups of joints; raises InputError with all problems of its form."""
-    return motion_of(read_text(path), path, groups)
+    return parse_motion(read_text(path), path, groups)
 
 
-def motion_of(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
+def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
     """Return the motion of a file's text; raises InputError with all problems of its form."""
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)

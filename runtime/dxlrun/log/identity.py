@@ -80,6 +80,41 @@ def package_of(key: str) -> tuple[str, str]:
     return name.partition("/")[0].removesuffix(".py"), distribution
 
 
+def distribution_name(publisher: str) -> str:
+    """Return the distribution of a publisher, `name version`, without the version."""
+    return publisher.rpartition(" ")[0] or publisher
+
+
+def changed_code(then: Mapping[str, str], publishers: Iterable[str]) -> tuple[str, ...]:
+    """Return a sentence for each plug-in whose files differ from those of a run, and one for dxlrun itself.
+
+    Args:
+        then: The identity in the log of the run; empty in logs from before it was kept.
+        publishers: The distributions of the plug-ins that the run used, with their versions.
+    """
+    if not then:
+        return ()
+    used = {distribution_name(publisher) for publisher in publishers}
+    packages = {package_of(key) for key in then if key.startswith(file_key(PLUGIN, ""))}
+    now = code_hashes(one for one in packages if one[1] in used)
+    sentences = []
+    if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
+        sentences.append("dxlrun itself has changed since the run")
+    for name in sorted(used):
+        prefix = file_key(f"{PLUGIN} {name}", "")
+        own = sorted(key for key in {*then, *now} if key.startswith(prefix))
+        changed = [key.removeprefix(prefix) for key in own if then.get(key) != now.get(key)]
+        if changed:
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            sentences.append(f"the plug-in {name} has changed since the run (file {changed[0]}{more})")
+    return tuple(sentences)
+
+
+def runtime_hash() -> str:
+    """Return the hash of dxlrun's own code."""
+    return code_hashes()[RUNTIME]
+
+
 _imported = cache(code_hashes)
 """The code of this process, which imports it once."""
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO, TypeVar, cast
 
@@ -12,12 +14,15 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from dxlrun.channels.events import Event, EventCode, LostRecords, Severity
-from dxlrun.channels.ring import Payload
+from dxlrun.channels.messages import MessageRing, PublishedTopic
+from dxlrun.channels.ring import Handover, Payload
 from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.run_messages import RunMessages
-from dxlrun.log.schemas import CycleSpan, LogHeader, LogSummary, to_metadata
+from dxlrun.log.schemas import CycleSpan, LogHeader, LogSummary, epoch_offset_ns, to_metadata
+from dxlrun.messages.cdr import Codec, Value
+from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
@@ -26,6 +31,8 @@ CHUNK_BYTES = 512 * 1024
 _COMPRESSED_FROM = 16 * 1024
 """Bytes: an attachment of so many is compressed, as the plan is; shorter ones stay as text to read."""
 _LIBRARY = "dxlrun"
+_PACKAGE = "dxlrun_msgs"
+_LIBRARIES = ("dxlrun", "mcap", "numpy")
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 
 
@@ -200,3 +207,56 @@ class LogWriter(RunMessages):
         )
         self._writer.finish()
         self._file.sync()
+
+
+class TopicWriter:
+    """Writes a log of topics into a new or empty file.
+
+        log = TopicWriter(Path("heat.mcap"), "heat", 1_000_000_000, {"setup": {"room": "lab"}})
+        heat = log.open_topic("/heat", Heat)  # a dataclass
+        log.append(heat, t_ns, (t_ns, 21.5))  # its fields
+        log.close()
+
+    Args:
+        path: The file.
+        name: Name in place of the robot's.
+        period_ns: Period of the measurement.
+        metadata: Metadata records by name, in addition to those of the machine.
+
+    Raises:
+        OSError: The file cannot be created.
+    """
+
+    def __init__(self, path: Path, name: str, period_ns: int, metadata: Mapping[str, dict[str, str]]) -> None:
+        here = platform.uname()
+        header = LogHeader(
+            robot=name,
+            joints=(),
+            buses=(),
+            controllers=(),
+            period_ns=period_ns,
+            epoch_offset_ns=epoch_offset_ns(),
+            metadata={
+                **metadata,
+                "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in _LIBRARIES},
+                "kernel": {"system": here.system, "release": here.release, "version": here.version}
+                | {"machine": here.machine},
+            },
+        )
+        self._log = LogWriter(path, header)
+        self._ring = MessageRing(Handover(self._log.take))
+        self._codecs: list[Codec] = []
+
+    def open_topic(self, name: str, message: type) -> int:
+        """Return the number of a new topic; `message` is a dataclass or msgspec struct."""
+        codec = Codec(declared_message(message, _PACKAGE).type)
+        self._codecs.append(codec)
+        return self._ring.announce(PublishedTopic(name, codec.message))
+
+    def append(self, topic: int, t_ns: int, values: Sequence[Value]) -> None:
+        """Append a message; `values` are its fields in order, `t_ns` a time of the monotonic clock."""
+        self._ring.message(topic, t_ns, self._codecs[topic].pack_row(values))
+
+    def close(self) -> LogSummary:
+        """Finish the file; a full disk is in the summary."""
+        return self._log.close()

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.log.schemas import MACHINE
-from dxlrun.messages.cdr import Codec, Value
+from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import LoadSample
 
 _SHARES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq", "steal")
@@ -164,7 +164,7 @@ def _readable(paths: Iterable[Path]) -> Iterable[float]:
             yield float(path.read_text())
 
 
-def load_sample(message: Mapping[str, Value]) -> LoadSample:
+def load_sample(message: Mapping[str, object]) -> LoadSample:
     """Return the part of a message of /machine that the load of the machine is judged by."""
     end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
     idle, steal = (cast("Floats", message[name]) for name in ("idle", "steal"))

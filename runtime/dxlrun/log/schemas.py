@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
+import time
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -256,6 +257,11 @@ class LoggedController(msgspec.Struct, frozen=True):
     joints: tuple[str, ...]
     publishes: tuple[str, ...]
     """Topics that it writes in the cycles it marks."""
+
+
+def epoch_offset_ns() -> int:
+    """Return wall time minus monotonic time, ns: read once, so that a clock step cannot bend the log."""
+    return time.time_ns() - time.monotonic_ns()
 
 
 class LogHeader(msgspec.Struct, frozen=True):

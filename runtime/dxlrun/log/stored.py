@@ -26,6 +26,16 @@ class StoredLog(msgspec.Struct, frozen=True):
     changed_s: float
     """When it was written last, s since 1970."""
 
+    def delete(self) -> None:
+        """Delete the log; raises OSError. Other files in the directory of a log in parts stay."""
+        if not self.path.is_dir():
+            self.path.unlink(missing_ok=True)
+            return
+        for part in log_files(self.path).files:
+            part.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.path.rmdir()
+
 
 def is_being_written(log: Path) -> bool:
     """Return whether a run is writing a log, a file or a directory of parts; False where there is none."""
@@ -69,17 +79,6 @@ def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tu
             found.append(one)
             left -= one.bytes
     return tuple(found)
-
-
-def delete(log: StoredLog) -> None:
-    """Delete a log; raises OSError. Other files in the directory of a log in parts stay."""
-    if not log.path.is_dir():
-        log.path.unlink(missing_ok=True)
-        return
-    for part in log_files(log.path).files:
-        part.unlink(missing_ok=True)
-    with suppress(OSError):
-        log.path.rmdir()
 
 
 def _stored(path: Path) -> StoredLog | None:

@@ -41,7 +41,7 @@ from dxlrun.channels.loop_requests import (
     Unload,
 )
 from dxlrun.contract.controller import Outcome
-from dxlrun.description.motion import motion_of
+from dxlrun.description.motion import parse_motion
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan, JointValues
@@ -406,7 +406,7 @@ class GatewayApp:
         """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
         answer: Played | Refusal
         try:
-            motion = motion_of(given.text, Path(file), self._link.plan.groups)
+            motion = parse_motion(given.text, Path(file), self._link.plan.groups)
             record = self._newest()  # after the reading of the file, which may have taken long
             controllers = {
                 name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))

@@ -84,11 +84,6 @@ def _files(plan: Plan) -> dict[str, str]:
     }
 
 
-def epoch_offset_ns() -> int:
-    """Return wall time minus monotonic time, ns: read once, so that a clock step cannot bend the log."""
-    return time.time_ns() - time.monotonic_ns()
-
-
 def new_log(recording: RecordingPlan, robot: str) -> Path:
     """Create an empty file for a log and return its path: `<robot>_<date>_<time>.mcap`.
 

@@ -39,14 +39,14 @@ from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.realtime import Grant
 from dxlrun.errors import ProcessFault, counted
-from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed
+from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed, epoch_offset_ns
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import sensor_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
-from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, log_header, new_log
+from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,

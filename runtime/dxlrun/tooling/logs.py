@@ -16,13 +16,21 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.cli.tools.tool_log import TOOL_NAME as TOOL_NAME
     from dxlrun.log.columns import PacketColumns as PacketColumns
+    from dxlrun.log.identity import IDENTITY_NAME as IDENTITY_NAME
+    from dxlrun.log.identity import changed_code as changed_code
+    from dxlrun.log.identity import runtime_hash as runtime_hash
+    from dxlrun.log.log_writer import TopicWriter as TopicWriter
     from dxlrun.log.parts import is_log_directory as is_log_directory
     from dxlrun.log.parts import log_files as log_files
     from dxlrun.log.reader import UNREADABLE as UNREADABLE
     from dxlrun.log.reader import LogFollower as LogFollower
     from dxlrun.log.reader import read_log as read_log
     from dxlrun.log.reading.walk import LogWalk as LogWalk
+    from dxlrun.log.schemas import FAILURES_NAME as FAILURES_NAME
+    from dxlrun.log.schemas import SUMMARY_NAME as SUMMARY_NAME
+    from dxlrun.log.schemas import LogSummary as LogSummary
     from dxlrun.log.stored import is_being_written as is_being_written
     from dxlrun.log.stored import oldest_beyond as oldest_beyond
     from dxlrun.log.stored import stored_logs as stored_logs

@@ -17,6 +17,7 @@ from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
     from dxlrun.channels.answers import CommandOutcome as CommandOutcome
+    from dxlrun.channels.commands import ClientCommand as ClientCommand
     from dxlrun.channels.commands import TakenCommand as TakenCommand
     from dxlrun.channels.cycle import OFFLINE as OFFLINE
     from dxlrun.channels.cycle import CycleRecord as CycleRecord

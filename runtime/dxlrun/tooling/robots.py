@@ -17,12 +17,16 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.compile.logged_plan import compile_texts as compile_texts
+    from dxlrun.compile.logged_plan import replan_controller as replan_controller
     from dxlrun.compile.motions import TRAJECTORY as TRAJECTORY
     from dxlrun.compile.motions import command_kind as command_kind
     from dxlrun.compile.robot import compile_robot as compile_robot
     from dxlrun.control.controllers.plugins import PlugIns as PlugIns
     from dxlrun.control.controllers.plugins import load_plugins as load_plugins
+    from dxlrun.control.controllers.single_files import published_by as published_by
     from dxlrun.description.document import read_file as read_file
+    from dxlrun.description.motion import parse_motion as parse_motion
     from dxlrun.description.motion import read_motion as read_motion
     from dxlrun.description.reading import Description as Description
     from dxlrun.description.reading import read_robot as read_robot

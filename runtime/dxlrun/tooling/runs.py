@@ -1,4 +1,4 @@
-"""Runs: running a robot, in processes of its own or on virtual time.
+"""Runs: running a robot, in processes of its own, on virtual time, or its controllers on a recorded run.
 
 `dxlrun.testing.simulated_robot` makes a virtual run of a robot file in one call.
 
@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.control.recorded_run import RecordedRun as RecordedRun
+    from dxlrun.control.recorded_run import RunInputs as RunInputs
+    from dxlrun.control.recorded_run import kept_states_of as kept_states_of
     from dxlrun.run.run_log import discard_log as discard_log
     from dxlrun.run.run_log import new_log as new_log
     from dxlrun.run.run_summary import RunOptions as RunOptions

@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.channels.messages import MessageSink as MessageSink
+    from dxlrun.channels.messages import PublishedTopic as PublishedTopic
+    from dxlrun.log.reading.arrow import message_struct as message_struct
     from dxlrun.log.reading.topics import LoggedTopic as LoggedTopic
     from dxlrun.log.schemas import ACTIVATION_TOPIC as ACTIVATION_TOPIC
     from dxlrun.log.schemas import BUS_PREFIX as BUS_PREFIX

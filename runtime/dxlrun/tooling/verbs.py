@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dxlrun.cli.inputs import examples_directory as examples_directory
     from dxlrun.cli.inputs import known_file as known_file
     from dxlrun.cli.inputs import parse_assignments as parse_assignments
+    from dxlrun.cli.inputs import parse_size as parse_size
     from dxlrun.cli.inputs import read_models as read_models
     from dxlrun.cli.inputs import terminated_as_interrupted as terminated_as_interrupted
     from dxlrun.cli.inputs import write_report as write_report

@@ -34,8 +34,8 @@ def tool_log(
     from dxlrun.channels.ring import Handover
     from dxlrun.log.identity import HOST, IDENTITY_NAME, code_hashes
     from dxlrun.log.log_writer import LogWriter
-    from dxlrun.log.schemas import LogHeader
-    from dxlrun.run.run_log import epoch_offset_ns, incomplete_log
+    from dxlrun.log.schemas import LogHeader, epoch_offset_ns
+    from dxlrun.run.run_log import incomplete_log
 
     check_target(path)
     metadata = {TOOL_NAME: {"command": command}, IDENTITY_NAME: {**code_hashes(), HOST: platform.node()}}

@@ -28,6 +28,7 @@ from dxlrun.control.controllers.single_files import class_in_file, file_of, publ
 from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
+from dxlrun.log.identity import distribution_name
 from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
 from dxlsim.motor_model import MotorModel
@@ -323,11 +324,6 @@ def _together(
 
 def _top(module: str) -> str:
     return module.partition(".")[0]
-
-
-def distribution_name(publisher: str) -> str:
-    """Return the distribution of a publisher, `name version`, without the version."""
-    return publisher.rpartition(" ")[0] or publisher
 
 
 def _publisher(entry_point: EntryPoint) -> str:

@@ -9,14 +9,17 @@ from __future__ import annotations
 import re
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from importlib.abc import ExecutionLoader
 from types import ModuleType
 
+from msgspec.structs import replace
+
 from dxlrun.contract.controller import Controller
 from dxlrun.errors import PlugInError, suggestion
+from dxlrun.plan.loop_plan import ControllerPlan
 
 _TYPE = re.compile(r"\./([A-Za-z_]\w*\.py):([A-Za-z_]\w*)", re.ASCII)
 _HASH = 12
@@ -37,6 +40,23 @@ def file_of(type_name: str) -> str | None:
 def publisher_of(file: str, text: str) -> str:
     """Return a file's name with its hash, as packages are named with their version."""
     return f"{file} {sha256(text.encode()).hexdigest()[:_HASH]}"
+
+
+def published_by(
+    controllers: Sequence[ControllerPlan], texts: Mapping[str, str]
+) -> tuple[ControllerPlan, ...]:
+    """Return the plans of controllers; those of files in `texts` are published by these texts.
+
+    Args:
+        controllers: The plans of all controllers.
+        texts: Texts of single files by name.
+    """
+    return tuple(
+        replace(plan, distribution=publisher_of(file, texts[file]))
+        if (file := file_of(plan.type)) in texts and file is not None
+        else plan
+        for plan in controllers
+    )
 
 
 def class_in_file(type_name: str, files: Mapping[str, str]) -> object:

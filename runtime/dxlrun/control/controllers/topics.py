@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, Topic
+from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, PublishedTopic
 from dxlrun.errors import ControllerFault
 from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
 
@@ -23,7 +23,7 @@ class Publisher:
 
     def __init__(
         self,
-        topic: Topic,
+        topic: PublishedTopic,
         message: DeclaredMessage,
         sink: MessageSink,
         record: CycleRecord,
@@ -61,7 +61,7 @@ class TopicLog:
     ) -> Publisher:
         """Announce a topic of messages of a dataclass; allocates. Raises WrongMessage when it is none."""
         declared = declared_message(message, package)
-        topic = Topic(name, declared.type, joints)
+        topic = PublishedTopic(name, declared.type, joints)
         return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
 
     def of_controller(self, name: str, bit: int) -> ControllerTopics:

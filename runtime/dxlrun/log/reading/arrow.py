@@ -9,7 +9,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dxlrun.messages.cdr_columns import Column, ColumnReader
-from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, short_name
+from dxlrun.messages.definition import (
+    PRIMITIVES,
+    Definitions,
+    MessageField,
+    MessageType,
+    parse,
+    short_name,
+)
 
 
 def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
@@ -36,6 +43,11 @@ def type_of(one: MessageField, definitions: Definitions) -> pa.DataType:
     else:
         inside = pa.from_numpy_dtype(np.dtype(PRIMITIVES[one.kind]))
     return pa.list_(inside) if one.sequence or one.length else inside
+
+
+def message_struct(message: MessageType) -> pa.DataType:
+    """Return the Arrow type of the messages of a topic."""
+    return struct_of(short_name(message.name), parse(message))
 
 
 def struct_of(message: str, definitions: Definitions) -> pa.DataType:

@@ -17,7 +17,7 @@ import msgspec
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.events import Event
-from dxlrun.channels.messages import OpenedTopic, Topic, TopicMessage
+from dxlrun.channels.messages import OpenedTopic, PublishedTopic, TopicMessage
 from dxlrun.channels.ring import Gap, Record, RingReader
 from dxlrun.channels.tagged import Tagged, decode
 from dxlrun.log.schemas import CYCLE, CYCLE_TOPIC, EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
@@ -56,7 +56,7 @@ class _LoopTopic:
 
     __slots__ = ("count", "newest", "times", "topic")
 
-    def __init__(self, topic: Topic, count: int) -> None:
+    def __init__(self, topic: PublishedTopic, count: int) -> None:
         self.topic, self.count = topic, count
         self.newest: TopicMessage | None = None
         self.times: deque[int] = deque(maxlen=_TIMES)
@@ -99,7 +99,7 @@ class LiveTopics:
         }
         self.ring = RingReader(messages)
 
-    def collect(self) -> list[tuple[Topic, TopicMessage]]:
+    def collect(self) -> list[tuple[PublishedTopic, TopicMessage]]:
         """Return the messages since the last call; the log declares what was lost on the way."""
         found = []
         for message in _decoded(iter(self.ring.read, None)):
@@ -112,13 +112,13 @@ class LiveTopics:
                 found.append((known.topic, message))
         return found
 
-    def described(self, name: str) -> Topic:
+    def described(self, name: str) -> PublishedTopic:
         """Return a topic; raises KeyError when there is none of this name."""
         if name in self.of_loop:
             return self.of_loop[name].topic
         if name == EVENT_TOPIC:
-            return Topic(name, EVENT)
-        return Topic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
+            return PublishedTopic(name, EVENT)
+        return PublishedTopic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
 
     def states(self, cycles: int) -> list[TopicState]:
         """Return what there is to listen to, after so many cycles."""
@@ -189,7 +189,7 @@ class TopicStream:
             found = [*{(type(frame), frame.place): frame for frame in found}.values()]
         return b"".join(map(framed, found))
 
-    def _opened(self, topic: Topic) -> Opened | Sample:
+    def _opened(self, topic: PublishedTopic) -> Opened | Sample:
         place, kind = self._places[topic.name], topic.type
         return Opened(place, topic.name, kind.name, kind.text, topic.joints, self._offset_ns)
 

@@ -1,4 +1,4 @@
-"""Recorded inputs: the clock, the servos and the clients of a loop, fed from a log; goals are taken by none.
+"""Recorded run: a loop that is fed from a log: its clock, servos and clients; its goals go nowhere.
 
 These are the seams of the loop: a replay changes nothing above them.
 """
@@ -8,24 +8,59 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import LogError, PortError, States
 from dxlrun.channels.answers import Answer, Refusal
-from dxlrun.channels.commands import Command
-from dxlrun.control.loop import StopFlag
-from dxlrun.tooling.logs import UNREADABLE
-from dxlrun.tooling.plans import ServoLimit
-from dxlrun.tooling.records import CycleRecord, EventCode, TakenCommand
-from dxlrun_analysis.client_commands import ClientCommand
-from dxlrun_analysis.replay.recorded import RecordedInputs
+from dxlrun.channels.commands import ClientCommand, Command, TakenCommand
+from dxlrun.channels.cycle import CycleRecord, States
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.messages import MessageSink
+from dxlrun.contract.controller import Controller
+from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.gate import Gate
+from dxlrun.control.loop import Loop, LoopResult, StopFlag
+from dxlrun.errors import LogError, PortError
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.schemas import KEPT_ATTACHMENT
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ServoLimit
 from dxlwire.modes import COMMAND_INTERFACES
 
 _STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
+
+
+class RunInputs(msgspec.Struct, frozen=True, eq=False):
+    """The inputs of one run."""
+
+    log: Log  # All that the log has, but packets and topics; of its cycles the scalars
+    loop: LoopPlan
+    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
+    policy where the run did, not by itself."""
+    activation: np.void  # States and goals when the controllers were activated
+    start_ns: int  # Deadline of cycle 0
+    steered: tuple[ClientCommand, ...]  # The commands from outside
+    end: int  # Number of cycles that can be run again, at least one
+    ends: int  # Index of the first cycle that is a policy's; in those the controllers are not active
+    kept: KeptStates  # What controllers began with that they had kept in earlier runs
+
+
+def kept_states_of(log: Log) -> KeptStates:
+    """Return the kept states that controllers began with; none in logs from before kept states.
+
+    Raises LogError when they cannot be read.
+    """
+    data = log.attachments.get(KEPT_ATTACHMENT)
+    try:
+        return KeptStates() if data is None else msgspec.json.decode(data, type=KeptStates)
+    except UNREADABLE as error:
+        raise LogError(f"{log.path}: {KEPT_ATTACHMENT} in the log cannot be read: {error}") from error
 
 
 class RecordedClock:
@@ -52,7 +87,7 @@ class RecordedClock:
 
 
 class RecordedHardware:
-    """Servos with the states of the run, bit for bit, that take no goals; see `control.loop.Hardware`.
+    """Servos with the states of the run, bit for bit, that take no goals; see `contract.hardware.Hardware`.
 
     After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
     periods that were skipped. After the cycle before number `inputs.ends` it asks the loop to stop: those
@@ -61,7 +96,7 @@ class RecordedHardware:
 
     def __init__(
         self,
-        inputs: RecordedInputs,
+        inputs: RunInputs,
         row: Callable[[int], np.void],
         record: CycleRecord,
         clock: RecordedClock,
@@ -73,8 +108,8 @@ class RecordedHardware:
         self._record = record
         self._clock = clock
         self._stop = stop
-        self._outside = len(inputs.plan.loop.sources)  # Sources that are no controllers: they come first
-        self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
+        self._outside = len(inputs.loop.sources)  # Sources that are no controllers: they come first
+        self._outside_states = sum(len(one.states) for one in inputs.loop.sources)
         self.index = 0  # Of the cycle that is replayed
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
         """The registers of the servos in the run, from the events until this cycle"""
@@ -164,9 +199,9 @@ class RecordedHardware:
         """Do nothing: no servo holds."""
 
 
-def _read_limits(inputs: RecordedInputs) -> Iterator[tuple[int, int, Sequence[ServoLimit]]]:
+def _read_limits(inputs: RunInputs) -> Iterator[tuple[int, int, Sequence[ServoLimit]]]:
     """Yield when the limits of a joint's servo were read, the joint's row, and the limits."""
-    rows = {joint.name: row for row, joint in enumerate(inputs.plan.loop.joints)}
+    rows = {joint.name: row for row, joint in enumerate(inputs.loop.joints)}
     for event in inputs.log.events:
         if event.code == EventCode.SERVO_LIMITS and event.source in rows:
             with suppress(*UNREADABLE):
@@ -239,3 +274,110 @@ class PlannedCommands:
                 f"{self._log}: {command.kind} of the plan for {command.controller} was not taken by cycle "
                 f"{command.cycle} in the run, but is due then: the log is damaged"
             )
+
+
+class _NoEvents:
+    """Drops the events of a recorded run: those of the run itself are in the log."""
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Drop an event."""
+
+
+Compare = Callable[[CycleRecord, np.void, int], None]
+"""Called after each cycle with its record, the recorded cycle and that cycle's index."""
+
+
+@dataclass(frozen=True, slots=True)
+class _ComparingSink:
+    """Passes each cycle with the recorded one to the caller."""
+
+    hardware: RecordedHardware
+    compare: Compare
+
+    def wake(self, cycle: int) -> None:
+        """Do nothing: no packets are exchanged."""
+
+    def begin(self, record: CycleRecord) -> None:
+        """Do nothing: nothing was commanded yet."""
+
+    def append(self, record: CycleRecord) -> None:
+        """Compare one finished cycle and go to the next."""
+        self.compare(record, self.hardware.recorded(), self.hardware.index)
+        self.hardware.next()
+
+
+class RecordedRun:
+    """Runs a loop's controllers again on the inputs of a recorded run.
+
+    Args:
+        inputs: The inputs of the run.
+        plan: The loop to run: that of the inputs, with changes.
+        plugins: The types of its controllers.
+        row: Returns a cycle of the log by its index.
+        messages: Takes the messages that controllers publish.
+        prepare: Returns the data of a command that a client sent; it gets the command, and a function that
+            returns a controller by its name.
+    """
+
+    def __init__(
+        self,
+        inputs: RunInputs,
+        plan: LoopPlan,
+        plugins: PlugIns,
+        *,
+        row: Callable[[int], np.void],
+        messages: MessageSink,
+        prepare: Callable[[TakenCommand, Callable[[str], Controller[Any] | None]], bytes],
+    ) -> None:
+        self._inputs, self._plan, self._row = inputs, plan, row
+        self._record, self._stop, self._events = CycleRecord(plan.layout), StopFlag(), _NoEvents()
+        self._clock = RecordedClock(inputs.start_ns - plan.period_ns)
+        self._hardware = RecordedHardware(inputs, row, self._record, self._clock, self._stop)
+        self._manager = Manager(
+            plan,
+            plugins,
+            self._record,
+            self._events,
+            self._clock,
+            commands=PlannedCommands(inputs.log.commands, str(inputs.log.path)),
+            topics=TopicLog(self._record, messages, inputs.log.header.epoch_offset_ns),
+            kept=inputs.kept,
+        )
+        self._inbox = RecordedInbox(
+            inputs.steered, self._record, lambda taken: prepare(taken, self._manager.controller)
+        )
+
+    @property
+    def controllers(self) -> tuple[ControllerPlan, ...]:
+        """The plans of all controllers by their bits in the record's masks."""
+        return self._manager.plans
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """A sentence for each command that was done in the run and is refused now, or the other way round."""
+        return self._inbox.remarks
+
+    def run(self, compare: Compare) -> LoopResult:
+        """Run all cycles that can be run again.
+
+        Raises:
+            LogError: The log is damaged.
+            ControllerFault: A controller cannot be configured.
+        """
+        loop = Loop(
+            clock=self._clock,
+            hardware=self._hardware,
+            manager=self._manager,
+            gate=Gate(self._plan, self._record, self._events),
+            record=self._record,
+            sink=_ComparingSink(self._hardware, compare),
+            events=self._events,
+            plan=self._plan,
+            beat=lambda: None,
+            stop=self._stop,
+            inbox=self._inbox,
+        )
+        self._row(0)  # what is published before the first cycle finds its messages
+        self._manager.configure()
+        self._hardware.start()
+        return loop.run()

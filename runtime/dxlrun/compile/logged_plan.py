@@ -1,0 +1,112 @@
+"""Logged plan: what a log holds of a robot, compiled again with changes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from msgspec.structs import replace
+from pydantic import ValidationError
+
+from dxlrun.compile.robot import Compiled, compile_robot
+from dxlrun.control.controllers.plugins import PlugIns, mismatches
+from dxlrun.description.document import confined
+from dxlrun.description.problems import sentences_of
+from dxlrun.description.reading import read_robot
+from dxlrun.errors import InputError
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+
+_MOST_SENTENCES = 20
+
+
+def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> Compiled:
+    """Compile a robot from texts, in a directory of their own.
+
+    Args:
+        files: Texts by their paths relative to the robot file; the robot file is the first.
+        arguments: Arguments of the robot file.
+        urdf: Text of the URDF that the robot file names, or None.
+
+    Raises:
+        InputError: The files do not compile, or one of them leads out of the directory.
+    """
+    name = next(iter(files))
+    with tempfile.TemporaryDirectory(prefix="dxlrun-replay-") as directory:
+        root = Path(directory).resolve()
+        home = root.joinpath(*["up"] * 8)  # a file may include one beside or above its own directory
+        for relative, text in files.items():
+            _write(root, home / relative, text)
+        try:
+            with confined(root):
+                description = read_robot(home / name, arguments)
+                if urdf is not None and description.robot.model is not None:
+                    _write(root, home / description.robot.model.urdf, urdf)
+                return compile_robot(description, [])
+        except InputError as error:
+            raise InputError(str(error).replace(f"{home}/", "")) from error
+
+
+def _write(root: Path, path: Path, text: str) -> None:
+    """Write one file of the log. Raises InputError for a name that leads out of the directory."""
+    place = Path(path).resolve()
+    if not place.is_relative_to(root):
+        raise InputError(
+            f"the log has a file {path.name} outside of its robot's directory; it is not written"
+        )
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(text)
+
+
+def replan_controller(
+    change: str, plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
+) -> ControllerPlan:
+    """Return the plan of a controller whose parameters or code have changed, with what it claims now.
+
+    Args:
+        change: The change, as messages begin.
+        plan: The controller with its new parameters.
+        joints: Plans of all joints by name.
+        plugins: The types of controllers.
+        urdf: Text of the robot's URDF, or None.
+
+    Raises:
+        InputError: The parameters are wrong, or the controller does not fit the robot of the log.
+    """
+    offer = plugins.controllers.get(plan.type)
+    if offer is None:
+        return plan  # the manager reports it
+    try:
+        parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
+        interfaces = offer.controller.interfaces(parameters, tuple(joints))
+    except ValidationError as error:
+        wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
+        prefix = change.removesuffix(plan.name)
+        raise InputError("\n".join(f"{prefix}{sentence}" for sentence in wrong)) from error
+    except Exception as error:  # foreign code: one sentence instead of its traceback
+        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
+    unknown = [joint for joint in interfaces.joints if joint not in joints]
+    if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
+        what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
+        raise InputError(f"{change}: the controller would want {what}")
+    own = [joints[joint] for joint in interfaces.joints]
+    try:
+        found = mismatches(offer.controller, parameters, interfaces.motors, own, urdf)
+    except Exception as error:  # as above
+        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
+    if found:
+        raise InputError(f"{change}: the controller {found[0].what}")
+    changed = replace(
+        plan,
+        joints=interfaces.joints,
+        command=interfaces.command,
+        reference=interfaces.reference,
+        reads=interfaces.reads,
+        provides=interfaces.provides,
+        device_commands=interfaces.device_commands,
+    )
+    if changed.references != plan.references:
+        raise InputError(f"{change}: the controller would export other references than those of the log")
+    if changed.provides != plan.provides:
+        raise InputError(f"{change}: the controller would provide other states than those of the log")
+    return changed
