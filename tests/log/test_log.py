@@ -35,7 +35,7 @@ from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
-from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
+from dxlrun.log.schemas import LogHeader, LogSummary, from_metadata, to_metadata
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -190,6 +190,12 @@ def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="a directory without a log"):
         read_log(tmp_path)
+
+
+def test_metadata_of_format_8_are_read(header: LogHeader) -> None:
+    text = to_metadata(header)
+    assert text["format"] == "9"
+    assert from_metadata(text | {"format": "8"}) == from_metadata(text)
 
 
 OTHER_FORMAT = "and this version reads formats 8 and 9 only; use the version of dxlrun that recorded it"
