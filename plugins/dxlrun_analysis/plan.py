@@ -19,7 +19,7 @@ from dxlrun.tooling.plans import (
     SchedulerPlan,
     decode_plan,
 )
-from dxlwire.port.latency_timer import is_simulated
+from dxlwire import is_simulated
 
 
 class LoggedRegister(msgspec.Struct):

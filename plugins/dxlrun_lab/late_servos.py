@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Log
-from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlsim.bus.ledger import LedgerEntry
+from dxlwire import PacketKind
 
 _BITS_A_BYTE = 10
 Longs = NDArray[np.int64]

@@ -42,13 +42,17 @@ if TYPE_CHECKING:
     from dxlwire.modes import Mode as Mode
     from dxlwire.modes import mode_of as mode_of
     from dxlwire.packets import PacketKind as PacketKind
+    from dxlwire.plan.line import TIMEOUT_MARGIN_NS as TIMEOUT_MARGIN_NS
     from dxlwire.port.adapters import serial_devices as serial_devices
+    from dxlwire.port.latency_timer import is_simulated as is_simulated
     from dxlwire.port.ports import Port as Port
     from dxlwire.port.ports import SerialPort as SerialPort
     from dxlwire.port.serial_open import SerialLine as SerialLine
     from dxlwire.port.serial_open import open_serial as open_serial
     from dxlwire.transaction import BROADCAST_ID as BROADCAST_ID
     from dxlwire.transaction import Status as Status
+    from dxlwire.wire import protocol1 as protocol1
+    from dxlwire.wire import protocol2 as protocol2
     from dxlwire.wire.dialect import Dialect as Dialect
     from dxlwire.wire.dialect import dialect_of as dialect_of
     from dxlwire.wire.receiver import Receiver as Receiver

@@ -14,7 +14,8 @@ def lazy_face(module: str, source: str) -> tuple[list[str], Callable[[str], obje
 
     Args:
         module: Name of the face.
-        source: File with a line `from MODULE import NAME as NAME` for each name that the face offers.
+        source: File with a line `from MODULE import NAME as NAME` for each name that the face offers;
+            a name may be that of a module.
     """
     with open(source, encoding="utf-8") as lines:
         words = [line.split() for line in lines if line.lstrip().startswith("from dxl") and " as " in line]
@@ -23,7 +24,9 @@ def lazy_face(module: str, source: str) -> tuple[list[str], Callable[[str], obje
     def get(name: str) -> object:
         if name not in homes:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        value: object = getattr(import_module(homes[name]), name)
+        home = import_module(homes[name])
+        # a name that its home has not loaded yet is a module in it
+        value: object = getattr(home, name) if hasattr(home, name) else import_module(f"{homes[name]}.{name}")
         setattr(sys.modules[module], name, value)
         return value
 

@@ -21,10 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.worst import CauseKind
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing, ordered
-from dxlwire.plan.line import TIMEOUT_MARGIN_NS
+from dxlwire import TIMEOUT_MARGIN_NS, PacketKind
 
 _NEVER = np.iinfo(np.int64).max
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.worst import TimelineKind, TimelinePacket
 from dxlrun_analysis.plan import LoggedBus
+from dxlwire import PacketKind
 
 _KIND_NAMES: dict[int, TimelineKind] = {
     PacketKind.INSTRUCTION: "instruction",

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dxlrun import Log, LogError, LogReader
-from dxlwire.modes import COMMAND_INTERFACES
+from dxlwire import COMMAND_INTERFACES
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

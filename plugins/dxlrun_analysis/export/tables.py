@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dxlrun import Log, LogError, LogReader
-from dxlrun.tooling.records import PacketKind, Severity, Torque
+from dxlrun.tooling.records import Severity, Torque
 from dxlrun.tooling.topics import (
     ACTIVATION_TOPIC,
     COMMANDS_TOPIC,
@@ -33,7 +33,7 @@ from dxlrun.tooling.topics import (
     bus_topic,
     message_struct,
 )
-from dxlwire.modes import Mode
+from dxlwire import Mode, PacketKind
 
 CYCLES, EVENTS, COMMANDS = CYCLE_TOPIC, EVENT_TOPIC, COMMANDS_TOPIC
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one

@@ -20,7 +20,7 @@ from dxlrun import Floats, Log
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
-from dxlwire.control_table import Fault
+from dxlwire import Fault
 
 Numbers = NDArray[np.int64]
 

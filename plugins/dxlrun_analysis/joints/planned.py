@@ -11,7 +11,7 @@ import numpy as np
 from dxlrun import LINEAR, Log
 from dxlrun.tooling.plans import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
-from dxlwire.control_table import ControlTable, Fault, HardwareErrors, control_table
+from dxlwire import ControlTable, Fault, HardwareErrors, find_table
 
 _TICK_RAD = math.tau / 4096  # Where the log's plan does not have the servo's
 _NEAREST = (
@@ -101,7 +101,7 @@ def _counts_one_turn(one: Mover) -> bool:
 
 def _table(one: Mover) -> ControlTable | None:
     try:
-        return control_table(one.servo.model, one.bus.protocol)
+        return find_table(one.servo.model, one.bus.protocol)
     except LookupError:  # a plug-in's model that is not installed here
         return None
 

@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, Range1d
 from dxlrun_analysis.causes.tables import worst_title
 from dxlrun_analysis.cycles.worst import TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import BLUE, ERROR, GREEN, INK, MUTED, ORANGE, WARNING, Canvas, Plot
-from dxlwire.transaction import BROADCAST_ID
+from dxlwire import BROADCAST_ID
 
 MOST_CYCLES = 5
 MOST_PACKETS = 400  # Of one cycle: noise may come in any number of pieces

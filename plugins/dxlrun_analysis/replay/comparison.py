@@ -12,7 +12,7 @@ from dxlrun import Floats, LogError
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan
 from dxlrun.tooling.records import CycleRecord
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
-from dxlwire.modes import COMMAND_INTERFACES
+from dxlwire import COMMAND_INTERFACES
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)

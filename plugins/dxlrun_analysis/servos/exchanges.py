@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from dxlrun import Log
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.cycles.latency import DISORDER_NS
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos import requests
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
-from dxlwire.transaction import BROADCAST_ID
+from dxlwire import BROADCAST_ID, PacketKind
 
 _ROWS = 40  # Bits of an exchange's index in a key; above them the servo
 _BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s

@@ -13,9 +13,7 @@ from typing import NamedTuple
 from dxlrun.tooling.records import Event, EventCode, LoggedPacket
 from dxlrun_analysis.finding import HURTS, listed
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
-from dxlwire.control_table import control_table
-from dxlwire.transaction import BROADCAST_ID
-from dxlwire.wire import protocol1, protocol2
+from dxlwire import BROADCAST_ID, find_table, protocol1, protocol2
 
 _AFTER_NS = 2_000_000_000  # A servo that fails so soon after it was written to fails by that
 _MOST_KEPT = 1000
@@ -131,7 +129,7 @@ def _addressed(plan: LoggedBus, servo_id: int) -> list[LoggedServo]:
 def _items(plan: LoggedBus, servo: LoggedServo, address: int, data: bytes) -> list[tuple[str, int]]:
     """Return the items that some bytes fill, from the first byte to the last; none: they do not."""
     try:
-        items = control_table(servo.model, plan.protocol).items
+        items = find_table(servo.model, plan.protocol).items
     except LookupError:  # a plug-in's model that is not installed here
         return []
     sizes = {item.address: (name, item.size) for name, item in items.items()}

@@ -19,8 +19,7 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, instruction_of
-from dxlwire.transaction import BROADCAST_ID
-from dxlwire.wire import protocol1, protocol2
+from dxlwire import BROADCAST_ID, protocol1, protocol2
 
 SPOILS, _FAILED = 1.5, 5.0
 """Shares of a finding about a host that wrote goals, or whose replies may be taken for those of this run, and

@@ -29,7 +29,7 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
-from dxlwire.transaction import BROADCAST_ID
+from dxlwire import BROADCAST_ID
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
 """Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlwire.transaction import BROADCAST_ID
+from dxlwire import BROADCAST_ID
 
 IDS = 256  # A servo is one number: that of its bus times this, plus its ID
 _HEADER_2 = b"\xff\xff\xfd\x00"

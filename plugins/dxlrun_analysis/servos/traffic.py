@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dxlrun import Log
-from dxlrun.tooling.records import PacketKind
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan import LoggedBus, plan_of
@@ -19,8 +18,7 @@ from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlrun_analysis.servos.requests import IDS, Numbers
-from dxlwire.transaction import BROADCAST_ID
-from dxlwire.wire import protocol1, protocol2
+from dxlwire import BROADCAST_ID, PacketKind, protocol1, protocol2
 
 _BYTES = 256
 _KINDS = max(PacketKind) + 1

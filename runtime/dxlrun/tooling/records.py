@@ -42,6 +42,5 @@ if TYPE_CHECKING:
     from dxlrun.plan.machine_load import LoadSample as LoadSample
     from dxlrun.plan.machine_load import MachineLoad as MachineLoad
     from dxlrun.plan.machine_load import SimulationWait as SimulationWait
-    from dxlwire.packets import PacketKind as PacketKind
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
