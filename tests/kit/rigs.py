@@ -310,7 +310,7 @@ def make_rig(
         lambda: beats.append(clock.now_ns()),
         take_over=take_over,
         sources=sources,
-        device_commands=commands,
+        source_commands=commands,
     )
     rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
     rig.sources, rig.device_commands = sources, commands

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.device.safe_values import make_safe
+from dxlrun.dynamixel.bus_part import load_safe_stages, make_safe
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -67,16 +67,17 @@ class DynamixelHardware:
         beat: Callable[[], None],
         take_over: bool = False,
         sources: SourceStates | None = None,
-        device_commands: Floats | None = None,
+        source_commands: Floats | None = None,
         refusals: Callable[[], Sequence[str]] | None = None,
     ) -> None:
         """`refusals` looks at where the servos stand, which the states then have, before any gets torque, and
         returns why the robot must not start, one sentence each.
 
-        `sources`, `device_commands`: of the cycle's record, with the states and commands of devices.
+        `sources`, `source_commands`: of the cycle's record.
 
         Raises NotCompiled where the exchange kernel was not compiled.
         """
+        load_safe_stages()
         self._lines = Lines(plans, ports, clock, packets, beat)
         self._plans, self._buses = self._lines.plans, self._lines.buses
         self._ports = ports
@@ -99,7 +100,7 @@ class DynamixelHardware:
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
         self._samples = Samples(self._plans, states, sources or SourceStates.empty(), reports)
-        commands = np.empty(0) if device_commands is None else device_commands
+        commands = np.empty(0) if source_commands is None else source_commands
         self._servos = tuple(
             Servos(idle, states, arrays, commands, events)
             for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
@@ -365,7 +366,7 @@ class DynamixelHardware:
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
         outcomes = self._limp()
-        self._make_devices_safe()
+        self._make_rest_safe()
         failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
         self._disarm({(one.bus, one.servo_id) for one in outcomes if one.confirmed})
         for sentence in failures:
@@ -382,7 +383,7 @@ class DynamixelHardware:
 
     def release(self) -> None:
         """Leave the robot with its torque on: nothing is sent any more, and no servo may stop for that.
-        Devices get their safe values.
+        Features leave the rest safe.
 
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
@@ -391,9 +392,9 @@ class DynamixelHardware:
         for problems in self._lines.run(programs):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
-        self._make_devices_safe()
+        self._make_rest_safe()
 
-    def _make_devices_safe(self) -> None:
+    def _make_rest_safe(self) -> None:
         for problem in make_safe(self._lines):
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 

@@ -137,7 +137,7 @@ def assemble(
         beat,
         take_over=take_over,
         sources=record.sources,
-        device_commands=record.device_command,
+        source_commands=record.device_command,
         refusals=layers.refusals,
     )
     hardware = layers.build(servos)

@@ -32,7 +32,7 @@ from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime
 from dxlrun.description.bus import SIMULATED
-from dxlrun.dynamixel.device.safe_values import make_safe
+from dxlrun.dynamixel.bus_part import load_safe_stages, make_safe
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
@@ -155,6 +155,7 @@ class SafeStop:
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
+        load_safe_stages()
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Leave the robot as the policy for a fault does, without its steps; return that as sentences.

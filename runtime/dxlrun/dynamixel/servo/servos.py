@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.device.devices import Devices
+from dxlrun.dynamixel.bus_part import BusContext, BusPart, BusStage
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
@@ -23,6 +23,7 @@ from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.errors import counted
+from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.control_table import control_table
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -51,10 +52,10 @@ class Servos:
         idle: IdleScheduler,
         states: States,
         samples: BusSamples,
-        device_commands: Floats,
+        source_commands: Floats,
         events: EventSink,
     ) -> None:
-        """`device_commands`: of all devices of the robot."""
+        """`source_commands`: of all sources of the robot."""
         plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
         self._bus = idle.bus
@@ -68,8 +69,10 @@ class Servos:
         self.goals = GoalArrays(plan)  # Builds the sync write
         self.reads = CyclicReads(plan, samples, idle.bus.owed)
         """The job that reads every servo and every device once."""
-        self.devices = Devices(idle, self.reads, samples, device_commands, events)
-        """What is on the bus and is no servo."""
+        context = BusContext(idle, self.reads, samples, source_commands, events)
+        attached = (stage.attach(context) for _, stage in stages(BusStage))
+        self._parts: tuple[BusPart, ...] = tuple(part for part in attached if part is not None)
+        """The share of features on this bus, in their order."""
         self.life = Life(idle, self.reads, events)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
@@ -153,7 +156,8 @@ class Servos:
         self._line_lost = False
         for index in range(len(self._rows)):
             self.life.lose(index).kept_goal = False
-        self.devices.found()
+        for part in self._parts:
+            part.recover_line()
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
@@ -184,7 +188,8 @@ class Servos:
         """Report what changed with this cycle's replies."""
         if self._samples.fresh.tobytes() != self._every_fresh or any(self.reads.missed):
             self._count_losses(now_ns)
-        self.devices.settle(now_ns)
+        for part in self._parts:
+            part.judge_replies(now_ns)
         if self.reads.errors[: len(self._rows)] != self._reported_errors:
             self._report_errors()
 
@@ -255,12 +260,12 @@ class Servos:
     def at_rest(self) -> bool:
         """True when nothing is to be looked at here before `due_ns`, as long as replies are as planned.
 
-        A device is looked at in each, for its commands.
+        A part of a feature is asked in each cycle, for its commands.
         """
         return not (
             self._bus.failure is not None
             or self._bus.receiver.pending
-            or self._plan.devices
+            or self._parts
             or self.life.torque_changed
             or not _RESTING.issuperset(self.life.states)
             or self._alerts
@@ -295,8 +300,8 @@ class Servos:
         if not self.life.calm:
             self._offline.look()
         self._slow.look()
-        if self._plan.devices:
-            self.devices.look()
+        for part in self._parts:
+            part.schedule_idle_work()
         if not self._reading and (due := self._due()) is not None:
             index, what, program = due
             self._reading, self._read_last = True, index

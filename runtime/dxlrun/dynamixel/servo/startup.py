@@ -15,7 +15,7 @@ import msgspec
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.device.device_checks import survey_devices
+from dxlrun.dynamixel.bus_part import BusStage
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy, describe_late_start
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -24,6 +24,7 @@ from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.errors import PortError, StartUpError
+from dxlrun.features import stages
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import control_table
 from dxlwire.exchange.bus import Lines
@@ -79,7 +80,8 @@ class StartUp:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
         found = [Findings() for _ in self._plans]
         self._run(lambda plan, found: survey(plan, take_over, found), found)
-        self._run(survey_devices, found)
+        for _, feature in stages(BusStage):
+            self._run(feature.inspect, found)
         self._judge(found)
         _refuse(self._late_replies(), for_replies=True)
         self.stage(settle_bus)

@@ -11,13 +11,13 @@ import math
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
-from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.device.device_checks import inspect_device
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel.bus_part import BusContext, BusStage
+from dxlrun.features.devices.checks import inspect_device, survey_devices
 from dxlwire.bus_plan import DeviceCommand, DevicePlan
-from dxlwire.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
-from dxlwire.exchange.idle import IdleScheduler, Urgency
-from dxlwire.exchange.samples import BusSamples
+from dxlwire.exchange.cyclic_reads import MOST_BROKEN
+from dxlwire.exchange.idle import Urgency
 from dxlwire.plan.line import Line
 from dxlwire.plan.planning import plan_line
 from dxlwire.transaction import Outcome, Program, Transaction
@@ -51,21 +51,13 @@ class _Written(msgspec.Struct):
 class Devices:
     """The devices of one bus, by their index in its plan."""
 
-    def __init__(
-        self,
-        idle: IdleScheduler,
-        reads: CyclicReads,
-        samples: BusSamples,
-        commands: Floats,
-        events: EventSink,
-    ) -> None:
-        """`commands`: of all devices of the robot, SI units; NaN = as it is."""
-        self._plan = plan = idle.plan
-        self._idle = idle
-        self._reads = reads
-        self._samples = samples
-        self._commands = commands
-        self._events = events
+    def __init__(self, context: BusContext) -> None:
+        self._plan = plan = context.idle.plan
+        self._idle = context.idle
+        self._reads = context.reads
+        self._samples = context.samples
+        self._commands = context.commands
+        self._events = context.events
         self._dialect = dialect_of(plan.protocol)
         self._members: list[list[int]] = [[] for _ in plan.devices]
         for number, member in enumerate(plan.members):
@@ -80,14 +72,14 @@ class Devices:
 
     # The cyclic reads
 
-    def settle(self, now_ns: int) -> None:
+    def judge_replies(self, now_ns: int) -> None:
         """Report what changed with this cycle's replies; a device that did not answer leaves the reads."""
         for index, members in enumerate(self._members):
             self._report_error(index, max(self._reads.errors[member] for member in members))
             if self._losses[index] is None and any(self._reads.blamed(member) for member in members):
                 self._miss(index, now_ns)
 
-    def found(self) -> None:
+    def recover_line(self) -> None:
         """Ask every device before it is read again: the line was gone, and maybe their power."""
         now_ns = self._idle.now_ns()
         for index in range(len(self._losses)):
@@ -127,7 +119,7 @@ class Devices:
 
     # Idle time
 
-    def look(self) -> None:
+    def schedule_idle_work(self) -> None:
         """Let the coming idle time ask those that do not answer, and write what is commanded."""
         now_ns = self._idle.now_ns()
         for index, loss in enumerate(self._losses):
@@ -230,6 +222,14 @@ class Devices:
     def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         device = self._plan.devices[index]
         self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+
+
+def attach_devices(context: BusContext) -> Devices | None:
+    """Return the devices of a bus; None if it has none."""
+    return Devices(context) if context.idle.plan.devices else None
+
+
+STAGE = BusStage(inspect=survey_devices, attach=attach_devices)
 
 
 def _probes(line: Line, device: DevicePlan) -> list[Transaction]:

@@ -5,24 +5,25 @@ Needs neither numpy nor the loop: the guardian writes them after the loop died.
 
 from __future__ import annotations
 
+from dxlrun.dynamixel.bus_part import SafeStage
 from dxlwire.bus_plan import BusPlan
 from dxlwire.exchange.bus import Lines
 from dxlwire.plan.retry import limit_patience, retry, setup_line
 from dxlwire.transaction import Outcome, Program
 
 
-def make_safe(lines: Lines) -> tuple[str, ...]:
+def write_safe_values(lines: Lines) -> tuple[str, ...]:
     """Write the safe value of every command that has one; return a sentence for each that failed.
 
     Raises nothing. A line without devices gets no byte.
     """
     if not any(device.commands for plan in lines.plans for device in plan.devices):
         return ()
-    found = lines.run([limit_patience(_make_safe(plan)) for plan in lines.plans])
+    found = lines.run([limit_patience(_write_safe_values(plan)) for plan in lines.plans])
     return tuple(problem for problems in found for problem in problems or ())
 
 
-def _make_safe(plan: BusPlan) -> Program[list[str]]:
+def _write_safe_values(plan: BusPlan) -> Program[list[str]]:
     line, problems = setup_line(plan), []
     for device in plan.devices:
         for command in device.commands:
@@ -36,3 +37,6 @@ def _make_safe(plan: BusPlan) -> Program[list[str]]:
             if reply.outcome is Outcome.TIMEOUT:
                 break  # it is not there
     return problems
+
+
+STAGE = SafeStage(write_safe_values)
