@@ -144,4 +144,4 @@ def test_the_board_and_the_robot_of_the_page_are_accepted(tmp_path):
     plan = compile_files(path, {}, []).plan
     assert plan.loop.source_states["mine"] == ("force.z", "button.start", "button.stop")
     assert plan.loop.source_states["foot"] == ("toe", "heel")
-    assert plan.loop.device_commands == ("board/led", "mine/lamp")
+    assert plan.loop.source_commands == ("board/led", "mine/lamp")

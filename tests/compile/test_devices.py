@@ -12,7 +12,7 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file():
         "light": ("led", "register_2"),
         "board": ("register_1", "register_2"),
     }
-    assert plan.loop.device_commands == ("light/lamp",)
+    assert plan.loop.source_commands == ("light/lamp",)
     foot, light, board = plan.buses[0].devices
     assert [(one.name, one.servo_id, one.source, one.model_number) for one in (foot, light, board)] == [
         ("foot", 101, 0, 65_000),

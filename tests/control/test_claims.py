@@ -39,8 +39,8 @@ def test_a_reference_is_claimed_by_joint_and_interface():
 
 
 def test_a_command_of_a_device_is_claimed_once():
-    one, two = (wants(name, (), (), device_commands=("light/led",)) for name in ("one", "two"))
-    (found,) = conflicts([one, two, wants("three", (), (), device_commands=("light/buzzer",))])
+    one, two = (wants(name, (), (), source_commands=("light/led",)) for name in ("one", "two"))
+    (found,) = conflicts([one, two, wants("three", (), (), source_commands=("light/buzzer",))])
     assert (found.holder, found.other) == ("one", "two")
     assert "light/led" in str(found)
 

@@ -193,9 +193,9 @@ def test_a_command_of_a_device_beyond_its_range_is_held_at_the_end_and_told_once
     rig = GateRig(sources=(LIGHT,))
 
     def lit(*commands):
-        rig.record.device_command[:] = commands
+        rig.record.source_commands[:] = commands
         rig.apply()
-        return rig.record.device_command.tolist()
+        return rig.record.source_commands.tolist()
 
     assert lit(1.0, -2.0) == [1.0, -2.0]
     assert lit(np.nan, 1.0) == [pytest.approx(np.nan, nan_ok=True), 1.0], "what is not commanded stays so"

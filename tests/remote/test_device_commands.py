@@ -87,8 +87,8 @@ def test_a_command_that_no_controller_takes_names_the_type_that_would(board, mon
 
 
 def test_what_is_commanded_of_a_device_is_asked_for_by_name(board):
-    names = list(board.record.layout.device_commands)
-    board.record.device_command[:] = [
+    names = list(board.record.layout.source_commands)
+    board.record.source_commands[:] = [
         {"board/led": 1.0, "board/register_7": 300.0}.get(one, np.nan) for one in names
     ]
     board.finish_cycle()

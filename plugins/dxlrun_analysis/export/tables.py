@@ -167,7 +167,7 @@ def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> 
         columns[f"{source}/age_ms"] = _joint_column("age_ns", cycles["source_age_ns"][:, row])
     for row, state in enumerate(layout.source_states):
         columns[state] = _known(cycles["source_state"][:, row])
-    for row, command in enumerate(layout.device_commands):
+    for row, command in enumerate(layout.source_commands):
         device, _, name = command.partition("/")
         columns[f"{device}/command.{name}"] = _known(cycles["device_command"][:, row])
     return _table(log, columns)

@@ -16,9 +16,8 @@ from dxlwire import COMMAND_INTERFACES
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
-_COMPARED = ("source_state", "reference", "device_command", *_COMMANDS, *_GOALS)
+_COMPARED = (*CycleRecord.COMPUTED, *_COMMANDS, *_GOALS)
 """In the order in which they are computed: what differs first is the cause of the rest."""
-_OF_NO_JOINT = {"source_state": "state", "device_command": "command"}
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
     **{
@@ -128,15 +127,14 @@ class Comparison:
         """Return what a place in a field of a cycle is called, its joint, and the controller that commands
         it; `active`: those that were, in the run or in the replay."""
         layout, plans = self._plan.layout, self._controllers()
-        if field in _OF_NO_JOINT:
-            name = (layout.source_states if field == "source_state" else layout.device_commands)[place]
-            owners = [
-                one.name for one in plans if name in one.device_commands or name.partition("/")[0] == one.name
-            ]
-            return f"{_OF_NO_JOINT[field]} {name}", None, next(iter(owners), None)
         actives = [one for bit, one in enumerate(plans) if active >> bit & 1]
-        if field == "reference":
-            name = self._plan.references[place]
+        name = layout.names_of(field)[place] if field in CycleRecord.COMPUTED else ""
+        if name and field != "reference":
+            owners = [
+                one.name for one in plans if name in one.source_commands or name.partition("/")[0] == one.name
+            ]
+            return f"{CycleRecord.COMPUTED[field]} {name}", None, next(iter(owners), None)
+        if name:
             lower, joint, interface = name.split("/")
             owners = [
                 one.name
@@ -153,8 +151,7 @@ class Comparison:
 
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
-    of_no_joint = record.sources.values, record.reference, record.device_command
-    return *of_no_joint, *record.commands.values, *record.goals.values
+    return *record.computed, *record.commands.values, *record.goals.values
 
 
 def shown_bits(bits: int) -> str:

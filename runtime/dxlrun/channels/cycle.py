@@ -12,7 +12,7 @@ import ctypes
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag, unique
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -68,11 +68,12 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("reference", "float64", "references"),
     ("torque", "uint8", "joints"),
     ("source_state", "float64", "source_states"),
-    ("device_command", "float64", "device_commands"),
+    ("device_command", "float64", "source_commands"),
     ("source_age_ns", "int64", "sources"),
     ("source_valid", "bool", "sources"),
 )
 """Name, element type and what it has one element of."""
+_OWNERS = {name: per for name, _, per in SEQUENCES}
 
 
 @unique
@@ -261,18 +262,18 @@ class CycleLayout:
 
     `references` are the names of the controllers' reference interfaces: `arm_pid/shoulder/position`.
     `sources` are devices, sensors and the controllers that provide states, each with the names of its states;
-    `device_commands` are names such as `light/led`. Raises ValueError for more than 63 controllers (they are
+    `source_commands` are names such as `light/led`. Raises ValueError for more than 63 controllers (they are
     bits of a mask).
     """
 
     __slots__ = (
         "controllers",
-        "device_commands",
         "dtype",
         "joints",
         "lengths",
         "places",
         "references",
+        "source_commands",
         "source_states",
         "sources",
     )
@@ -283,7 +284,7 @@ class CycleLayout:
         controllers: Sequence[str],
         references: Sequence[str] = (),
         sources: Mapping[str, Sequence[str]] | None = None,
-        device_commands: Sequence[str] = (),
+        source_commands: Sequence[str] = (),
     ) -> None:
         if len(controllers) > MOST_CONTROLLERS:
             raise ValueError(f"at most {MOST_CONTROLLERS} controllers, not {len(controllers)}")
@@ -295,14 +296,14 @@ class CycleLayout:
             f"{source}/{state}" for source, states in (sources or {}).items() for state in states
         )
         """Names of all states of the sources: `imu/angular_velocity.x`."""
-        self.device_commands = tuple(device_commands)
+        self.source_commands = tuple(source_commands)
         counts = {
             "joints": len(self.joints),
             "controllers": len(self.controllers),
             "references": len(self.references),
             "sources": len(self.sources),
             "source_states": len(self.source_states),
-            "device_commands": len(self.device_commands),
+            "source_commands": len(self.source_commands),
         }
         names = [name for name, _ in SCALARS]
         formats: list[Any] = [np.dtype(kind).newbyteorder("<") for _, kind in SCALARS]
@@ -337,6 +338,11 @@ class CycleLayout:
         first: int = self.places[name].start
         return first // 8
 
+    def names_of(self, sequence: str) -> tuple[str, ...]:
+        """Return the names of the elements of a sequence that belong to no joint: `light/led`."""
+        names: tuple[str, ...] = getattr(self, _OWNERS[sequence])
+        return names
+
     def source_slice(self, source: str) -> slice:
         """Return where the states of a source are among `source_states`."""
         places = [index for index, name in enumerate(self.source_states) if name.partition("/")[0] == source]
@@ -354,6 +360,9 @@ class CycleRecord(_Scalars):
 
     Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
     """
+
+    COMPUTED: ClassVar = {"source_state": "state", "reference": "reference", "device_command": "command"}
+    """Sequences of float64 that belong to no joint, as a cycle computes them, with the word for one."""
 
     cycle: int
     """Number of the period since the loop's first deadline, skipped ones counted."""
@@ -421,9 +430,10 @@ class CycleRecord(_Scalars):
             age_ns=array["source_age_ns"][0],
         )
         """States of devices, sensors and controllers."""
-        self.device_command: Floats = _row(array, "device_command")
-        """What controllers command of devices, one element a name of the layout's device_commands; NaN = not
-        commanded."""
+        self.source_commands: Floats = _row(array, "device_command")
+        """Commands of sources, one element a name of the layout's source_commands; NaN = not commanded."""
+        self.computed: tuple[Floats, ...] = tuple(_row(array, name) for name in self.COMPUTED)
+        """The sequences of COMPUTED."""
         self.floats: Floats = np.frombuffer(self.raw[: layout.size - layout.size % 8], dtype="<f8")
         """The record as float64: the element at `layout.place(name)` is the first of a sequence of them."""
         for name, kind, _ in SEQUENCES:

@@ -195,7 +195,7 @@ def class_plan(
         reference=interfaces.reference,
         reads=interfaces.reads,
         provides=interfaces.provides,
-        device_commands=interfaces.device_commands,
+        source_commands=interfaces.device_commands,
         takeovers=interfaces.takeovers,
         partial=interfaces.partial,
         topics=tuple(f"/{plan.name}/{topic}" for topic in topics),
@@ -226,10 +226,10 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
     match at[2:]:
         case ("joints", int(index)):
             return joint_mark(description, plan.name, plan.joints[index])
-        case ("reads" | "device_commands" | "takeovers" as which, int(index)):
+        case ("reads" | "source_commands" | "takeovers" as which, int(index)):
             named: Mapping[str, tuple[str, ...]] = {
                 "reads": plan.reads,
-                "device_commands": plan.device_commands,
+                "source_commands": plan.source_commands,
                 "takeovers": plan.takeovers,
             }
             interface = named[str(which)][index]

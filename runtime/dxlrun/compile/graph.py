@@ -84,7 +84,7 @@ class ControllerGraph:
             self._activity,
             self._rates,
             self._reads,
-            self._device_commands,
+            self._source_commands,
             self._takeovers,
             self._needed_together,
             self._fallback,
@@ -354,14 +354,14 @@ class ControllerGraph:
             return f"there is no {kind} {owner}", suggestion(owner, known)
         return _unexported(plan, joint)
 
-    def _device_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each of `device_commands` is a command of a device."""
+    def _source_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Check that each of `source_commands` is a command of a source."""
         known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
-        for index, name in enumerate(plan.device_commands):
+        for index, name in enumerate(plan.source_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
                 what = f"{plan.name} commands {name}, which is no command of a device"
                 fix = suggestion(name, known) if known else "name it under `commands` of the device"
-                yield Mistake((*_path(plan.name), "device_commands", index), what, fix)
+                yield Mistake((*_path(plan.name), "source_commands", index), what, fix)
 
     def _takeovers(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Each of `takeovers` is another controller, and they can be active together."""

@@ -103,7 +103,7 @@ def replan_controller(
         reference=interfaces.reference,
         reads=interfaces.reads,
         provides=interfaces.provides,
-        device_commands=interfaces.device_commands,
+        source_commands=interfaces.device_commands,
     )
     if changed.references != plan.references:
         raise InputError(f"{change}: the controller would export other references than those of the log")

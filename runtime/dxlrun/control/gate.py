@@ -108,7 +108,7 @@ class Gate:
         """The joints with the registers that limit their servos."""
         self._record = record
         self._events = events
-        self._devices = DeviceGate(plan, record, events)
+        self._sources = SourceGate(plan, record, events)
         self._joints = _laid_out(plan.joints)
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
@@ -220,8 +220,8 @@ class Gate:
             self._report_begun()
         if self._clamps:
             self._report_ended()
-        if self._devices.commands.size:
-            self._devices.apply()
+        if self._sources.commands.size:
+            self._sources.apply()
 
     def _report_begun(self) -> None:
         for bit, what in _WHAT.items():
@@ -296,16 +296,16 @@ def _limits(limits: Sequence[float | None]) -> Floats:
     return np.array([np.inf if limit is None else limit for limit in limits])
 
 
-class DeviceGate:
-    """Keeps the commands of devices inside the ranges of their items; NaN was not commanded and stays."""
+class SourceGate:
+    """Keeps the commands of sources inside their ranges; NaN was not commanded and stays."""
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         ranges = [each for source in plan.sources for each in source.ranges]
         self._names = [(source, name) for source in plan.sources for name in source.commands]
         self._lowest, self._highest = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
         self._events = events
-        self.commands: Floats = record.device_command
-        """Of the robot's devices."""
+        self.commands: Floats = record.source_commands
+        """Of the robot's sources."""
         self._outside = np.zeros(len(ranges), dtype=np.bool_)
         self._held = np.zeros(len(ranges), dtype=np.bool_)
         """What is at an end of its range because it was commanded beyond."""

@@ -305,7 +305,7 @@ class LogHeader(msgspec.Struct, frozen=True):
             epoch_offset_ns=epoch_offset_ns,
             references=loop.references,
             sources=loop.source_states,
-            device_commands=loop.device_commands,
+            device_commands=loop.source_commands,
             robot_description=plan.urdf,
             frames=plan.frames,
         )

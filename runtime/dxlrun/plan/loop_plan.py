@@ -305,7 +305,8 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
     topics: tuple[str, ...] = ()  # Its own topics: `/arm/state`
     provides: tuple[str, ...] = ()  # States that it provides to others: `orientation.x`
-    device_commands: tuple[str, ...] = ()  # Commands of devices that it claims: `light/led`
+    source_commands: tuple[str, ...] = msgspec.field(default=(), name="device_commands")
+    """Commands of sources that it claims: `light/led`; logs have the name of the first kind of source."""
     takeovers: tuple[str, ...] = ()  # Controllers that it may let take over
     partial: bool = False  # It goes on with its other joints while some have no torque
 
@@ -382,7 +383,7 @@ class LoopPlan(msgspec.Struct, frozen=True):
             tuple(one.name for one in self.controllers),
             self.references,
             self.source_states,
-            self.device_commands,
+            self.source_commands,
         )
 
     @property
@@ -393,6 +394,6 @@ class LoopPlan(msgspec.Struct, frozen=True):
         }
 
     @property
-    def device_commands(self) -> tuple[str, ...]:
-        """Names of all commands of devices, in the order of the cycle's record."""
+    def source_commands(self) -> tuple[str, ...]:
+        """Names of all commands of sources, in the order of the cycle's record."""
         return tuple(f"{one.name}/{command}" for one in self.sources for command in one.commands)

@@ -137,7 +137,7 @@ def assemble(
         beat,
         take_over=take_over,
         sources=record.sources,
-        source_commands=record.device_command,
+        source_commands=record.source_commands,
         refusals=layers.refusals,
     )
     hardware = layers.build(servos)

@@ -117,8 +117,8 @@ def test_states_of_sources_and_commands_of_devices_have_columns(
     assert cycles[f"{source}/{state}"].to_pylist() == known
     ages = [None if age < 0 else age / 1e6 for age in log.cycles["source_age_ns"][:, row].tolist()]
     assert cycles[f"{source}/age_ms"].to_pylist() == ages
-    if layout.device_commands:
-        device, _, name = layout.device_commands[0].partition("/")
+    if layout.source_commands:
+        device, _, name = layout.source_commands[0].partition("/")
         assert cycles[f"{device}/command.{name}"].to_pylist() == [None] * len(cycles)
 
 

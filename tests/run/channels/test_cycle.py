@@ -69,7 +69,7 @@ def test_no_two_fields_share_a_byte_and_lengths_are_set(joints, controllers, ref
     record = np.frombuffer(bytes(CycleRecord(layout).raw), dtype=layout.dtype)[0]
     for name, _, per in SEQUENCES:
         counts = {"joints": joints, "controllers": controllers, "references": references}
-        counts |= {"sources": sources, "source_states": 2 * sources, "device_commands": sources}
+        counts |= {"sources": sources, "source_states": 2 * sources, "source_commands": sources}
         assert record[f"{name}_length"] == counts[per]
         assert len(record[name]) == record[f"{name}_length"]
 

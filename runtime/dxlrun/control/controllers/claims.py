@@ -55,7 +55,7 @@ def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]
     Of controllers that are into several ones each joint is claimed where it is exported, as far as these are
     among `named`.
     """
-    for command in claimant.device_commands:
+    for command in claimant.source_commands:
         yield "", command
     if not claimant.command:
         return

@@ -190,7 +190,7 @@ class Managed:
             units=tuple(joint.unit for joint in joints),
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
-            device_commands=self._outputs.devices,
+            device_commands=self._outputs.source_commands,
             take_over=partial(_take_over, self._requests, plan),
             end_run=partial(_end_run, self._requests, plan),
         )

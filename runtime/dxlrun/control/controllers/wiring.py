@@ -163,18 +163,18 @@ class Outputs:
     """What a controller commands: its own arrays, where they go, and what of them was ever finite.
 
     It commands the servos of its joints, or references of those that it is `into`, and devices. Raises
-    ControllerFault for a reference or a device that is not there.
+    ControllerFault for a reference or a source that is not there.
     """
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
         """`rows` are those of its joints."""
         layout, count = record.layout, len(plan.joints)
-        own = np.full(len(COMMAND_INTERFACES) * count + len(plan.device_commands), np.nan)
-        devices = own.size - len(plan.device_commands)
+        own = np.full(len(COMMAND_INTERFACES) * count + len(plan.source_commands), np.nan)
+        sources = own.size - len(plan.source_commands)
         self.own: Floats = own
         """All that it writes, in one array."""
-        self.commands = Commands(own[:devices].reshape(len(COMMAND_INTERFACES), count))
-        self.devices: Floats = own[devices:]
+        self.commands = Commands(own[:sources].reshape(len(COMMAND_INTERFACES), count))
+        self.source_commands: Floats = own[sources:]
         self.taken = b""
         """The bytes of `own` that were checked last."""
         self._parts: list[_Part] = []
@@ -193,10 +193,10 @@ class Outputs:
             else:
                 names = [f"{joint}/{interface}" for joint in plan.joints]
                 self._send(begin, names, getattr(record.commands, interface), rows, interface)
-        if missing := [name for name in plan.device_commands if name not in layout.device_commands]:
+        if missing := [name for name in plan.source_commands if name not in layout.source_commands]:
             raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
-        places = _places(plan.device_commands, layout.device_commands)
-        self._send(devices, plan.device_commands, record.device_command, places)
+        places = _places(plan.source_commands, layout.source_commands)
+        self._send(sources, plan.source_commands, record.source_commands, places)
         self._claimed = np.array([name != "" for name in self._names], dtype=np.bool_)
         self._finite, self._seen, self._wrong = np.zeros((3, own.size), dtype=np.bool_)
 

@@ -52,7 +52,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         references=layout.references,
         source_states=layout.source_states,
         sources=layout.sources,
-        device_commands=layout.device_commands,
+        device_commands=layout.source_commands,
         controllers=tuple(timed),
     )
 

@@ -235,7 +235,7 @@ def _commander(
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> str:
     """Return the active controller that takes values for a command of a device; raises RefusedRequest."""
-    claiming = [plan for plan in controllers if name in plan.device_commands]
+    claiming = [plan for plan in controllers if name in plan.source_commands]
     now = [plan for plan in claiming if active(plan)]
     if now and DEVICE_COMMANDS in takes(now[0]):
         return now[0].name
