@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.loaded import loaded
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ("docs", "plugins", "release", "robots", "runtime", "tests")
@@ -43,6 +44,16 @@ def pytest_on(
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 0 < float(pytestconfig.getini("timeout")) <= 120
+
+
+def test_packages_that_the_import_linter_does_not_see_import_only_the_faces() -> None:
+    """They are distributions of their own, with a folder `src`, and need not be installed here."""
+    house = loaded(ROOT / "tests/bench/house.py")
+    names = list(house.imported_names(house.read_sources("")))
+    own = {path.split("/")[1] for path, _, _ in names if "/src/" in path}
+    assert own >= {"dxlrun_ros2", "dxlrun_view"}
+    inside = [f"{path}: {name}" for path, name, of_face in names if "/src/" in path and not of_face]
+    assert inside == []
 
 
 SKIPS = {

@@ -12,16 +12,13 @@ import fcntl
 import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from urllib.parse import unquote
 
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
-from uvicorn.server import ServerState
 
-from dxlrun.remote.server import Connection, config_of
-from dxlrun.tooling.live import Listener, Role
+from dxlrun.tooling.live import Listener, Role, serve_clients
 from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
@@ -77,8 +74,5 @@ class Starter:
 
 async def serve(agent: Agent, directory: Path) -> None:
     """Serve until the process ends. Raises InputError for certificates that are refused, and OSError."""
-    config = config_of(Starter(agent, directory))
-    config.load()
-    listener = Listener.secured(agent.address)
-    await listener.serve(partial(Connection, config, ServerState(), {"listener": listener}))
+    await serve_clients(Listener.secured(agent.address), Starter(agent, directory))
     await asyncio.Event().wait()

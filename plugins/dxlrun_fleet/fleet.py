@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -53,7 +53,7 @@ def fleet(
     serve
         Be the agent of this name: start the robots that the file names for it. Robots go on when it ends.
     """
-    from dxlrun.remote.network.certificates import client_context
+    from dxlrun.tooling.live import client_context
     from dxlrun_fleet.fleet_file import read_fleet
 
     found = read_fleet(file)
@@ -141,16 +141,15 @@ def _stop(fleet: Fleet, name: str) -> str:
 
 
 def _view(fleet: Fleet, *, as_json: bool) -> int:
-    from dxlrun.cli.steering.watch import keys_pressed
-    from dxlrun_fleet.fleet_view import SILENT_S, RobotView, fleet_table, show_live
+    from dxlrun.tooling.output import show_live
+    from dxlrun_fleet.fleet_view import LOOK_S, SILENT_S, RobotView, fleet_table
 
     with ExitStack() as ends:
         views = [
             ends.enter_context(closing(RobotView(name, address))) for name, address in fleet.robots.items()
         ]
         if sys.stdout.isatty() and not as_json:
-            with suppress(KeyboardInterrupt), keys_pressed() as pressed:
-                show_live(views, pressed)
+            show_live(lambda: fleet_table([view.seen() for view in views]), LOOK_S / 2)
             return 0
         until = time.monotonic() + SILENT_S
         for view in views:

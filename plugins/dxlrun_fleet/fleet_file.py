@@ -9,13 +9,8 @@ from typing import Annotated, NamedTuple
 from pydantic import AfterValidator
 
 from dxlrun import InputError
-from dxlrun.description.arguments import refuse_arguments
-from dxlrun.description.document import grow, parse, read_text
-from dxlrun.description.form import Form, key, refuse
-from dxlrun.description.problems import read_form
-from dxlrun.remote.network.robots_file import ListedAddress, RobotsFile
-from dxlrun.remote.sockets import address_of
-from dxlrun.tooling.live import Address
+from dxlrun.tooling.files import Form, key, read_yaml, refuse
+from dxlrun.tooling.live import Address, ListedAddress
 from dxlrun.tooling.verbs import suggestion
 
 
@@ -39,9 +34,10 @@ class AgentForm(Form):
     )
 
 
-class FleetForm(RobotsFile):
+class FleetForm(Form):
     """Robots, and the agents that start them."""
 
+    robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
     agents: dict[str, AgentForm] = key("By the names of their certificates.", "{lab3: {}}", {})
 
 
@@ -75,13 +71,12 @@ class Fleet(NamedTuple):
 
 def read_fleet(path: Path) -> Fleet:
     """Return the fleet of a file; raises InputError with the place of each mistake."""
-    file = str(path)
-    form = read_form(grow(parse(read_text(path), file), file, refuse_arguments), FleetForm)
+    form = read_yaml(path, FleetForm)
     return Fleet(
-        {name: address_of(text, name) for name, text in form.robots.items()},
+        {name: Address.parse(text, name) for name, text in form.robots.items()},
         {
             name: Agent(
-                address_of(agent.address, name),
+                Address.parse(agent.address, name),
                 {robot: tuple(shlex.split(line)) for robot, line in agent.starts.items()},
             )
             for name, agent in form.agents.items()

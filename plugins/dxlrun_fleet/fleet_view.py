@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from datetime import datetime
 
 import msgspec
 import numpy as np
 
 from dxlrun import DxlrunError, Refused, RemoteRobot
-from dxlrun.channels.answers import Code
-from dxlrun.remote.requests.replies import Events
-from dxlrun.tooling.live import Address, NetworkLink, RobotInfo
+from dxlrun.tooling.live import Address, Events, NetworkLink, RobotInfo
 from dxlrun.tooling.output import Cell, Column, Columns, Table
 
 LOOK_S = 0.5
@@ -97,7 +94,7 @@ class RobotView:
         try:
             states = robot.states()
         except Refused as refused:
-            if refused.code != Code.NO_CYCLE:
+            if refused.code != "no_cycle":
                 raise
             self._seen = msgspec.structs.replace(seen, state="starting")
             return events.last
@@ -135,17 +132,3 @@ def _state(one: Seen) -> Cell:
     if one.state == "unreachable":
         return Cell(f"unreachable since {one.since[11:19]}", "error")
     return Cell(one.state, "good" if one.state == "running" else "warning")
-
-
-def show_live(views: list[RobotView], wait: Callable[[float], bool]) -> None:
-    """Draw the table until `wait` returns True."""
-    from rich.live import Live
-
-    from dxlrun.cli.steering.watch import compact
-    from dxlrun.tooling.output import out
-
-    with Live(console=out(), screen=True, auto_refresh=False) as live:
-        while True:
-            live.update(compact(fleet_table([view.seen() for view in views])), refresh=True)
-            if wait(LOOK_S / 2):
-                return

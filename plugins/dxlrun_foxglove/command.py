@@ -57,15 +57,14 @@ def foxglove(
     origin
         Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
     """
-    from dxlrun.remote.network.listener import LOOPBACK
     from dxlrun.tooling.live import Place
 
     place = Place.parse(listen)
     if cert is None and key is not None:
         raise InputError(f"--key {key}: add its certificate, --cert FILE")
-    if place.host != LOOPBACK and cert is None:
+    if place.host != "127.0.0.1" and cert is None:
         raise InputError(
-            f"--listen {listen}: only {LOOPBACK} is served without TLS; add --cert FILE --key FILE"
+            f"--listen {listen}: only 127.0.0.1 is served without TLS; add --cert FILE --key FILE"
         )
     leave_real_time()
     try:

@@ -9,8 +9,6 @@ from functools import partial
 import msgspec
 
 from dxlrun import DxlrunError, InputError, RemoteRobot, TopicMessage, connect
-from dxlrun.channels.loop_requests import Switch, TorqueRequest
-from dxlrun.log import schemas
 from dxlrun.tooling.live import LiveMessages, RobotInfo
 from dxlrun.tooling.topics import MessageType
 from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
@@ -22,6 +20,23 @@ RATE = 50.0
 """Hz: so often what has come meanwhile is taken; more costs the machine, and no screen shows it."""
 LOOK_S = 2.0
 """Between two looks for topics that were opened meanwhile."""
+
+
+class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
+
+    activate: tuple[str, ...] = ()
+    deactivate: tuple[str, ...] = ()
+
+
+class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `torque`."""
+
+    joints: tuple[str, ...]
+    on: bool
+    release: bool = False
+    """Deactivate the controllers that command the joints, in the same cycle. Without it torque off is refused
+    while there are any; torque on starts them again where the joints are."""
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -173,10 +188,10 @@ def advertised(channels: Sequence[Channel]) -> str:
         {
             "id": one.number,
             "topic": one.topic,
-            "encoding": schemas.ENCODING,
+            "encoding": "cdr",
             "schemaName": one.type.name,
             "schema": one.type.text,
-            "schemaEncoding": schemas.SCHEMA_ENCODING,
+            "schemaEncoding": "ros2msg",
         }
         for one in channels
     ]

@@ -12,21 +12,16 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun import LINEAR, ROTARY, JointUnit
-from dxlrun.compile.joints.limits import degrees
-from dxlrun.compile.joints.servos import servo_travel
-from dxlrun.description.document import KeyPath
-from dxlrun.description.reading import Replacement
-from dxlrun.dynamixel.remedies import CHECK, choose_remedy
-from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.dynamixel.tools.scanning import Search, find
-from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.errors import ServoFault
+from dxlrun import LINEAR, ROTARY, JointUnit, ServoFault
+from dxlrun.tooling.files import KeyPath
+from dxlrun.tooling.output import choose_remedy
+from dxlrun.tooling.robots import Replacement
+from dxlrun.tooling.servos import OneServo, Search, ToolLine, find_servo
 from dxlrun_hand.dialogue import Dialogue
 from dxlrun_hand.robot_text import RobotText
-from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import ControlTable
+from dxlwire import BusPlan, ControlTable, ServoPlan
 
+_degrees = ROTARY.number
 LEAST_WAY = math.radians(5.0)
 """Of the servo between both ends: less may be a hand that slipped."""
 _STEPS: Mapping[JointUnit, float] = {ROTARY: math.radians(0.1), LINEAR: 1e-4}
@@ -71,9 +66,9 @@ class HandJoint:
         self._label = plan.label(servo)
         self._port = plan.port
         search = Search((plan.protocol,), (plan.baud_rate,), (servo.servo_id,))
-        found = find(tool, servo.servo_id, search)
+        found = find_servo(tool, servo.servo_id, search)
         if not found:
-            remedy = choose_remedy(plan.port, CHECK)
+            remedy = choose_remedy(plan.port)
             raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s: {remedy}")
         self._one = OneServo(tool, found[0])
         self.table: ControlTable = self._one.table
@@ -120,12 +115,13 @@ class HandJoint:
 
     def check_turn(self, lowest: float, highest: float) -> None:
         """Raise BeyondTurn where the servo left the angles that its goals reach; `lowest`, `highest`: rad."""
-        reach, tick = servo_travel(self.table), self.table.rad_per_tick
-        if not self.servo.continuous and (lowest < reach.lower - tick or highest > reach.upper + tick):
+        tick = self.table.rad_per_tick
+        least, most = self.table.min_tick * tick, self.table.max_tick * tick
+        if not self.servo.continuous and (lowest < least - tick or highest > most + tick):
             raise BeyondTurn(
                 f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
-                f"{degrees(reach.lower)} to {degrees(reach.upper)} deg: its servo was at {degrees(lowest)} "
-                f"to {degrees(highest)} deg. If the joint must go there, turn the servo's horn "
+                f"{_degrees(least)} to {_degrees(most)} deg: its servo was at {_degrees(lowest)} "
+                f"to {_degrees(highest)} deg. If the joint must go there, turn the servo's horn "
                 "first. Bring it back."
             )
 
@@ -137,7 +133,7 @@ class HandJoint:
         try:
             return self._one.read(["present_position"])["present_position"]
         except ServoFault:
-            remedy = choose_remedy(self._port, CHECK)
+            remedy = choose_remedy(self._port)
             raise ServoFault(f"{self._label} does not answer any more: {remedy}") from None
 
 
@@ -164,7 +160,7 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
         way = positive - (zero if servo.continuous else negative)
         if abs(way) >= LEAST_WAY:
             break
-        dialogue.say(f"{joint.name} moved by {degrees(abs(way))} deg only: move it further.")
+        dialogue.say(f"{joint.name} moved by {_degrees(abs(way))} deg only: move it further.")
     direction = 1 if way > 0 else -1
     limits = None
     if not servo.continuous:
@@ -183,7 +179,7 @@ def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, fl
         nonlocal now
         now = joint.follow()
         seen[:] = min(seen[0], now), max(seen[1], now)
-        return f"  its servo is at {degrees(now)} deg, was at {degrees(seen[0])} to {degrees(seen[1])} deg"
+        return f"  its servo is at {_degrees(now)} deg, was at {_degrees(seen[0])} to {_degrees(seen[1])} deg"
 
     way = "on in its positive direction" if joint.servo.continuous else "in its positive direction to the end"
     dialogue.ask_while(f"Move {joint.name} {way}, and press Enter", look)

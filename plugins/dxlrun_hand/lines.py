@@ -7,11 +7,11 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 
 from dxlrun import InputError, PortError
-from dxlrun.description.bus import SIMULATED
-from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
+from dxlrun.tooling.robots import SIMULATED
+from dxlrun.tooling.servos import ToolLine, TunablePort
 from dxlrun.tooling.verbs import suggestion
 from dxlrun_hand.dialogue import Dialogue
-from dxlwire.port.reopening import lasting_name
+from dxlwire import lasting_name
 
 TRIES = 3
 Opened = Callable[[str], TunablePort]

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import yaml
 
 from dxlrun import InputError
-from dxlrun.description.document import KeyPath, node_mark, refusal
-from dxlrun.description.including import Source, read_sources
+from dxlrun.tooling.files import KeyPath, Mark, Problem
 from dxlrun.tooling.output import unwritable
+from dxlrun.tooling.robots import Source, read_sources
 
 
 class _Edit(NamedTuple):
@@ -49,14 +49,14 @@ class RobotText:
         if not os.access(source.path.resolve(), os.W_OK):
             raise InputError(f"{source.path} cannot be written: it is read-only; change that first")
         if self._uses[self._sources.index(source)][id(node)] > 1:
-            mark = node_mark(node, str(source.path))
-            raise refusal(mark, f"{_words(path)} is shared by an alias", "write it out for each")
+            what = f"{_words(path)} is shared by an alias"
+            raise _refuse_node(source, node, what, "write it out for each")
         if at == path and any("${" in str(one.value) for one in _nodes(node)):
-            mark = node_mark(node, str(source.path))
-            raise refusal(mark, f"{_words(path)} is made of an argument", "write the value itself")
+            raise _refuse_node(
+                source, node, f"{_words(path)} is made of an argument", "write the value itself"
+            )
         if at != path and not isinstance(node, yaml.MappingNode):
-            mark = node_mark(node, str(source.path))
-            raise refusal(mark, f"{_words(at)} is no mapping", "write its keys below it")
+            raise _refuse_node(source, node, f"{_words(at)} is no mapping", "write its keys below it")
 
     def put(self, path: KeyPath, value: str | Sequence[str]) -> None:
         """Plan a value at a path, or the items of a list; raises InputError as `check`."""
@@ -117,6 +117,12 @@ class RobotText:
         """Return the file that has a value, or else the most of the way to it, with the node there."""
         found = ((source, *_nearest(source.tree.root, path)) for source in reversed(self._sources))
         return max(found, key=lambda one: len(one[1]))  # the first of the longest: the strongest file
+
+
+def _refuse_node(source: Source, node: yaml.Node, what: str, fix: str) -> InputError:
+    """Return the error of a value that cannot be replaced, at its place."""
+    place = node.start_mark
+    return InputError([Problem(Mark(str(source.path), place.line + 1, place.column + 1), what, fix)])
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from dxlrun import PortError
-from dxlrun.compile.joints.described_servos import described_servos
-from dxlrun.compile.joints.servos import AUTO
-from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.remedies import choose_remedy
-from dxlrun.dynamixel.servo.access import first_reach
-from dxlrun.dynamixel.servo.checks import inspect
-from dxlrun.dynamixel.servo.registers import compare, merged
-from dxlrun.dynamixel.tools.one_servo import OneServo, change_id, change_rate
-from dxlrun.dynamixel.tools.scanning import FoundServo, Search, scan
-from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.errors import ServoFault
-from dxlrun.tooling.robots import Description, compile_robot
+from dxlrun import PortError, ServoFault
+from dxlrun.tooling.output import choose_remedy
+from dxlrun.tooling.robots import Description, compile_robot, find_unknown_servos
+from dxlrun.tooling.servos import (
+    FoundServo,
+    OneServo,
+    Search,
+    ToolLine,
+    change_id,
+    change_rate,
+    compare_servos,
+    scan,
+    stored_registers,
+)
 from dxlrun_hand.dialogue import Dialogue, yes
 from dxlrun_hand.lines import BusLines
-from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlwire.control_table import ControlTable, control_table, models_by_number
-from dxlwire.plan.retry import extend_timeouts, retry
-from dxlwire.transaction import Outcome, Program
+from dxlwire import BusPlan, ControlTable, ServoPlan, find_table
 
 SKIP = ("s", "skip")
 
@@ -33,7 +31,7 @@ class SetUp:
     def __init__(self, description: Description, dialogue: Dialogue) -> None:
         self.description = description
         self.dialogue = dialogue
-        self._unknown = {one.name for one in described_servos(description) if one.model == AUTO}
+        self._unknown = find_unknown_servos(description)
         self._models: dict[str, str] = {}
         self.plans: Sequence[BusPlan] = compile_robot(description, []).plan.buses
         self.done: list[str] = []
@@ -54,8 +52,7 @@ class SetUp:
             while servos:
                 self.dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
                 with lines.open(plan.name) as tool:
-                    tool.speak(plan.protocol, plan.baud_rate)
-                    found = tool.run(extend_timeouts(_read_back(plan, servos)))
+                    found = compare_servos(tool, plan, servos)
                 self.dialogue.say(*(f"{joint}: {text}" for joint, text in found.describe_deviations()))
                 if not found.problems:
                     count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
@@ -96,7 +93,7 @@ class SetUp:
 
     def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
         """Return the only servo that answers; raises ServoFault where none or several do, or another."""
-        table = control_table(servo.model, plan.protocol)
+        table = find_table(servo.model, plan.protocol)
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
         if not found:
@@ -116,8 +113,11 @@ class SetUp:
                 f"The servo speaks Protocol {one.protocol}, bus {plan.name} Protocol {plan.protocol}: "
                 "connect another one, or change its firmware by the maker's tool."
             )
-        same = {each.model for each in models_by_number(one.model_number, plan.protocol, one.firmware)}
-        if one.device or not one.model or (servo.own_name not in self._unknown and servo.model not in same):
+        if (
+            one.device
+            or not one.model
+            or (servo.own_name not in self._unknown and servo.model not in one.models)
+        ):
             called = one.model or f"model number {one.model_number}"
             wanted = "a servo" if servo.own_name in self._unknown else f"the {servo.model}"
             raise ServoFault(
@@ -148,52 +148,16 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
             raise ServoFault(f"{error}; correct the robot file") from None
     if one.servo_id != servo.servo_id:
         done.append(change_id(one, servo.servo_id))
-    desired = stored(one.table, plan, servo)
+    desired = stored_registers(one.table, plan, servo)
     declared = {register.name for register in desired}
     refusing = (item for item in one.table.items.values() if item.deviation and item.deviation.may_refuse)
     names = [item.name for item in refusing if item.area == "EEPROM"]
     for each in one.deviations(one.read(names, refused=True)):
         if each.refused and each.item.name not in declared:
-            desired = merged(desired, one.register(each.item.name, each.factory))
+            desired = (*desired, one.register(each.item.name, each.factory))
     done += one.write(desired)
     return done or ["was as the robot file has it"]
 
 
-def stored(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
-    """Return what the EEPROM of a servo shall hold: its registers, and the return delay time of its bus.
-
-    Registers in the RAM are written by each run.
-    """
-    declared = [one for one in servo.registers if one.eeprom]
-    item = table.items.get("return_delay_time")
-    if item is not None and all(one.name != item.name for one in declared):
-        raw = round(plan.return_delay_ns / 2_000)
-        if item.minimum <= raw <= item.maximum:
-            declared.append(RegisterValue(item.address, item.size, raw, item.name, True))
-    return tuple(declared)
-
-
 def _named(plan: BusPlan, name: str) -> ServoPlan:
     return next(servo for servo in plan.servos if servo.own_name == name)
-
-
-def _read_back(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findings]:
-    """Compare servos with the robot file as a start does, and all that setup has written."""
-    survey = Findings()
-    for servo in servos:
-        one = first_reach(plan, servo)
-        reply = yield from retry(one.line.ping(servo.servo_id))
-        if not reply.answered:
-            how = "does not answer" if reply.outcome is Outcome.TIMEOUT else "answers garbled"
-            survey.problems.append(f"{plan.label(servo)} {how} at {plan.baud_rate} bit/s")
-            continue
-        if not (yield from inspect(one, survey, take_over=True)):
-            continue
-        table = control_table(servo.model, plan.protocol)
-        for each in (yield from compare(one, stored(table, plan, servo))):
-            title = table.items[each.register.name].title
-            if each.found is None:
-                survey.problems.append(f"{one} did not answer when {title} was read")
-            elif each.differs:
-                survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
-    return survey

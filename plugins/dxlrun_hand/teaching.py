@@ -9,12 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from dxlrun import GoalState, InputError, JointUnit, Refused, RemoteRobot
-from dxlrun.cli.steering.goals import cancelled, sentence
-from dxlrun.errors import ServoFault
+from dxlrun import GoalState, InputError, JointUnit, Refused, RemoteRobot, ServoFault
 from dxlrun.tooling.output import write_target
 from dxlrun.tooling.plans import ControllerPlan
-from dxlrun.tooling.verbs import suggestion
+from dxlrun.tooling.verbs import cancel_goals, suggestion
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, ending_with, yes
@@ -121,9 +119,9 @@ class Teaching:
         try:
             states: Sequence[GoalState] = [self._robot.wait(number) for number in numbers]
         except KeyboardInterrupt:
-            cancelled(self._robot, numbers)
+            cancel_goals(self._robot, numbers)
             raise
-        self._dialogue.say(*(f"  {sentence(state)}" for state in states))
+        self._dialogue.say(*(f"  {state.describe()}" for state in states))
         return all(state.reached for state in states)
 
     def left(self) -> str:

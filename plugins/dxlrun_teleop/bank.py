@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import Enum, unique
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 from msgspec.structs import replace
 
 from dxlrun import InputError, RemoteRobot
-from dxlrun.cli.steering.steer import Row
 from dxlrun.tooling.verbs import suggestion
 
+Row = Mapping[str, Any]
+"""A part of `RemoteRobot.info`."""
 USUAL_SPEED = {"rad": 0.5, "m": 0.05}
 """Of a joint at the end of its axis at factor 1: rad/s and m/s."""
 USUAL_TWIST = {"linear": 0.2, "angular": 1.0}

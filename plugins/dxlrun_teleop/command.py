@@ -9,8 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.cli.steering.steer import Chosen, robot_of
-from dxlrun.tooling.verbs import DebugFlag, Flag, RobotName, terminated_as_interrupted
+from dxlrun.tooling.verbs import DebugFlag, Flag, RobotName, connect_robot, terminated_as_interrupted
 
 Targets = Annotated[str, Parameter(name="target", show_default=False)]
 """Names of controllers, groups or joints."""
@@ -52,7 +51,7 @@ def teleop(
     lowest, highest = FACTORS
     if not lowest <= speed <= highest:  # false for nan too
         raise InputError(f"--speed {speed:g} is no factor from {lowest:g} to {highest:g}")
-    with robot_of(Chosen(robot), "teleop") as running:
+    with connect_robot(robot, "teleop") as running:
         source: Source = chosen(device) if gamepad or device else TerminalKeyboard()
         with terminated_as_interrupted(), closing(source):
             drive = Drive(running, banks_of(running, targets, len(source.axes)), speed)

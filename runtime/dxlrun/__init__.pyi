@@ -51,6 +51,7 @@ from dxlrun.errors import PlugInError as PlugInError
 from dxlrun.errors import PortError as PortError
 from dxlrun.errors import ProcessFault as ProcessFault
 from dxlrun.errors import Refused as Refused
+from dxlrun.errors import ServoFault as ServoFault
 from dxlrun.errors import StartUpError as StartUpError
 from dxlrun.log.reader import Log as Log
 from dxlrun.log.reader import LogReader as LogReader

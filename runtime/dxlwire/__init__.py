@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlwire.bus_plan import BusPlan as BusPlan
+    from dxlwire.bus_plan import ServoPlan as ServoPlan
     from dxlwire.clock import Clock as Clock
     from dxlwire.clock import MonotonicClock as MonotonicClock
     from dxlwire.control_table.hardware_errors import Fault as Fault
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from dxlwire.port.latency_timer import is_simulated as is_simulated
     from dxlwire.port.ports import Port as Port
     from dxlwire.port.ports import SerialPort as SerialPort
+    from dxlwire.port.reopening import lasting_name as lasting_name
     from dxlwire.port.serial_open import SerialLine as SerialLine
     from dxlwire.port.serial_open import open_serial as open_serial
     from dxlwire.transaction import BROADCAST_ID as BROADCAST_ID

@@ -61,7 +61,7 @@ class Robot:
 def running(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     def start(*arguments: Any) -> Robot:
         robot = Robot(*arguments)
-        monkeypatch.setattr(module, "robot_of", lambda chosen, verb: robot)
+        monkeypatch.setattr(module, "connect_robot", lambda name, verb: robot)
         return robot
 
     return start

@@ -124,7 +124,7 @@ class Robot:
 def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     one = Robot()
     for room in (goals, parameters, play, steer):
-        monkeypatch.setattr(room, "robot_of", lambda chosen, verb: one)
+        monkeypatch.setattr(room, "connect_robot", lambda name, verb: one)
     return one
 
 

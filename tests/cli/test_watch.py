@@ -92,7 +92,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     def run(
         robot: Robot, *, runs: bool = False, as_json: bool = False, once: bool = False
     ) -> tuple[int, str]:
-        monkeypatch.setattr(watch, "robot_of", lambda *_: robot)
+        monkeypatch.setattr(watch, "connect_robot", lambda *_: robot)
         monkeypatch.setattr(robot, "link", SimpleNamespace(alive=runs), raising=False)
         monkeypatch.setattr(watch, "REFRESH_S", 0.0)
         code = watch.watch(once=once, chosen=Chosen(as_json=as_json))

@@ -7,7 +7,7 @@ from tests.kit.rigs import VirtualLine
 from dxlrun.cli.tools.servo import VERBS, Asked
 from dxlrun.dynamixel.tools import one_servo, servo_backup
 from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.dynamixel.tools.scanning import Search, find
+from dxlrun.dynamixel.tools.scanning import Search, find_servo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault
 from dxlsim.simulation_plan import ServoConfig
@@ -24,7 +24,7 @@ class Rig:
         servos = (ServoConfig(1, model, 2.0), *(ServoConfig(each, model, 1.5) for each in others))
         self.line = VirtualLine(*servos, protocol=protocol, cannot=cannot)
         self.tool = ToolLine(self.line)
-        (found,) = find(self.tool, 1, Search((protocol,), (RATE,)))
+        (found,) = find_servo(self.tool, 1, Search((protocol,), (RATE,)))
         self.one = OneServo(self.tool, found)
         self.start = len(self.line.ledger.entries)
 

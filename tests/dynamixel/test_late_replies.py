@@ -18,18 +18,17 @@ import pytest
 from tests.kit.line_faults import STALLED, disturb_replies
 from tests.kit.rigs import VirtualLine, make_plan, make_rig, start_rig
 
-from dxlrun.dynamixel.tools.inspection import NOWHERE, _look, _run, identify
+from dxlrun.dynamixel.tools.inspection import NOWHERE, _look, _run, compare_servos, identify
 from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.dynamixel.tools.scanning import Search, find, scan
+from dxlrun.dynamixel.tools.scanning import Search, find_servo, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault, StartUpError
-from dxlrun_hand.servo_setup import _read_back, bring
+from dxlrun_hand.servo_setup import bring
 from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import control_table
 from dxlwire.plan.planning import Wiring, bus_plan
-from dxlwire.plan.retry import extend_timeouts
 
 COUNT = os.environ.get("DXLRUN_LATE_REPLIES", "40")
 FARTHEST = 8  # Requests between two faults: later, the first one is over
@@ -161,7 +160,7 @@ def tool_of(protocol: float) -> tuple[VirtualLine, ToolLine]:
 def servo(protocol: float, faults: Faults) -> tuple[set[str], int]:
     """Read, write, and switch torque as `dxlrun servo` does."""
     line, tool = tool_of(protocol)
-    (found,) = find(tool, 1, Search((protocol,), (1_000_000,)))
+    (found,) = find_servo(tool, 1, Search((protocol,), (1_000_000,)))
     one = OneServo(tool, found)
     replies = disturb_replies(line.bus, 1, faults)
     said: list[str] = []
@@ -211,14 +210,14 @@ def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
         joints=[wiring],
         protocol=protocol,
     )
-    (found,) = find(tool, 1, Search((protocol,), (1_000_000,)))
+    (found,) = find_servo(tool, 1, Search((protocol,), (1_000_000,)))
     replies = disturb_replies(line.bus, 1, faults)
     said: list[str] = []
     try:
         said += bring(OneServo(tool, found), plan, plan.servos[0])
     except ServoFault as error:
         said += error.sentences
-    survey = tool.run(extend_timeouts(_read_back(plan, plan.servos)))
+    survey = compare_servos(tool, plan, plan.servos)
     said += [*survey.problems, *(text for _, text in survey.describe_deviations())]
     return reported(said), replies()
 

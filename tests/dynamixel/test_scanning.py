@@ -5,7 +5,7 @@ from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.dynamixel.tools import scanning
-from dxlrun.dynamixel.tools.scanning import Search, find, known_rates, scan
+from dxlrun.dynamixel.tools.scanning import Search, find_servo, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
 from dxlsim.simulation_plan import AdapterConfig, ServoConfig
@@ -62,7 +62,7 @@ def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(protocol):
     found = scan(ToolLine(line), search).servos
     assert [(one.servo_id, one.model, one.remarks) for one in found] == [(3, model, ())]
     delay_next(line.bus, 3, 90_000_000)
-    (found,) = find(ToolLine(line), 3, search)
+    (found,) = find_servo(ToolLine(line), 3, search)
     assert (found.model, found.remarks) == (model, ())
 
 
@@ -150,9 +150,9 @@ def test_a_line_that_is_gone_ends_the_scan():
 
 def test_one_id_is_found_wherever_it_is():
     line = VirtualLine(two(9), rate=4_000_000)
-    (found,) = find(ToolLine(line), 9)
+    (found,) = find_servo(ToolLine(line), 9)
     assert (found.protocol, found.baud_rate, found.model) == (2.0, 4_000_000, "XM430-W350")
-    assert find(ToolLine(line), 8) == ()
+    assert find_servo(ToolLine(line), 8) == ()
 
 
 def test_the_rates_are_those_of_the_tables_and_the_usual_ones_come_first():

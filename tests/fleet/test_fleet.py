@@ -29,8 +29,8 @@ from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code
 from dxlrun.cli import app
-from dxlrun.cli.steering.watch import compact
 from dxlrun.errors import InputError, Refused
+from dxlrun.output.live_view import compact
 from dxlrun.remote.network.certificates import keys_place
 from dxlrun.remote.network.network_link import NetworkLink
 from dxlrun.remote.requests.replies import EventRow, Events, RobotInfo

@@ -317,7 +317,7 @@ def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, tmp_path: Path)
     assert header.robot_description is None
     LogWriter(tmp_path / "plain.mcap", replace(header, frames=FramesPlan(30))).close()
 
-    assert schemas.FRAMES_TOPIC not in open_log(tmp_path / "plain.mcap").topics
+    assert schemas.LogTopic.FRAMES not in open_log(tmp_path / "plain.mcap").topics
 
 
 # An IMU on a moving link, linear and mimic joints

@@ -108,4 +108,4 @@ def test_virtual_runs_have_no_machine_and_stay_equal(tmp_path: Path) -> None:
     for name in ("a", "b"):
         simulated_robot("robots/single_joint.yaml", duration_s=0.2, log=tmp_path / f"{name}.mcap").run()
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    assert schemas.MACHINE_TOPIC not in read_log(tmp_path / "a.mcap").topics
+    assert schemas.LogTopic.MACHINE not in read_log(tmp_path / "a.mcap").topics

@@ -28,7 +28,7 @@ from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
-from dxlrun.log.schemas import MACHINE_TOPIC, CycleSpan, LogHeader, RecorderJob
+from dxlrun.log.schemas import CycleSpan, LogHeader, LogTopic, RecorderJob
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -125,7 +125,7 @@ def test_what_the_loop_gets_of_the_machine_is_in_the_log(start: Start, cycle: Cy
     recording.control.sendall(b'{"type": "LoopRuns", "pid": %d}\n' % os.getpid())
     recording.finish()
     sample: Any
-    (sample,) = read_log(recording.path).messages(MACHINE_TOPIC)
+    (sample,) = read_log(recording.path).messages(LogTopic.MACHINE)
     assert sample["loop_voluntary"] >= 0
     assert len(sample["idle"]) >= 1
 
@@ -204,7 +204,7 @@ def test_recorder_measures_the_machine_from_the_loop_s_begin_to_its_end(
         job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
         closed = Recorder(job, MessageChannel(theirs, REQUESTS)).run(asked_to_stop)
     os.close(memory)
-    assert MACHINE_TOPIC in read_log(tmp_path / "run.mcap").topics
+    assert LogTopic.MACHINE in read_log(tmp_path / "run.mcap").topics
     # the sample at the end covers half a second or more; the first cycle was due before it began
     assert closed.run_load.seconds > 0.4
     assert closed.start_up_load.seconds == 0

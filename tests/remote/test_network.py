@@ -21,7 +21,7 @@ from dxlrun.remote.network.commander import LEASE_S
 from dxlrun.remote.network.listener import MOST_UNPROVED, Listener
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests.table import REQUESTS, Role
-from dxlrun.remote.sockets import Address, address_of
+from dxlrun.remote.sockets import Address
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
@@ -279,12 +279,12 @@ def test_half_open_connections_keep_no_client_out_and_are_closed(net):
 
 
 def test_addresses(monkeypatch, tmp_path):
-    assert address_of("torso@lab3:7660") == ("torso", "lab3", 7660)
-    assert address_of("[::1]:7660", "torso") == ("torso", "::1", 7660)
-    assert str(address_of("t@[::1]:1")) == "t@[::1]:1"
+    assert Address.parse("torso@lab3:7660") == ("torso", "lab3", 7660)
+    assert Address.parse("[::1]:7660", "torso") == ("torso", "::1", 7660)
+    assert str(Address.parse("t@[::1]:1")) == "t@[::1]:1"
     for wrong in ("lab3", "lab3:0", "a@b@c:1", "a@b:65536", "", "a@:1", "a@b:1 "):
         with pytest.raises(InputError, match="is no address"):
-            address_of(wrong, "torso")
+            Address.parse(wrong, "torso")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     (tmp_path / "dxlrun").mkdir()
     (tmp_path / "dxlrun" / "robots.yaml").write_text("robots:\n  torso: lab3:7660\n  arm: lab4\n  leg: x:y\n")

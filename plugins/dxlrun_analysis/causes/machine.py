@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Log
 from dxlrun.tooling.records import LoadMeter, LoadSample, MachineLoad, load_sample
-from dxlrun.tooling.topics import MACHINE_TOPIC
+from dxlrun.tooling.topics import LogTopic
 
 STEAL = "steal by the host"
 OTHERS = "other processes on its core"
@@ -45,9 +45,9 @@ class MachineHistory:
 
     def new(self, log: Log) -> list[MachineSample]:
         """Return the samples of a slice. Raises LogError when one cannot be read."""
-        if MACHINE_TOPIC not in log.topics:
+        if LogTopic.MACHINE not in log.topics:
             return []
-        return [self._sample(message) for message in log.messages(MACHINE_TOPIC)]
+        return [self._sample(message) for message in log.messages(LogTopic.MACHINE)]
 
     def load(self, begin_ns: int, end_ns: int) -> MachineLoad:
         """Return whether the machine was too busy in an interval of the samples so far."""

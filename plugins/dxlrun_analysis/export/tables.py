@@ -16,36 +16,20 @@ from numpy.typing import NDArray
 
 from dxlrun import Log, LogError, LogReader
 from dxlrun.tooling.records import Severity, Torque
-from dxlrun.tooling.topics import (
-    ACTIVATION_TOPIC,
-    COMMANDS_TOPIC,
-    CYCLE_TOPIC,
-    DIAGNOSTICS_TOPIC,
-    EVENT_TOPIC,
-    FRAMES_TOPIC,
-    JOINT_COMMANDS_TOPIC,
-    JOINT_STATES_TOPIC,
-    ROBOT_DESCRIPTION_TOPIC,
-    ROSOUT_TOPIC,
-    STILL_FRAMES_TOPIC,
-    Codec,
-    LoggedTopic,
-    bus_topic,
-    message_struct,
-)
+from dxlrun.tooling.topics import Codec, LoggedTopic, LogTopic, bus_topic, message_struct
 from dxlwire import Mode, PacketKind
 
-CYCLES, EVENTS, COMMANDS = CYCLE_TOPIC, EVENT_TOPIC, COMMANDS_TOPIC
+CYCLES, EVENTS, COMMANDS = LogTopic.CYCLE, LogTopic.EVENT, LogTopic.COMMANDS
 PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one
 WITHOUT_TABLE: Mapping[str, str] = {
-    JOINT_STATES_TOPIC: "the states are in /cycle",
-    JOINT_COMMANDS_TOPIC: "the goals are in /cycle",
-    DIAGNOSTICS_TOPIC: "temperatures, voltages, hardware errors and modes are in /cycle",
-    FRAMES_TOPIC: "the URDF and the positions in /cycle give the frames",
-    STILL_FRAMES_TOPIC: "the URDF has these frames",
-    ROBOT_DESCRIPTION_TOPIC: "it is one text, the URDF",
-    ROSOUT_TOPIC: "the same events are in /events",
-    ACTIVATION_TOPIC: "it is one message, the states and goals before the first cycle",
+    LogTopic.JOINT_STATES: "the states are in /cycle",
+    LogTopic.JOINT_COMMANDS: "the goals are in /cycle",
+    LogTopic.DIAGNOSTICS: "temperatures, voltages, hardware errors and modes are in /cycle",
+    LogTopic.FRAMES: "the URDF and the positions in /cycle give the frames",
+    LogTopic.STILL_FRAMES: "the URDF has these frames",
+    LogTopic.ROBOT_DESCRIPTION: "it is one text, the URDF",
+    LogTopic.ROSOUT: "the same events are in /events",
+    LogTopic.ACTIVATION: "it is one message, the states and goals before the first cycle",
 }
 """Topics of a log that no table has, and the reason."""
 _ROWS = 4096

@@ -10,7 +10,7 @@ from bokeh.models import Range1d
 from numpy.typing import NDArray
 
 from dxlrun import Log
-from dxlrun.tooling.topics import MACHINE_TOPIC
+from dxlrun.tooling.topics import LogTopic
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Line, Plot, many_lines
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope
@@ -44,9 +44,9 @@ class MachineCollector:
 
     def take(self, log: Log) -> None:
         """Take the samples of the next slice. Raises LogError when one cannot be read."""
-        if MACHINE_TOPIC not in log.topics:
+        if LogTopic.MACHINE not in log.topics:
             return
-        for message in log.messages(MACHINE_TOPIC):
+        for message in log.messages(LogTopic.MACHINE):
             self._add(message)
 
     def finish(self) -> tuple[Curves, tuple[int, ...]]:

@@ -13,11 +13,11 @@ from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import EventCode, LostRecords
-from dxlrun.tooling.topics import MACHINE_TOPIC, Codec, MessageSink, MessageType, PublishedTopic
+from dxlrun.tooling.topics import Codec, LogTopic, MessageSink, MessageType, PublishedTopic
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"
-_NOT_COMPARED = frozenset((MACHINE_TOPIC, "/snapshots"))
+_NOT_COMPARED = frozenset((LogTopic.MACHINE, "/snapshots"))
 """Topics that no replay publishes; /snapshots: of logs from before this version."""
 _LONGEST_SHOWN = 120
 

@@ -13,8 +13,7 @@ from dxlrun import InputError
 from dxlrun.tooling.verbs import Assignment, DebugFlag, RobotPath, compiled, parse_assignments, read_models
 
 if TYPE_CHECKING:
-    from dxlrun.compile.joints.joints import CompiledJoint
-    from dxlrun.compile.robot import Compiled
+    from dxlrun.tooling.robots import Compiled, CompiledJoint
     from dxlrun_hand.calibration import HandJoint
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.lines import Opened
@@ -36,7 +35,7 @@ def calibrate(
     joint
         Only this joint, or the joints of this group; may be given several times.
     """
-    from dxlrun.dynamixel.tools.tool_line import TunablePort
+    from dxlrun.tooling.servos import TunablePort
     from dxlrun_hand.dialogue import Dialogue
 
     result = compiled(robot, assignments, (), None, read_models)
@@ -47,7 +46,7 @@ def calibrated(
     result: Compiled, dialogue: Dialogue, opened: Opened, words: Sequence[str], assignments: Sequence[str]
 ) -> int:
     """Calibrate a robot; return the exit code. Where it raises an error, the file is as it was."""
-    from dxlrun.compile.robot import compile_files
+    from dxlrun.tooling.robots import compile_robot, read_robot
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import ending_with, yes
     from dxlrun_hand.lines import BusLines
@@ -79,7 +78,7 @@ def calibrated(
             text.put(change.path, change.value if isinstance(change.value, list) else str(change.value))
         dialogue.say(*text.diff())
         try:
-            compile_files(robot, parse_assignments(assignments), [], replacements=changes)
+            compile_robot(read_robot(robot, parse_assignments(assignments), changes), [])
         except InputError as error:
             dialogue.say("With this something else in the robot file is wrong:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):

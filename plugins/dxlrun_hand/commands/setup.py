@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun import InputError
-from dxlrun.cli.tools.scan import load_models
 from dxlrun.tooling.verbs import Assignment, DebugFlag, Flag, RobotPath, known_file, parse_assignments
 from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
     from dxlrun_hand.lines import Devices, Opened
     from dxlrun_hand.servo_setup import SetUp
-    from dxlwire.bus_plan import BusPlan
+    from dxlwire import BusPlan
 
 
 def setup(
@@ -38,14 +37,14 @@ def setup(
     find_port
         Find the port of each bus by unplugging its adapter, also where the file's is there.
     """
-    from dxlrun.dynamixel.tools.tool_line import TunablePort
-    from dxlrun.tooling.robots import read_robot
+    from dxlrun.tooling.robots import load_plugins, read_robot
+    from dxlrun.tooling.servos import TunablePort
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.servo_setup import SetUp
-    from dxlwire.port.adapters import serial_devices
+    from dxlwire import serial_devices
 
     known_file(robot)
-    load_models()
+    load_plugins()  # they can add servo models
     task = SetUp(read_robot(robot, parse_assignments(assignments)), Dialogue("setup"))
     return set_up(task, TunablePort, serial_devices, joint, search=find_port)
 
@@ -82,7 +81,7 @@ def _left(task: SetUp) -> str:
 
 def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     """Return the port of a bus: that of the file where it is there, else the one that is plugged in."""
-    from dxlrun.description.bus import SIMULATED
+    from dxlrun.tooling.robots import SIMULATED
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.lines import find_port
     from dxlrun_hand.robot_text import RobotText

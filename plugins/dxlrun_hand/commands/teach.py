@@ -8,8 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.cli.steering.steer import Chosen, robot_of
-from dxlrun.tooling.verbs import DebugFlag, RobotName
+from dxlrun.tooling.verbs import DebugFlag, RobotName, connect_robot
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
 """Names of joints, groups or controllers."""
@@ -39,8 +38,8 @@ def teach(
     velocity
         Velocity of the joints on the way from one pose to the next.
     """
-    from dxlrun.description.units import angular_velocity
     from dxlrun.tooling.output import check_target
+    from dxlrun.tooling.verbs import angular_velocity
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.teaching import taught
 
@@ -53,5 +52,5 @@ def teach(
         raise InputError(f"--velocity: {error}") from None
     if way_speed <= 0:
         raise InputError(f"--velocity {velocity}: write a velocity above 0, such as 30 deg/s")
-    with robot_of(Chosen(robot), "teach") as running:
+    with connect_robot(robot, "teach") as running:
         return taught(running, Dialogue("teach"), joints, motion, way_speed)

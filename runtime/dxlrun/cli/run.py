@@ -128,9 +128,9 @@ def run(
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
     """Raise InputError where clients of other computers could not be served."""
     from dxlrun.remote.network.listener import Listener
-    from dxlrun.remote.sockets import address_of
+    from dxlrun.remote.sockets import Address
 
-    address = address_of(text, plan.robot)
+    address = Address.parse(text, plan.robot)
     if not (served and plan.gateway):
         raise InputError(
             "--listen needs the gateway of a run in real time: leave out --no-gateway, --virtual"

@@ -19,6 +19,7 @@ from dxlrun.compile.controllers import (
     compile_modes,
     read_controller_files,
 )
+from dxlrun.compile.joints.described_servos import AUTO
 from dxlrun.compile.joints.joints import (
     CompiledJoint,
     check_limp_joints,
@@ -28,7 +29,6 @@ from dxlrun.compile.joints.joints import (
     compile_mechanics,
 )
 from dxlrun.compile.joints.motors import read_motors
-from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies

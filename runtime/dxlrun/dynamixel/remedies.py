@@ -18,7 +18,9 @@ INJECTED = "look at the faults that were injected into the simulation"
 _IDLE = MachineLoad()
 
 
-def choose_remedy(port: str, hardware: str, *, simulated: str = INJECTED, load: MachineLoad = _IDLE) -> str:
+def choose_remedy(
+    port: str, hardware: str = CHECK, *, simulated: str = INJECTED, load: MachineLoad = _IDLE
+) -> str:
     """Return the remedy for late or missing replies on a bus, imperative and without its full stop.
 
     Args:

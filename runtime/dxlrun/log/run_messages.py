@@ -70,14 +70,14 @@ class RunMessages(ABC):
     def _open_channels(self) -> None:
         """Open the channels that every run has."""
         header = self.header
-        self._cycle_channel = self._channel(schemas.CYCLE_TOPIC, schemas.CYCLE)
-        self._activation_channel = self._channel(schemas.ACTIVATION_TOPIC, schemas.CYCLE)
-        self._taken_channel = self._channel(schemas.COMMANDS_TOPIC, schemas.COMMAND)
-        self._states_channel = self._channel(schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
-        self._commands_channel = self._channel(schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
-        self._diagnostics_channel = self._channel(schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
-        self._event_channel = self._channel(schemas.EVENT_TOPIC, schemas.EVENT)
-        self._rosout_channel = self._channel(schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
+        self._cycle_channel = self._channel(schemas.LogTopic.CYCLE, schemas.CYCLE)
+        self._activation_channel = self._channel(schemas.LogTopic.ACTIVATION, schemas.CYCLE)
+        self._taken_channel = self._channel(schemas.LogTopic.COMMANDS, schemas.COMMAND)
+        self._states_channel = self._channel(schemas.LogTopic.JOINT_STATES, schemas.JOINT_STATE)
+        self._commands_channel = self._channel(schemas.LogTopic.JOINT_COMMANDS, schemas.JOINT_STATE)
+        self._diagnostics_channel = self._channel(schemas.LogTopic.DIAGNOSTICS, schemas.DIAGNOSTICS)
+        self._event_channel = self._channel(schemas.LogTopic.EVENT, schemas.EVENT)
+        self._rosout_channel = self._channel(schemas.LogTopic.ROSOUT, schemas.ROS_LOG)
         self._bus_channels = [
             self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
@@ -93,17 +93,17 @@ class RunMessages(ABC):
                 np.array([header.joints.index(j) for j in controller.joints], int),
             )
             for index, controller in enumerate(header.controllers)
-            if schemas.JOINT_STATES_TOPIC in controller.publishes
+            if schemas.LogTopic.JOINT_STATES in controller.publishes
         ]
         if header.robot_description is not None:
-            channel = self._channel(schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched=True)
+            channel = self._channel(schemas.LogTopic.ROBOT_DESCRIPTION, schemas.STRING, latched=True)
             description = Codec(schemas.STRING).pack(header.robot_description)
             self._firsts.append((channel, lambda _: description))
         self._frames = frame_messages(header)
         if self._frames is not None:
-            self._frames_channel = self._channel(schemas.FRAMES_TOPIC, schemas.FRAMES)
+            self._frames_channel = self._channel(schemas.LogTopic.FRAMES, schemas.FRAMES)
             if self._frames.any_still:
-                channel = self._channel(schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched=True)
+                channel = self._channel(schemas.LogTopic.STILL_FRAMES, schemas.FRAMES, latched=True)
                 self._firsts.append((channel, self._frames.still))
 
     def cycle(self, payload: Payload) -> None:
@@ -224,5 +224,5 @@ class RunMessages(ABC):
 
     def _machine(self, t_ns: int, data: bytes) -> None:
         if self._machine_channel is None:
-            self._machine_channel = self._channel(schemas.MACHINE_TOPIC, schemas.MACHINE)
+            self._machine_channel = self._channel(schemas.LogTopic.MACHINE, schemas.MACHINE)
         self._add(self._machine_channel, t_ns, data)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -31,19 +32,25 @@ PROFILE = "ros2"
 ENCODING = "cdr"
 SCHEMA_ENCODING = "ros2msg"
 
-CYCLE_TOPIC = "/cycle"
-ACTIVATION_TOPIC = "/activation"
-"""One message of the type of /cycle: the states and goals with which the controllers were activated."""
-COMMANDS_TOPIC = "/commands"
-EVENT_TOPIC = "/events"
-ROSOUT_TOPIC = "/rosout"
-JOINT_STATES_TOPIC = "/joint_states"
-JOINT_COMMANDS_TOPIC = "/joint_commands"
-DIAGNOSTICS_TOPIC = "/diagnostics"
-MACHINE_TOPIC = "/machine"
-FRAMES_TOPIC = "/tf"
-STILL_FRAMES_TOPIC = "/tf_static"
-ROBOT_DESCRIPTION_TOPIC = "/robot_description"
+
+class LogTopic(StrEnum):
+    """Topics of every log. A bus has a topic that begins with `BUS_PREFIX`; controllers add their own."""
+
+    CYCLE = "/cycle"
+    ACTIVATION = "/activation"
+    """One message of the type of /cycle: states and goals with which the controllers were activated."""
+    COMMANDS = "/commands"
+    EVENT = "/events"
+    ROSOUT = "/rosout"
+    JOINT_STATES = "/joint_states"
+    JOINT_COMMANDS = "/joint_commands"
+    DIAGNOSTICS = "/diagnostics"
+    MACHINE = "/machine"
+    FRAMES = "/tf"
+    STILL_FRAMES = "/tf_static"
+    ROBOT_DESCRIPTION = "/robot_description"
+
+
 BUS_PREFIX = "/bus/"
 
 METADATA_NAME = "dxlrun"

@@ -31,7 +31,7 @@ from dxlrun.remote.requests import replies
 from dxlrun.remote.requests import table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
 from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Request, Row, Value
-from dxlrun.remote.sockets import MOST_BYTES, RobotLink, SocketLink, address_of, sockets
+from dxlrun.remote.sockets import MOST_BYTES, Address, RobotLink, SocketLink, sockets
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.tree import FrameTree
@@ -85,7 +85,7 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     """
     found, client = sockets(), client or f"python {os.getpid()}"
     if robot is not None and robot not in found:
-        address = address_of(robot) if "@" in robot else known_robots().get(robot)
+        address = Address.parse(robot) if "@" in robot else known_robots().get(robot)
         if address is not None:
             return RemoteRobot(robot, NetworkLink(address, client))
     names = ", ".join(sorted(found))

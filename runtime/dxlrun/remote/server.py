@@ -27,6 +27,7 @@ import uvicorn
 from msgspec.json import Decoder
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
 
 from dxlrun.channels import process
 from dxlrun.channels.process import Failed, Finish, Listening, MessageChannel
@@ -42,7 +43,7 @@ from dxlrun.remote.network.commander import Client
 from dxlrun.remote.network.listener import Listener
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.table import Role
-from dxlrun.remote.sockets import address_of, listen
+from dxlrun.remote.sockets import Address, listen
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
@@ -70,7 +71,7 @@ def main() -> None:
         plugins = load_plugins(files=plan.included)
         preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
-        network = Listener.secured(address_of(job.listen, plan.robot)) if job.listen else None
+        network = Listener.secured(Address.parse(job.listen, plan.robot)) if job.listen else None
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))
@@ -101,7 +102,7 @@ async def serve(
     server = _Server(config)
     config.load()
     if network is not None:
-        await network.serve(partial(Connection, config, server.server_state, {"listener": network}))
+        await serve_clients(network, config, server.server_state)
 
     def end(*_: object) -> None:
         server.should_exit = True
@@ -119,6 +120,27 @@ async def serve(
     watching.cancel()
     with suppress(asyncio.CancelledError):
         await watching
+
+
+async def serve_clients(
+    listener: Listener, app: ASGIApp | uvicorn.Config, state: ServerState | None = None
+) -> None:
+    """Serve an application to clients of other computers from now on, each by its certificate.
+
+    `scope["client"]` of a request has the name and the role of its client. Silent connections are closed,
+    and those of a client that has too many.
+
+    Args:
+        listener: A listener with TLS.
+        app: The application, or the loaded configuration of the server that serves it elsewhere too.
+        state: State of that server.
+    """
+    if isinstance(app, uvicorn.Config):
+        config = app
+    else:
+        config = config_of(app)
+        config.load()
+    await listener.serve(partial(Connection, config, state or ServerState(), {"listener": listener}))
 
 
 def config_of(app: ASGIApp) -> uvicorn.Config:

@@ -162,16 +162,16 @@ class Address(NamedTuple):
     host: str
     port: int
 
+    @classmethod
+    def parse(cls, text: str, name: str = "") -> Address:
+        """Return the address that `[NAME@]HOST:PORT` means; raises InputError."""
+        found = _ADDRESS.fullmatch(text)
+        if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
+            raise InputError(f"{text[:80]!r} is no address; write [NAME@]HOST:PORT, such as torso@lab3:7660")
+        return cls(found[1] or name, found[2].strip("[]"), int(found[3]))
+
     def __str__(self) -> str:
         return f"{self.name}@{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
-
-
-def address_of(text: str, name: str = "") -> Address:
-    """Return the address that `[NAME@]HOST:PORT` means; raises InputError."""
-    found = _ADDRESS.fullmatch(text)
-    if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
-        raise InputError(f"{text[:80]!r} is no address; write [NAME@]HOST:PORT, such as torso@lab3:7660")
-    return Address(found[1] or name, found[2].strip("[]"), int(found[3]))
 
 
 class RobotLink(Protocol):

@@ -9,9 +9,11 @@ each module is a page of names, and each name is imported when it is first used.
 | `verbs` | commands: their options, a wrong line, an extra that is missing |
 | `output` | tables and sentences in the terminal and as JSON; files that are written |
 | `html` | reports as HTML pages |
+| `files` | YAML files of a package's own, checked as robot files are |
 | `robots` | robot and motion files: read, compile |
 | `plans` | the compiled robot, as a run and each log have it |
 | `runs` | running a robot: in processes, on virtual time |
+| `servos` | single servos on a line that no run uses |
 | `live` | robots that run: addresses, keys, messages as they come |
 | `logs` | logs: finding, reading, following |
 | `records` | the contents of a log: cycles, packets, events, commands |

@@ -20,19 +20,8 @@ if TYPE_CHECKING:
     from dxlrun.channels.messages import PublishedTopic as PublishedTopic
     from dxlrun.log.reading.arrow import message_struct as message_struct
     from dxlrun.log.reading.topics import LoggedTopic as LoggedTopic
-    from dxlrun.log.schemas import ACTIVATION_TOPIC as ACTIVATION_TOPIC
     from dxlrun.log.schemas import BUS_PREFIX as BUS_PREFIX
-    from dxlrun.log.schemas import COMMANDS_TOPIC as COMMANDS_TOPIC
-    from dxlrun.log.schemas import CYCLE_TOPIC as CYCLE_TOPIC
-    from dxlrun.log.schemas import DIAGNOSTICS_TOPIC as DIAGNOSTICS_TOPIC
-    from dxlrun.log.schemas import EVENT_TOPIC as EVENT_TOPIC
-    from dxlrun.log.schemas import FRAMES_TOPIC as FRAMES_TOPIC
-    from dxlrun.log.schemas import JOINT_COMMANDS_TOPIC as JOINT_COMMANDS_TOPIC
-    from dxlrun.log.schemas import JOINT_STATES_TOPIC as JOINT_STATES_TOPIC
-    from dxlrun.log.schemas import MACHINE_TOPIC as MACHINE_TOPIC
-    from dxlrun.log.schemas import ROBOT_DESCRIPTION_TOPIC as ROBOT_DESCRIPTION_TOPIC
-    from dxlrun.log.schemas import ROSOUT_TOPIC as ROSOUT_TOPIC
-    from dxlrun.log.schemas import STILL_FRAMES_TOPIC as STILL_FRAMES_TOPIC
+    from dxlrun.log.schemas import LogTopic as LogTopic
     from dxlrun.log.schemas import bus_topic as bus_topic
     from dxlrun.messages.cdr import ENCAPSULATION as ENCAPSULATION
     from dxlrun.messages.cdr import Codec as Codec

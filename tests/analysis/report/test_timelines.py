@@ -12,7 +12,7 @@ from msgspec import structs
 from tests.kit.made_logs import Cycle
 
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun.log.schemas import LogTopic
 from dxlrun_analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import Canvas, Plot
 from dxlrun_analysis.page.curves import CurveCollector
@@ -100,7 +100,7 @@ def test_a_short_cycle_is_drawn_in_us_and_its_idle_step_is_left_out() -> None:
 class Samples:
     """A slice of a log of which only the samples of the machine are read."""
 
-    topics = (MACHINE_TOPIC,)
+    topics = (LogTopic.MACHINE,)
 
     def __init__(self, *samples: dict[str, Any]) -> None:
         self._samples = samples

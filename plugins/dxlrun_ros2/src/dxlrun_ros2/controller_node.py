@@ -17,8 +17,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
-from dxlrun.remote.client import Executed
-from dxlrun.tooling.live import ControllerInfo
+from dxlrun.tooling.live import ControllerInfo, Executed
 from dxlrun_ros2 import CLIENT
 from dxlrun_ros2.actions import FollowTrajectory, Gripper, stopped
 from dxlrun_ros2.published_run import STATE, PublishedRun

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 
 import numpy as np
@@ -13,23 +13,26 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_rosout_default
 
 from dxlrun import DxlrunError, Floats, RemoteRobot, TopicMessage, connect
-from dxlrun.log import schemas
-from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.tooling.live import LiveMessages
-from dxlrun.tooling.topics import MessageType
+from dxlrun.tooling.topics import BUS_PREFIX, LogTopic, MessageType
 from dxlrun_ros2 import CLIENT
 
 STATE = QoSProfile(depth=1)
 """As broadcasters of ros2_control have it: reliable, the newest message, nothing for late subscribers."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-QUALITIES = {
-    schemas.FRAMES_TOPIC: QoSProfile(depth=100),
-    schemas.ROSOUT_TOPIC: qos_profile_rosout_default,
+QUALITIES: Mapping[str, QoSProfile] = {
+    LogTopic.FRAMES: QoSProfile(depth=100),
+    LogTopic.ROSOUT: qos_profile_rosout_default,
 }
-GLOBAL = {schemas.FRAMES_TOPIC, schemas.STILL_FRAMES_TOPIC, schemas.ROSOUT_TOPIC, schemas.DIAGNOSTICS_TOPIC}
+GLOBAL = {
+    LogTopic.FRAMES,
+    LogTopic.STILL_FRAMES,
+    LogTopic.ROSOUT,
+    LogTopic.DIAGNOSTICS,
+}
 """Topics that ROS 2 has once, whatever the namespace."""
-LOGGED = (schemas.CYCLE, schemas.COMMAND, schemas.EVENT, schemas.BUS_PACKETS, schemas.MACHINE)
-"""Messages that only the log has."""
+LOGGED = {LogTopic.CYCLE, LogTopic.ACTIVATION, LogTopic.COMMANDS, LogTopic.EVENT, LogTopic.MACHINE}
+"""Topics whose messages only the log has, as those of buses."""
 
 
 class PublishedRun(LiveMessages):
@@ -57,7 +60,7 @@ class PublishedRun(LiveMessages):
         quality = LATCHED if latched else QUALITIES.get(topic, STATE)
         name = topic if topic in GLOBAL else topic.removeprefix("/")
         kind = message_class(message.name)
-        if kind is None and message not in LOGGED:
+        if kind is None and topic not in LOGGED and not topic.startswith(BUS_PREFIX):
             self._node.get_logger().warning(f"{topic} is not published: {message.name} is not installed here")
         opened = None if kind is None else self._node.create_publisher(kind, name, quality)
         self._publishers_of.append(opened)
@@ -91,8 +94,8 @@ class PublishedRun(LiveMessages):
     def take(self, message: TopicMessage) -> None:
         """Publish a message, and keep the newest record of a cycle."""
         super().take(message)
-        if message.topic == schemas.CYCLE_TOPIC:
-            self.newest = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
+        if message.topic == LogTopic.CYCLE:
+            self.newest = self.read_cycle(message)
             for see in tuple(self.seen):
                 see(self.newest)
 

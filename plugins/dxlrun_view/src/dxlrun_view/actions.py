@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 import msgspec
 
 from dxlrun import DxlrunError, InputError, RemoteRobot
-from dxlrun.remote.requests.replies import Parameter
+from dxlrun.tooling.live import Parameter
 from dxlrun_view.live import LiveRobot, info_of
 from dxlrun_view.shown import Source
 

@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 
 from dxlrun import DxlrunError, Refused, RemoteRobot, connect, running
-from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
-from dxlrun.remote.live.states import RobotStates
+from dxlrun.tooling.live import RobotStates
 from dxlrun.tooling.records import Torque
 from dxlrun.tooling.robots import read_motion
+from dxlrun.tooling.topics import LogTopic
 from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, Values, columns_of, numbers_in
 from dxlrun_view.shown import LiveEvent, RobotInfo, Shown
-from dxlwire.modes import Mode
+from dxlwire import Mode
 
 PERIOD_S = 0.04
 """Between two looks of a page; what a screen shows need not come more often."""
@@ -35,7 +35,7 @@ GAP_S = 1.0
 _MOST_EVENTS = 400
 _TORQUE = {torque.word: torque for torque in reversed(Torque)}
 """Numbers of the log by their words."""
-NOT_DRAWN = (EVENT_TOPIC, JOINT_STATES_TOPIC, "/goals")
+NOT_DRAWN = (LogTopic.EVENT, LogTopic.JOINT_STATES, "/goals")
 """Topics whose numbers are columns already, or none."""
 
 

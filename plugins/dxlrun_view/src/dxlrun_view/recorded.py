@@ -11,17 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import DxlrunError, LogError, open_log
-from dxlrun.log.schemas import (
-    ACTIVATION_TOPIC,
-    BUS_PREFIX,
-    COMMANDS_TOPIC,
-    CYCLE_TOPIC,
-    EVENT_TOPIC,
-    JOINT_COMMANDS_TOPIC,
-    JOINT_STATES_TOPIC,
-)
 from dxlrun.tooling.plans import Plan, from_json
 from dxlrun.tooling.records import Event
+from dxlrun.tooling.topics import BUS_PREFIX, LogTopic
 from dxlrun_view.curves import (
     CYCLE,
     JOINT_COLUMNS,
@@ -38,12 +30,12 @@ from dxlrun_view.shown import Controller, LiveEvent, Mark, RobotInfo, Shown
 MOST_CYCLES = 100_000
 """Shown of a log, in some 120 MB for 20 joints."""
 _IN_COLUMNS = (
-    CYCLE_TOPIC,
-    ACTIVATION_TOPIC,
-    COMMANDS_TOPIC,
-    EVENT_TOPIC,
-    JOINT_STATES_TOPIC,
-    JOINT_COMMANDS_TOPIC,
+    LogTopic.CYCLE,
+    LogTopic.ACTIVATION,
+    LogTopic.COMMANDS,
+    LogTopic.EVENT,
+    LogTopic.JOINT_STATES,
+    LogTopic.JOINT_COMMANDS,
 )
 """Topics whose numbers are columns of the cycles, or nothing to draw."""
 _NONE = np.zeros(0, [("cycle", "i8")])

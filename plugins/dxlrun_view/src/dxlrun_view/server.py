@@ -12,7 +12,6 @@ import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager
-from functools import partial
 from importlib.resources import files
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -28,9 +27,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun import DxlrunError, InputError
-from dxlrun.remote.asked import client_of
-from dxlrun.remote.server import Connection
-from dxlrun.tooling.live import Listener, Role, in_url
+from dxlrun.tooling.live import Listener, Role, in_url, serve_clients
 from dxlrun_view.actions import Action, ListParameters, act
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.shown import LiveEvent, Shown, Source
@@ -212,7 +209,10 @@ class Page:
 
     def _role(self, request: Request) -> Role:
         """Return the role of a browser: by its certificate; without TLS it is one of this computer."""
-        return Role.ADMIN if self.listener.tls is None else client_of(request).role
+        if self.listener.tls is None:
+            return Role.ADMIN
+        role: Role = request.scope["client"].role
+        return role
 
 
 def mesh_file(folder: Path, name: str) -> Path | None:
@@ -252,8 +252,7 @@ class Server(uvicorn.Server):
         """Begin to serve the sockets of `run`."""
         secured = [one for one in sockets or () if isinstance(one, Listener) and one.tls]
         for listener in secured:
-            make = partial(Connection, self.config, self.server_state, {"listener": listener})
-            await listener.serve(make)
+            await serve_clients(listener, self.config, self.server_state)
         await super().startup([one for one in sockets or () if one not in secured])
 
     @contextmanager

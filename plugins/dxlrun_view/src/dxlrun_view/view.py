@@ -50,7 +50,7 @@ def view(
 
     place = Place.parse(listen)
     leave_real_time()
-    from dxlrun.remote.network.certificates import server_context
+    from dxlrun.tooling.live import server_context
     from dxlrun_view.server import PORT, Page, hosts_of, scheme_of, server_of
 
     source = _source(what)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.inputs import Hertz
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json
@@ -45,7 +45,7 @@ def echo(
         raise InputError(f"--count {count} is no number of messages; give 1 or more")
     if rate is not None and not 0 < rate < math.inf:  # false for nan too
         raise InputError(f"--rate {rate:g} is no rate; give a number of Hz above 0")
-    with robot_of(chosen, "echo") as robot:
+    with connect_robot(chosen.robot, "echo") as robot:
         if topic is None:
             states = robot.topics()
             if chosen.as_json:

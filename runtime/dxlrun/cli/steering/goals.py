@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from msgspec import to_builtins
 
 from dxlrun.cli.inputs import WaitFlag
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, connect_robot, report_done
 from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
@@ -73,7 +73,7 @@ def send(
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
         raise InputError(f"--in: {error}") from None
-    with robot_of(chosen, "send") as robot:
+    with connect_robot(chosen.robot, "send") as robot:
         try:
             with begun_or_cancelled(robot, "send", waited=wait):
                 done = robot.send(controller, kind, written.data, units=True, seconds=seconds, goal=wait)
@@ -106,7 +106,7 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
     """
     from dxlrun.channels.answers import Code
 
-    with robot_of(chosen, "cancel") as robot:
+    with connect_robot(chosen.robot, "cancel") as robot:
         states = robot.goals()
         if not goal:
             wanted = [state.number for state in states if state.status == "running"]
@@ -155,8 +155,8 @@ def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterat
                     for state in robot.goals()
                     if state.number > last and state.origin.startswith(f"dxlrun {verb}")
                 ]
-            for state in cancelled(robot, own):
-                print_warning(f"dxlrun: {sentence(state)}")
+            for state in cancel_goals(robot, own):
+                print_warning(f"dxlrun: {state.describe()}")
         raise
 
 
@@ -172,10 +172,10 @@ def follow(
     try:
         states = _ended(robot, numbers, motion, hidden=chosen.as_json)
     except KeyboardInterrupt:
-        states = cancelled(robot, numbers)
+        states = cancel_goals(robot, numbers)
         if not chosen.as_json:
             for state in states:
-                print_warning(f"dxlrun: {sentence(state)}")
+                print_warning(f"dxlrun: {state.describe()}")
         raise
     reached = all(state.reached for state in states)
     if chosen.as_json:
@@ -183,14 +183,14 @@ def follow(
         result: dict[str, object] = {"robot": robot.name, "cycle": done.cycle}
         result |= {"motion": motion} if motion else {}
         result |= goals[0] if len(goals) == 1 else {"goals": goals}
-        missed = [sentence(state) for state in states if not state.reached]
+        missed = [state.describe() for state in states if not state.reached]
         show_json(result, code=0 if reached else 1, errors=missed)
         return 0 if reached else 1
     joints = _joints(robot) if motion else {}
     for state in states:
         moved = joints.get(state.controller, ())
         played = f"{motion} ({', '.join(moved[:MOST_JOINTS])}{' ...' * (len(moved) > MOST_JOINTS)}): "
-        text = f"{played if motion else ''}{sentence(state)}"
+        text = f"{played if motion else ''}{state.describe()}"
         if state.reached:
             show(f"{robot.name}: {text}")
         else:
@@ -218,8 +218,8 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: b
     return list(states.values())
 
 
-def cancelled(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
-    """Cancel goals and return them when their joints are at rest; those that ended before are as they are."""
+def cancel_goals(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
+    """Cancel goals, and return them once their joints are at rest. A goal that ended before is unchanged."""
     for number in numbers:
         try:
             robot.cancel(number)
@@ -236,14 +236,6 @@ def cancelled(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
         except DxlrunError as error:
             print_error(f"dxlrun: {error}")
     return states
-
-
-def sentence(state: GoalState) -> str:
-    """Return how a goal ended: `goal 3 of left_arm reached after 1.02 s`."""
-    timed = state.seconds is None or state.text.startswith("after ")  # by its controller
-    after = "" if timed else f" after {state.seconds:.2f} s"
-    why = f"{' ' if timed and state.seconds is not None else ': '}{state.text}" if state.text else ""
-    return f"goal {state.number} of {state.controller} {state.status}{after}{why}"
 
 
 def _shown(state: GoalState) -> dict[str, object]:

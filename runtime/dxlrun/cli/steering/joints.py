@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, pose_text
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot, report_done
 from dxlrun.errors import InputError
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show, show_json
@@ -56,7 +56,7 @@ def torque(
         Deactivate the controllers that command the joints; without it they are a reason to refuse `off`.
     """
     names = _named(joints)
-    with robot_of(chosen, f"torque {state}") as robot:
+    with connect_robot(chosen.robot, f"torque {state}") as robot:
         done = robot.torque(names, state == "on", release=release)
         verb = "has torque" if state == "on" else "is limp"
         return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} {verb}{_others(done)}")
@@ -76,7 +76,7 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
         Deactivate the controllers that command the joints; without it they are a reason to refuse.
     """
     names = _named(joints)
-    with robot_of(chosen, "reboot") as robot:
+    with connect_robot(chosen.robot, "reboot") as robot:
         done = robot.reboot(names, release=release)
         text = f"{', '.join(names)} rebooted, in order again{_others(done)}"
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
@@ -97,7 +97,7 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     item
         Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
     """
-    with robot_of(chosen, "get") as robot:
+    with connect_robot(chosen.robot, "get") as robot:
         if not item and (names := _meant(robot.info(), joint)):
             return _show_pose(robot, names, chosen)
         found = robot.get(joint, item)
@@ -151,7 +151,7 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 
     number = plain_value(value)
     given = number if isinstance(number, int) and not isinstance(number, bool) else value
-    with robot_of(chosen, "set") as robot:
+    with connect_robot(chosen.robot, "set") as robot:
         done = robot.set_register(joint, item, given)
         before = "" if done.old is None else f"{done.old} -> "
         meaning = "" if given == done.value else f" ({given})"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from msgspec import to_builtins
 
 from dxlrun.cli.inputs import parse_pair
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, connect_robot
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import show, show_json
@@ -31,7 +31,7 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
     values = dict(_pair(word) for word in words)
     if len(values) < len(words):
         raise InputError("a parameter is given twice; give each once")
-    with robot_of(chosen, "parameters") as robot:
+    with connect_robot(chosen.robot, "parameters") as robot:
         if not values:
             rows = robot.parameter_table(controller)
             if chosen.as_json:

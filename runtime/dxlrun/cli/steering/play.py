@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, WaitFlag
 from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, follow
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot, report_done
 from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
 from dxlrun.output.terminal import show, show_json
 
@@ -74,7 +74,7 @@ def play(
         Return when all are played; --no-wait: when the motion has begun.
     """
     _check(motions, loop, listed=listed, wait=wait)
-    with robot_of(chosen, "play") as robot:
+    with connect_robot(chosen.robot, "play") as robot:
         if listed:
             _list(robot, chosen)
             return 0

@@ -138,7 +138,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
     """
     if not activate and not deactivate:
         raise InputError("nothing to switch; write --activate NAME, --deactivate NAME, or both")
-    with robot_of(chosen, "switch") as robot:
+    with connect_robot(chosen.robot, "switch") as robot:
         done = robot.switch(activate, deactivate)
         groups = {
             "activated": [*(name for name in activate if name not in deactivate), *done.below],
@@ -159,14 +159,14 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """
     if not 0 < hz < float("inf"):  # false for nan too
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
-    with robot_of(chosen, "rate") as robot:
+    with connect_robot(chosen.robot, "rate") as robot:
         done = robot.rate(hz)
         return report_done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
 
 
 def halt(*, chosen: Chosen = ONLY_ONE) -> int:
     """Let every joint come to a stop within its limits, and hold: the run goes on."""
-    with robot_of(chosen, "halt") as robot:
+    with connect_robot(chosen.robot, "halt") as robot:
         done = robot.halt()
         text = f"{robot.name} stands still"
         if (found := done.halted) is not None:
@@ -176,14 +176,14 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
 
 def take_over(*, chosen: Chosen = ONLY_ONE) -> int:
     """Command a robot that a client of another computer commands; that one is refused from now on."""
-    with robot_of(chosen, "take-over") as robot:
+    with connect_robot(chosen.robot, "take-over") as robot:
         done = robot.take_over()
         return report_done(robot, chosen, done, f"{robot.name} is commanded from here")
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
     """Pause a running robot: its joints are held, its controllers' time stops."""
-    with robot_of(chosen, "pause") as robot:
+    with connect_robot(chosen.robot, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
         return report_done(robot, chosen, done, f"{robot.name} {text}")
@@ -191,7 +191,7 @@ def pause(*, chosen: Chosen = ONLY_ONE) -> int:
 
 def resume(*, chosen: Chosen = ONLY_ONE) -> int:
     """Resume the controllers of a paused robot where they were."""
-    with robot_of(chosen, "resume") as robot:
+    with connect_robot(chosen.robot, "resume") as robot:
         done = robot.resume()
         return report_done(robot, chosen, done, f"{robot.name} runs again")
 
@@ -213,7 +213,7 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
     entry = Written.read(words, file).data
     if "type" not in entry:
         raise InputError(f"{name} has no type; give it one, such as type=joint_group_position_controller")
-    with robot_of(chosen, "load") as robot:
+    with connect_robot(chosen.robot, "load") as robot:
         done = robot.load(name, entry)
         text = f"{name} is loaded; `dxlrun switch --activate {name}` starts it"
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
@@ -227,7 +227,7 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     name
         Name of the controller.
     """
-    with robot_of(chosen, "unload") as robot:
+    with connect_robot(chosen.robot, "unload") as robot:
         done = robot.unload(name)
         return report_done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
 
@@ -242,53 +242,62 @@ def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
     """
     from dxlrun.run.unsteered import end_run
 
-    if (run := unsteered_of(chosen)) is not None:
+    if (run := unsteered_of(chosen.robot)) is not None:
         sentence = end_run(run, wait=wait)
         if chosen.as_json:
             show_json({"robot": run.name, "ended": sentence})
         else:
             show(sentence)
         return 0
-    with robot_of(chosen, "stop") as robot:
+    with connect_robot(chosen.robot, "stop") as robot:
         robot.stop(wait=wait)
         return report_done(robot, chosen, None, f"{robot.name} {'has ended' if wait else 'is ending'}")
 
 
-def unsteered_of(chosen: Chosen) -> UnsteeredRun | None:
-    """Return the chosen run if it cannot be steered, else None; raises InputError when the choice is open."""
+def unsteered_of(name: str | None) -> UnsteeredRun | None:
+    """Return the run of a name, or the only run, if it cannot be steered; raises InputError for several."""
     from dxlrun.remote.sockets import running
     from dxlrun.run.unsteered import unsteered_runs
 
     unsteered, steered = unsteered_runs(), running()
-    if chosen.robot is None:
+    if name is None:
         unsteered = [run for run in unsteered if run.is_ours]
         _require_one(sorted({*steered, *(run.name for run in unsteered)}))
         return unsteered[0] if unsteered else None
-    found = next((run for run in unsteered if run.is_named(chosen.robot)), None)
-    if found is None and chosen.robot not in steered:
-        _require_one([run.name for run in unsteered if run.run.robot == chosen.robot])
+    found = next((run for run in unsteered if run.is_named(name)), None)
+    if found is None and name not in steered:
+        _require_one([run.name for run in unsteered if run.run.robot == name])
     return found
 
 
-def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
-    """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
+def connect_robot(name: str | None, verb: str) -> RemoteRobot:
+    """Connect to the robot that `--robot` names, or to the only one that runs.
+
+    Args:
+        name: None when the option was not given.
+        verb: The command, for the log of the robot.
+
+    Raises:
+        InputError: Several robots run and none was named, or none has this name.
+        DxlrunError: No robot runs, or it cannot be steered.
+    """
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
     from dxlrun.remote.sockets import running
     from dxlrun.run.unsteered import describe
 
     names = running()
-    known = names if chosen.robot is None else (*names, *known_robots())
-    missing = chosen.robot not in known if chosen.robot else not names
-    if missing and (run := unsteered_of(chosen)) is not None:
+    known = names if name is None else (*names, *known_robots())
+    missing = name not in known if name else not names
+    if missing and (run := unsteered_of(name)) is not None:
         raise DxlrunError(describe(run))
-    if chosen.robot is not None:
-        _require_known(chosen.robot, known)
+    if name is not None:
+        _require_known(name, known)
     elif not names:
         raise DxlrunError("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     else:
         _require_one(names)
-    return connect(chosen.robot or names[0], f"dxlrun {verb}")
+    return connect(name or names[0], f"dxlrun {verb}")
 
 
 def _require_one(names: Sequence[str]) -> None:

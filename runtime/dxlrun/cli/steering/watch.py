@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import select
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from dxlrun.cli.inputs import Flag
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, robot_of, state
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, connect_robot, state
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
+from dxlrun.output.live_view import compact, keys_pressed
 from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json
 from dxlwire.joint_unit import JointUnit
@@ -94,7 +93,7 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     once
         Print one snapshot.
     """
-    with robot_of(chosen, "watch") as robot:
+    with connect_robot(chosen.robot, "watch") as robot:
         watched = Watched(robot)
         _first_look(watched)
         try:
@@ -152,43 +151,6 @@ def _show_live(watched: Watched) -> None:
             if pressed(REFRESH_S):
                 return
             watched.look()
-
-
-@contextmanager
-def keys_pressed() -> Iterator[Pressed]:
-    """Give what waits for the key q; without a terminal on stdin it only waits."""
-    if not sys.stdin.isatty():
-        yield Pressed(None)
-        return
-    import termios
-    import tty
-
-    keyboard = sys.stdin.fileno()
-    before = termios.tcgetattr(keyboard)
-    try:
-        tty.setcbreak(keyboard)
-        yield Pressed(keyboard)
-    finally:
-        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
-
-
-@dataclass(frozen=True, slots=True)
-class Pressed:
-    """Waits for the key q."""
-
-    keyboard: int | None
-
-    def __call__(self, seconds: float) -> bool:
-        """Wait so long; return True as soon as q was pressed, or the terminal is gone."""
-        if self.keyboard is None:
-            time.sleep(seconds)
-            return False
-        if not select.select([self.keyboard], [], [], seconds)[0]:
-            return False
-        import os
-
-        typed = os.read(self.keyboard, 64)
-        return not typed or b"q" in typed
 
 
 # What is shown
@@ -329,24 +291,3 @@ def _line(sentence: Sentence, width: int) -> Text:
     text = Text(escaped(sentence.text), style=STYLES[sentence.tone], no_wrap=True, overflow="ellipsis")
     text.truncate(width, overflow="ellipsis")
     return text
-
-
-def compact(table: Table) -> RenderableType:
-    """Return a table without rules, whose texts give way first where there is no room."""
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    shown = RichTable(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
-    table = table.escaped()
-    for column in table.columns:
-        right = column.kind == "number"
-        shown.add_column(
-            column.name,
-            justify="right" if right else "left",
-            no_wrap=column.kind != "text",  # these give way first
-            overflow="ellipsis",
-            min_width=5 if right else None,
-        )
-    for row in table.rows:
-        shown.add_row(*(Text(cell.text, style=STYLES[cell.tone], no_wrap=True) for cell in row))
-    return shown

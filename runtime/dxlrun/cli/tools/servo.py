@@ -131,9 +131,9 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
 
 def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     """Look for the servo; raises ServoFault where it is not there, or is there more than once."""
-    from dxlrun.dynamixel.tools.scanning import find
+    from dxlrun.dynamixel.tools.scanning import find_servo
 
-    port, found = tool.port.name, find(tool, servo_id, search)
+    port, found = tool.port.name, find_servo(tool, servo_id, search)
     if not found:
         raise ServoFault(
             f"no servo with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "

@@ -14,6 +14,8 @@ from dxlrun.errors import Mark
 from dxlwire.bus_plan import ServoPlan
 from dxlwire.joint_unit import ROTARY, JointUnit
 
+AUTO = "auto"  # In place of a model: it is read from the servo
+
 
 class DescribedServo(msgspec.Struct, frozen=True):
     """One servo as the robot file has it, with what its joint has for it."""
@@ -80,6 +82,11 @@ def described_servos(description: Description) -> list[DescribedServo]:
                 )
             )
     return found
+
+
+def find_unknown_servos(description: Description) -> frozenset[str]:
+    """Return the names of the servos with `model: auto`, whose models are read from them."""
+    return frozenset(servo.name for servo in described_servos(description) if servo.model == AUTO)
 
 
 def first_joint(description: Description, servo: ServoPlan) -> str:

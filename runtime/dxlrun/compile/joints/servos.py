@@ -9,7 +9,7 @@ from typing import Protocol
 
 import msgspec
 
-from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
+from dxlrun.compile.joints.described_servos import AUTO, DescribedServo, described_servos
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
@@ -21,7 +21,6 @@ from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans
 
-AUTO = "auto"  # In place of a model: it is read from the servo
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # The model that is assumed where none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
 """Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal

@@ -13,19 +13,20 @@ from dxlrun.contract.serial_line import open_serial
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
-from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
+from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect, survey
 from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.tools.scanning import identity
+from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
-from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.clock import Clock, MonotonicClock
-from dxlwire.control_table import FoundDeviation, control_table, models_by_number
+from dxlwire.control_table import ControlTable, FoundDeviation, control_table, models_by_number
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketSink
 from dxlwire.plan.line import listen
-from dxlwire.plan.retry import extend_timeouts, setup_line
+from dxlwire.plan.retry import extend_timeouts, retry, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
 from dxlwire.transaction import Outcome, Program, Reply, Result
 
@@ -125,6 +126,56 @@ def look(
     if together.problems:
         together.registers = [replace(row, action="") for row in together.registers]
     return together
+
+
+def compare_servos(tool: ToolLine, plan: BusPlan, servos: Sequence[ServoPlan]) -> Findings:
+    """Compare servos with the robot file: as a start does, and with `stored_registers`. Writes nothing.
+
+    Args:
+        tool: The line of their bus.
+        plan: The bus.
+        servos: Those servos of the bus that are connected.
+
+    Returns:
+        Findings whose `problems` name each servo that does not answer or differs.
+    """
+    tool.speak(plan.protocol, plan.baud_rate)
+    return tool.run(extend_timeouts(_compare_servos(plan, servos)))
+
+
+def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findings]:
+    survey = Findings()
+    for servo in servos:
+        one = first_reach(plan, servo)
+        reply = yield from retry(one.line.ping(servo.servo_id))
+        if not reply.answered:
+            how = "does not answer" if reply.outcome is Outcome.TIMEOUT else "answers garbled"
+            survey.problems.append(f"{plan.label(servo)} {how} at {plan.baud_rate} bit/s")
+            continue
+        if not (yield from inspect(one, survey, take_over=True)):
+            continue
+        table = control_table(servo.model, plan.protocol)
+        for each in (yield from compare(one, stored_registers(table, plan, servo))):
+            title = table.items[each.register.name].title
+            if each.found is None:
+                survey.problems.append(f"{one} did not answer when {title} was read")
+            elif each.differs:
+                survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
+    return survey
+
+
+def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
+    """Return what the EEPROM of a servo shall hold: its registers, and the return delay time of its bus.
+
+    Registers in the RAM are written by each run.
+    """
+    declared = [one for one in servo.registers if one.eeprom]
+    item = table.items.get("return_delay_time")
+    if item is not None and all(one.name != item.name for one in declared):
+        raw = round(plan.return_delay_ns / 2_000)
+        if item.minimum <= raw <= item.maximum:
+            declared.append(RegisterValue(item.address, item.size, raw, item.name, True))
+    return tuple(declared)
 
 
 def identify(

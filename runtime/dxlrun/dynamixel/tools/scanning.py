@@ -57,6 +57,12 @@ class FoundServo(msgspec.Struct, frozen=True):
     garbled: bool = False  # True when it answers garbled, as two servos of one ID do
     remarks: tuple[str, ...] = ()  # What a person should know
 
+    @property
+    def models(self) -> frozenset[str]:
+        """Models of servos with its model number and firmware; some share a number."""
+        tables = models_by_number(self.model_number, self.protocol, self.firmware)
+        return frozenset(table.model for table in tables)
+
 
 class Search(msgspec.Struct, frozen=True):
     """Protocols, rates and IDs to look at."""
@@ -113,7 +119,7 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
     return Scanned(tuple(found), tuple(dict.fromkeys(left_out)))
 
 
-def find(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
+def find_servo(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
     """Look for one ID in every protocol and at every rate; raises PortError as `scan` does."""
     found: list[FoundServo] = []
     lines = search.lines()

@@ -30,22 +30,22 @@ from dxlwire.modes import Mode
 
 _FOR_OTHERS = frozenset(
     (
-        schemas.ROSOUT_TOPIC,
-        schemas.JOINT_STATES_TOPIC,
-        schemas.JOINT_COMMANDS_TOPIC,
-        schemas.DIAGNOSTICS_TOPIC,
-        schemas.ROBOT_DESCRIPTION_TOPIC,
-        schemas.FRAMES_TOPIC,
-        schemas.STILL_FRAMES_TOPIC,
+        schemas.LogTopic.ROSOUT,
+        schemas.LogTopic.JOINT_STATES,
+        schemas.LogTopic.JOINT_COMMANDS,
+        schemas.LogTopic.DIAGNOSTICS,
+        schemas.LogTopic.ROBOT_DESCRIPTION,
+        schemas.LogTopic.FRAMES,
+        schemas.LogTopic.STILL_FRAMES,
     )
 )
 """What other tools read; the same is in the other topics."""
 _OWN = frozenset(
     (
-        schemas.CYCLE_TOPIC,
-        schemas.ACTIVATION_TOPIC,
-        schemas.COMMANDS_TOPIC,
-        schemas.EVENT_TOPIC,
+        schemas.LogTopic.CYCLE,
+        schemas.LogTopic.ACTIVATION,
+        schemas.LogTopic.COMMANDS,
+        schemas.LogTopic.EVENT,
     )
 )
 """What this module reads by itself."""
@@ -160,7 +160,7 @@ class Slicer:
                 buses[channel] = self._buses[topic]
                 continue
             rows = np.flatnonzero(messages.channel == channel)
-            if topic == schemas.CYCLE_TOPIC:
+            if topic == schemas.LogTopic.CYCLE:
                 cycle_rows = np.append(cycle_rows, rows)
             elif topic in _OWN:
                 bodies.setdefault(topic, []).extend(messages.bodies(rows))
@@ -170,8 +170,8 @@ class Slicer:
                 topics[logged.name] = logged if before is None else joined_topic((before, logged))
         packets = self._read_packets(messages, buses) if self._with_packets else _NO_PACKETS
         activation = None
-        if self._activation is None and schemas.ACTIVATION_TOPIC in bodies:
-            message = np.frombuffer(bodies[schemas.ACTIVATION_TOPIC][0], np.uint8)
+        if self._activation is None and schemas.LogTopic.ACTIVATION in bodies:
+            message = np.frombuffer(bodies[schemas.LogTopic.ACTIVATION][0], np.uint8)
             activation = self._activation = _cycles(
                 self._layout, message, np.zeros(1, np.int64), np.array([len(message)])
             )
@@ -183,8 +183,8 @@ class Slicer:
         return replace(
             self._slice(cycles, packets, last=not self._with_packets),
             activation=activation,
-            events=_events(bodies.get(schemas.EVENT_TOPIC, [])),
-            commands=_commands(bodies.get(schemas.COMMANDS_TOPIC, [])),
+            events=_events(bodies.get(schemas.LogTopic.EVENT, [])),
+            commands=_commands(bodies.get(schemas.LogTopic.COMMANDS, [])),
             topics=topics,
         )
 

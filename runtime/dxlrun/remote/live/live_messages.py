@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 import msgspec
+import numpy as np
 
 from dxlrun.channels.events import Event, EventCode
 from dxlrun.log import schemas
@@ -32,13 +33,18 @@ class LiveMessages(RunMessages):
     @staticmethod
     def heard(topics: Collection[TopicState]) -> set[str]:
         """Return the topics to listen to: those of the log, and those that others of it are made of."""
-        return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.JOINT_STATES_TOPIC}
+        return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.LogTopic.JOINT_STATES}
+
+    def read_cycle(self, message: TopicMessage) -> np.void:
+        """Return the record of a message of /cycle: its fields by name, with a row for each joint."""
+        record: np.void = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
+        return record
 
     def take(self, message: TopicMessage) -> None:
         """Take a message of a topic of `heard`."""
-        if message.topic == schemas.CYCLE_TOPIC:
+        if message.topic == schemas.LogTopic.CYCLE:
             self.cycle(message.data[len(ENCAPSULATION) :])
-        elif message.topic == schemas.EVENT_TOPIC:
+        elif message.topic == schemas.LogTopic.EVENT:
             fields = message.message
             numbers = [fields[name] for name in ("t_ns", "code", "severity")]
             t_ns, code, severity = msgspec.convert(numbers, tuple[int, int, int])

@@ -20,7 +20,7 @@ from dxlrun.channels.events import Event
 from dxlrun.channels.messages import OpenedTopic, PublishedTopic, TopicMessage
 from dxlrun.channels.ring import Gap, Record, RingReader
 from dxlrun.channels.tagged import Tagged, decode
-from dxlrun.log.schemas import CYCLE, CYCLE_TOPIC, EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
+from dxlrun.log.schemas import CYCLE, EVENT, JOINT_STATE, LogTopic
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
@@ -91,8 +91,8 @@ class LiveTopics:
         self.of_loop: dict[str, _LoopTopic] = {}
         self.by_number: dict[int, _LoopTopic] = {}
         self.of_cycles = {
-            CYCLE_TOPIC: _CycleTopic(CYCLE, layout.joints, lambda record: ENCAPSULATION + record.raw),
-            JOINT_STATES_TOPIC: _CycleTopic(JOINT_STATE, layout.joints, self._joint_states),
+            LogTopic.CYCLE: _CycleTopic(CYCLE, layout.joints, lambda record: ENCAPSULATION + record.raw),
+            LogTopic.JOINT_STATES: _CycleTopic(JOINT_STATE, layout.joints, self._joint_states),
         } | {
             f"/{source}": _CycleTopic(SOURCE_STATES, (), partial(_source_states, source))
             for source in layout.sources
@@ -116,7 +116,7 @@ class LiveTopics:
         """Return a topic; raises KeyError when there is none of this name."""
         if name in self.of_loop:
             return self.of_loop[name].topic
-        if name == EVENT_TOPIC:
+        if name == LogTopic.EVENT:
             return PublishedTopic(name, EVENT)
         return PublishedTopic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
 
@@ -125,7 +125,7 @@ class LiveTopics:
         events = self.events[-1][0] if self.events else 0
         return [
             *(one.state() for one in self.of_loop.values()),
-            TopicState(EVENT_TOPIC, EVENT.name, (), events, None),
+            TopicState(LogTopic.EVENT, EVENT.name, (), events, None),
             *(
                 TopicState(name, one.type.name, one.joints, cycles, None)
                 for name, one in self.of_cycles.items()
@@ -225,14 +225,14 @@ class TopicStream:
                     yield Sample(place, number, self._record.woken_ns, pack(self._record))
 
     def _new_events(self) -> Iterator[Opened | Sample]:
-        if EVENT_TOPIC not in self._places or not self._events or self._events[-1][0] <= self._event:
+        if LogTopic.EVENT not in self._places or not self._events or self._events[-1][0] <= self._event:
             return
         for number, event in self._events:
             if number > self._event:
                 data = event.data.decode(errors="replace")
                 texts = event.name, event.source, event.text, data
                 packed = _EVENT.pack(event.t_ns, int(event.code), int(event.severity), 0, *texts)
-                yield Sample(self._places[EVENT_TOPIC], number, event.t_ns, packed)
+                yield Sample(self._places[LogTopic.EVENT], number, event.t_ns, packed)
         self._event = self._events[-1][0]
 
 

@@ -7,17 +7,15 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from dxlrun.description.arguments import refuse_arguments
-from dxlrun.description.document import grow, parse, read_text
 from dxlrun.description.form import Form, key, refuse
-from dxlrun.description.problems import read_form
+from dxlrun.description.yaml_file import read_yaml
 from dxlrun.errors import InputError
-from dxlrun.remote.sockets import Address, address_of
+from dxlrun.remote.sockets import Address
 
 
 def _address(text: str) -> str:
     try:
-        address_of(text, "robot")
+        Address.parse(text, "robot")
     except InputError as error:
         what, _, fix = str(error).partition("; ")
         raise refuse(what, fix) from error
@@ -36,6 +34,5 @@ class RobotsFile(Form):
 
 def read_robots(path: Path) -> dict[str, Address]:
     """Return the addresses of a file by name; raises InputError with the place of each mistake."""
-    file = str(path)
-    robots = read_form(grow(parse(read_text(path), file), file, refuse_arguments), RobotsFile).robots
-    return {name: address_of(text, name) for name, text in robots.items()}
+    robots = read_yaml(path, RobotsFile).robots
+    return {name: Address.parse(text, name) for name, text in robots.items()}

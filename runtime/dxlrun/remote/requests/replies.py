@@ -202,6 +202,13 @@ class GoalState(msgspec.Struct, frozen=True):
         """True when it ended well."""
         return self.status == "reached"
 
+    def describe(self) -> str:
+        """Return how the goal ended: `goal 3 of left_arm reached after 1.02 s`."""
+        timed = self.seconds is None or self.text.startswith("after ")  # by its controller
+        after = "" if timed else f" after {self.seconds:.2f} s"
+        why = f"{' ' if timed and self.seconds is not None else ': '}{self.text}" if self.text else ""
+        return f"goal {self.number} of {self.controller} {self.status}{after}{why}"
+
 
 class Goals(msgspec.Struct, frozen=True):
     """The goals that run, and the last that ended."""

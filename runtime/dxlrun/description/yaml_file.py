@@ -1,0 +1,23 @@
+"""YAML files of their own form: read into a model, with the place of each mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.document import grow, parse, read_text
+from dxlrun.description.problems import Form, read_form
+
+
+def read_yaml(path: Path, model: type[Form]) -> Form:
+    """Read a YAML file into a model.
+
+    Args:
+        path: The file. It takes no arguments `${NAME}` and no tags.
+        model: A `dxlrun.tooling.files.Form`, or another model of pydantic.
+
+    Raises:
+        InputError: All problems of the file, each with its line and column.
+    """
+    file = str(path)
+    return read_form(grow(parse(read_text(path), file), file, refuse_arguments), model)

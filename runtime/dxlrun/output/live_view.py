@@ -1,0 +1,95 @@
+"""Live view: a table in the terminal that is drawn again and again until the key q is pressed."""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from dxlrun.output.table import Table
+from dxlrun.output.terminal import STYLES, out
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+def show_live(table: Callable[[], Table], every_s: float) -> None:
+    """Draw a table on the whole screen until q or Ctrl-C.
+
+    Args:
+        table: Returns the table as it is now.
+        every_s: Time between two drawings, s.
+    """
+    from rich.live import Live
+
+    with (
+        suppress(KeyboardInterrupt),
+        keys_pressed() as pressed,
+        Live(console=out(), screen=True, auto_refresh=False) as live,
+    ):
+        while True:
+            live.update(compact(table()), refresh=True)
+            if pressed(every_s):
+                return
+
+
+@contextmanager
+def keys_pressed() -> Iterator[Pressed]:
+    """Give what waits for the key q; without a terminal on stdin it only waits."""
+    if not sys.stdin.isatty():
+        yield Pressed(None)
+        return
+    import termios
+    import tty
+
+    keyboard = sys.stdin.fileno()
+    before = termios.tcgetattr(keyboard)
+    try:
+        tty.setcbreak(keyboard)
+        yield Pressed(keyboard)
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+
+
+@dataclass(frozen=True, slots=True)
+class Pressed:
+    """Waits for the key q."""
+
+    keyboard: int | None
+
+    def __call__(self, seconds: float) -> bool:
+        """Wait so long; return True as soon as q was pressed, or the terminal is gone."""
+        if self.keyboard is None:
+            time.sleep(seconds)
+            return False
+        if not select.select([self.keyboard], [], [], seconds)[0]:
+            return False
+        import os
+
+        typed = os.read(self.keyboard, 64)
+        return not typed or b"q" in typed
+
+
+def compact(table: Table) -> RenderableType:
+    """Return a table without rules, whose texts give way first where there is no room."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    shown = RichTable(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    table = table.escaped()
+    for column in table.columns:
+        right = column.kind == "number"
+        shown.add_column(
+            column.name,
+            justify="right" if right else "left",
+            no_wrap=column.kind != "text",  # these give way first
+            overflow="ellipsis",
+            min_width=5 if right else None,
+        )
+    for row in table.rows:
+        shown.add_row(*(Text(cell.text, style=STYLES[cell.tone], no_wrap=True) for cell in row))
+    return shown

@@ -1,0 +1,31 @@
+"""Files: YAML files of a package's own, checked as robot files are.
+
+A model says which keys there are. Everything that is wrong with a file is reported at once, with its place.
+
+    from pathlib import Path
+
+    from dxlrun.tooling.files import Form, key, read_yaml
+
+    class Lights(Form):
+        pin: int = key("Number of the output.", "4")
+
+    Path("lights.yaml").write_text("pin: 7")
+    lights = read_yaml(Path("lights.yaml"), Lights)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlwire.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.description.document import KeyPath as KeyPath
+    from dxlrun.description.form import Form as Form
+    from dxlrun.description.form import key as key
+    from dxlrun.description.form import refuse as refuse
+    from dxlrun.description.yaml_file import read_yaml as read_yaml
+    from dxlrun.errors import Mark as Mark
+    from dxlrun.errors import Problem as Problem
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
