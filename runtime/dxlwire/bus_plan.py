@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Literal
 
 import msgspec
@@ -130,6 +131,18 @@ class ModePlan(msgspec.Struct, frozen=True):
     pwm: Scale | None = None
 
 
+SlowState = Literal["temperature", "voltage"]
+SLOW_STATES: Mapping[str, SlowState] = MappingProxyType(
+    {
+        "present_temperature": "temperature",
+        "present_motor_temperature": "temperature",
+        "present_voltage": "voltage",
+        "present_input_voltage": "voltage",
+    }
+)
+"""Items of control tables that are states of a joint and are read between the cycles."""
+
+
 class ServoPlan(msgspec.Struct, frozen=True):
     """One servo and what it moves: s = direction * (theta - reference) * ratio, the position of its joint."""
 
@@ -172,6 +185,11 @@ class ServoPlan(msgspec.Struct, frozen=True):
     name: str = ""
     """Its own among all servos, where several move one joint: `hip/1`, `wrist/left`; empty: its joint's."""
     unit: JointUnit = ROTARY  # Of the joint's positions
+
+    @property
+    def slow_states(self) -> frozenset[SlowState]:
+        """States that are read between the cycles; another one stays NaN for the whole run."""
+        return frozenset(SLOW_STATES[name] for name in self.slow if name in SLOW_STATES)
 
     @property
     def own_name(self) -> str:

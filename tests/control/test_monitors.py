@@ -8,14 +8,16 @@ from typing import Self
 import pytest
 from tests.kit.loops import loop_plan
 
+from dxlrun import features
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import Severity
 from dxlrun.compile.report import policy_rows
-from dxlrun.control import monitors
-from dxlrun.control.monitors import MONITORS, build_monitors
+from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.lost_servos import LostServos
-from dxlrun.control.monitors.needed_sensors import NeededSensors
+from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.features.feature import Feature, S
+from dxlrun.features.sensors.monitor import NeededSensors
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SensorPlan, SourcePlan
 from dxlrun.plan.policy_plan import PolicyPlan
 from dxlrun.testing import simulated_robot
@@ -60,11 +62,19 @@ class FarJoints:
         return [("on_far_joint", "one becomes limp, then the run ends")]
 
 
+class FarJointsFeature(Feature):
+    """A feature that has a monitor only."""
+
+    def stage(self, kind: type[S]) -> S | None:
+        """Return the monitor."""
+        found = MonitorStage(FarJoints)
+        return found if isinstance(found, kind) else None
+
+
 def test_policy_of_a_new_monitor_needs_no_change_of_loop_and_check(
     monkeypatch: pytest.MonkeyPatch, tmp_path
 ) -> None:
-    monkeypatch.setattr(monitors, "MONITORS", (*MONITORS, FarJoints))
-    monkeypatch.setattr("dxlrun.compile.report.MONITORS", (*MONITORS, FarJoints))
+    monkeypatch.setattr(features, "FEATURES", (*features.FEATURES, FarJointsFeature("far_joints", "")))
     path = tmp_path / "pair.yaml"
     path.write_text(ROBOT)
     robot, torque = simulated_robot(path, duration_s=2.0), list[bool]()

@@ -15,7 +15,7 @@ from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.control.monitors import MONITORS
+from dxlrun.control.monitors import list_monitors
 from dxlrun.description.joints.mechanics import Limits
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
@@ -218,7 +218,7 @@ def policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> list[PolicyRo
         policy = policies.named(name)
         does = _HELD.get(name, policy.text) if policy.goes_on else policy.text
         found.append((name, does, policy.longest_ns * 1e-9))
-    for monitor in MONITORS:
+    for monitor in list_monitors():
         found += ((name, does, 0.0) for name, does in monitor.rows(policies))
     found.append(("on_returned_servo", _on_returned_servo(buses), 0.0))
     alone = policies.on_fault.last

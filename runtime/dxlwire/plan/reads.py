@@ -17,15 +17,13 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from dxlwire.bus_plan import Budget, Member, ServoPlan
+from dxlwire.bus_plan import SLOW_STATES, Budget, Member, ServoPlan
 from dxlwire.control_table import ControlTable
 from dxlwire.plan.line import TIMEOUT_MARGIN_NS, Line
 from dxlwire.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
 """Protocol -> the capability by which several servos of one layout answer one instruction in turn."""
-TEMPERATURES = ("present_temperature", "present_motor_temperature")
-VOLTAGES = ("present_voltage", "present_input_voltage")  # Names of the item in the control tables
 TOGETHER = "bulk_read"  # The capability by which servos of different layouts do
 FAST = "fast_sync_read"  # The capability by which they answer with one status packet
 
@@ -69,7 +67,7 @@ def servo_read(line: Line, servo: ServoPlan) -> Transaction:
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:
     """Return the items that are read between the cycles where the robot file names none."""
-    return tuple(name for name in table.items if name in TEMPERATURES or name in VOLTAGES)
+    return tuple(name for name in table.items if name in SLOW_STATES)
 
 
 def choose_reads(

@@ -1,23 +1,25 @@
-"""Monitors: what is watched in every cycle, one file each; what a run does then is in its `policies`.
+"""Monitors: what is watched in every cycle; what a run does then is in its `policies`.
 
-A policy that reacts to states belongs here: a file with a class such as those of `MONITORS`, which acts by
-`PolicyActions`. Neither the loop nor `check` changes for it.
+A policy that reacts to states is a class such as `LostServos`, which acts by `PolicyActions`; a feature has
+its own in `monitor.py`. Neither the loop nor `check` changes for it.
 """
 
 from __future__ import annotations
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.lost_servos import LostServos
-from dxlrun.control.monitors.monitor import Monitor
-from dxlrun.control.monitors.needed_sensors import NeededSensors
+from dxlrun.control.monitors.monitor import Monitor, MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.features import stages
 from dxlrun.plan.loop_plan import LoopPlan
 
-MONITORS: tuple[type[Monitor], ...] = (LostServos, NeededSensors)
-"""In the order in which a cycle asks them, and in which `check` shows their policies."""
+
+def list_monitors() -> tuple[type[Monitor], ...]:
+    """Return all monitors, in the order of a cycle and of the policies that `check` shows."""
+    return (LostServos, *(stage.monitor for _, stage in stages(MonitorStage)))
 
 
 def build_monitors(plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> tuple[Monitor, ...]:
     """Return the monitors that have something to watch in this robot."""
-    built = (one.build(plan, record, actions) for one in MONITORS)
+    built = (one.build(plan, record, actions) for one in list_monitors())
     return tuple(one for one in built if one is not None)

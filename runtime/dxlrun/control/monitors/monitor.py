@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol, Self
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, Self
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.policy_actions import PolicyActions
@@ -32,3 +33,12 @@ class Monitor(Protocol):
     @staticmethod
     def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
         """Return its rows in the policies of `check`: the name of a policy, and what it does."""
+
+
+@dataclass(frozen=True)
+class MonitorStage:
+    """`STAGE` of `monitor.py`: asked when a loop is built, and when `check` shows the policies."""
+
+    FILE: ClassVar[str] = "monitor"
+
+    monitor: type[Monitor]

@@ -6,11 +6,10 @@ from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlwire.bus_plan import BusPlan
+from dxlwire.bus_plan import SLOW_STATES, BusPlan
 from dxlwire.control_table import ControlItem, control_table, decoded, side_by_side
 from dxlwire.exchange.bus import NEVER
 from dxlwire.exchange.idle import Urgency
-from dxlwire.plan.reads import TEMPERATURES, VOLTAGES
 from dxlwire.transaction import Program
 
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
@@ -80,10 +79,11 @@ class SlowReads:
         states, row = self._states, self._life.plan.servos[index].row
         before = self._known.get((index, item.name))
         self._known[index, item.name] = raw
-        if item.name in TEMPERATURES:
+        state = SLOW_STATES.get(item.name)
+        if state == "temperature":
             states.temperature[row] = raw * item.scale
             self._warm(index, raw * item.scale)
-        elif item.name in VOLTAGES:
+        elif state == "voltage":
             states.voltage[row] = raw * item.scale
         elif before not in (None, raw) and item.name not in _LIMITS:
             text = f"{item.title} was {before}, is {raw}"

@@ -1,4 +1,4 @@
-"""Needed sensors: a run ends when a sensor with `on_lost: stop` brings nothing new."""
+"""Monitor of needed sensors: a run ends when a sensor with `on_lost: stop` brings nothing new."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from dxlrun.channels.cycle import CycleRecord
+from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import PolicyPlan
@@ -42,3 +43,6 @@ class NeededSensors:
     def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
         """Return nothing: the table of sensors shows what happens when one is lost."""
         return ()
+
+
+STAGE = MonitorStage(NeededSensors)
