@@ -25,7 +25,7 @@ from dxlrun.tooling.robots import Description, compile_robot
 from dxlrun.tooling.runs import RunOptions, run_robot
 from dxlrun_analysis.counts import median, quantile
 from dxlrun_lab.late_servos import overruns_by_servos
-from dxlsim.bus.ledger import read_ledger
+from dxlsim import read_ledger
 
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Log
 from dxlrun_analysis.plan import LoggedBus, plan_of
-from dxlsim.bus.ledger import LedgerEntry
+from dxlsim import LedgerEntry
 from dxlwire import PacketKind
 
 _BITS_A_BYTE = 10

@@ -17,27 +17,34 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun import InputError
 from dxlrun.compile.simulation import INSTALL_MUJOCO, NEEDS_MUJOCO
-from dxlsim.motion.coupled_joints import moved_together, parts_without_bodies, together
-from dxlsim.motion.motor import Motor
-from dxlsim.motion.plant import (
+from dxlsim import (
     JAMMED_NM,
-    Floats,
+    CoupledServo,
+    Coupling,
+    Motor,
     Part,
     Plant,
     PlantJoint,
     PlantMaker,
-    Rows,
-    one_plant,
+    UrdfBodies,
+    UrdfJoint,
+    combine_plants,
+    coupled_motion,
+    coupled_projection,
+    parts_without_bodies,
 )
-from dxlsim.simulation_plan import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
     from mujoco import MjModel, MjsJoint, MjSpec
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 _LEAST_MASS = 1e-6
 """kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
@@ -91,7 +98,7 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
         parts: list[Part] = [(here.rows, MujocoBodies(text, here, joints))] if here.rows else []
         if others or not parts:
             parts += parts_without_bodies(couplings, joints, others)
-        return one_plant(joints, parts)
+        return combine_plants(joints, parts)
 
     return make
 
@@ -191,7 +198,7 @@ class MujocoBodies:
         self.velocity[index] = 0.0
         for one in self._couplings:
             if index in one.rows:
-                moved = moved_together(one.together, one.rows.tolist().index(index))
+                moved = coupled_motion(one.together, one.rows.tolist().index(index))
                 self.angle[one.rows] += (moved * by - (one.rows == index) * by) / self._per_rad[one.rows]
                 self.velocity[one.rows[moved != 0.0]] = 0.0
         self._put_bodies()
@@ -229,7 +236,7 @@ class _CoupledBodies:
         """Of its servos"""
         self.numbers = numbers  # Of its joints in MuJoCo
         self.matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
-        self.together = together(self.matrix)
+        self.together = coupled_projection(self.matrix)
 
 
 def _make_movable(root: Element, moved: Set[str]) -> None:

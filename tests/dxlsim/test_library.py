@@ -14,6 +14,7 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 import serial
@@ -49,7 +50,8 @@ def test_import_of_the_face_loads_nothing_that_simulates() -> None:
 
 @pytest.mark.parametrize("name", dxlsim.__all__)
 def test_each_name_of_the_face_is_documented(name: str) -> None:
-    assert getattr(dxlsim, name).__doc__
+    value = getattr(dxlsim, name)
+    assert value.__doc__ or not isinstance(value, type | FunctionType)  # an alias of a type has none
 
 
 def test_face_has_no_other_names() -> None:

@@ -13,9 +13,7 @@ from dxlrun.tooling.plans import Plan, from_json
 from dxlrun.tooling.verbs import suggestion
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
-from dxlsim.motion.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P
-from dxlsim.motion.mode_shaft import SAMPLING_S
-from dxlsim.motion.motor import Motor, motor_of
+from dxlsim import SAMPLING_S, SLOPE_TICK, SLOPE_TIMES_P, Motor, motor_of
 from dxlwire.control_table import ControlTable, control_table
 
 

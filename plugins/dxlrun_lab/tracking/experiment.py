@@ -20,7 +20,7 @@ from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion
 from dxlrun_lab.tracking.setups import Setup
-from dxlsim.bus.ledger import read_ledger
+from dxlsim import read_ledger
 
 _INTERRUPTED = 130
 

@@ -20,7 +20,7 @@ from dxlrun_analysis.cycles.latency import ROUGH_NS
 from dxlrun_lab.late_servos import waits_for_servos
 from dxlrun_lab.tracking.motion import DesiredMotion
 from dxlrun_lab.tracking.setups import Setup
-from dxlsim.bus.ledger import LedgerEntry
+from dxlsim import LedgerEntry
 
 Longs = NDArray[np.int64]
 LATE_NS = ROUGH_NS

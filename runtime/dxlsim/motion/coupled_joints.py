@@ -23,7 +23,7 @@ from dxlsim.motion.plant import (
     Plant,
     PlantJoint,
     Stribecks,
-    one_plant,
+    combine_plants,
 )
 from dxlsim.simulation_plan import Coupling
 
@@ -51,7 +51,7 @@ class CoupledJoints:
         self._per_rad = scale = np.array([each.per_rad for each in coupling.servos])
         self._size = size = np.abs(scale)
         self._matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
-        self._together = together(self._matrix)
+        self._together = coupled_projection(self._matrix)
         apart = np.eye(len(joints)) - self._together
         stiffness = np.array([motor.stall_torque / GIVE_RAD for motor in motors]) / scale**2
         self._stiffness: Floats = apart.T @ (stiffness[:, None] * apart)
@@ -97,7 +97,7 @@ class CoupledJoints:
 
     def place(self, index: int, angle: float) -> None:
         """Put a shaft somewhere, rad, at rest, and with it those that are on the same axis."""
-        moved = moved_together(self._together, index)
+        moved = coupled_motion(self._together, index)
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle += moved * by / self._per_rad
         self.velocity[moved != 0.0] = 0.0
@@ -140,21 +140,21 @@ class CoupledJoints:
         return found
 
 
-def together(matrix: Floats) -> Floats:
-    """Return what takes of servos' coordinates the part in which none is ahead of another: pinv(M) M."""
+def coupled_projection(matrix: Floats) -> Floats:
+    """Return the projection of servo coordinates onto motions that no coupling resists: pinv(M) M."""
     found = np.linalg.pinv(matrix) @ matrix
     return np.where(np.abs(found) < _ROUNDED, 0.0, found)
 
 
-def moved_together(together: Floats, index: int) -> Floats:
-    """Return how far the servos of a coupling move for one of them: by 1 itself."""
-    moved: Floats = together[:, index] / together[index, index]
+def coupled_motion(projection: Floats, index: int) -> Floats:
+    """Return how far each servo of a coupling moves when one of them moves by 1."""
+    moved: Floats = projection[:, index] / projection[index, index]
     return moved
 
 
 def joints_without_bodies(couplings: Sequence[Coupling], joints: Sequence[PlantJoint]) -> Plant:
     """Return the plant of coupled joints, and of the others, each by itself."""
-    return one_plant(joints, parts_without_bodies(couplings, joints, range(len(joints))))
+    return combine_plants(joints, parts_without_bodies(couplings, joints, range(len(joints))))
 
 
 def parts_without_bodies(

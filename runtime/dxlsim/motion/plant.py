@@ -175,7 +175,7 @@ class SeveralPlants:
         self.velocity[rows] = plant.velocity
 
 
-def one_plant(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
+def combine_plants(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
     """Return the plant that these parts are together; rows are in the order of the joints."""
     rows, plant = parts[0]
     return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
