@@ -22,6 +22,7 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
+from dxlrun.features import stages
 from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 from dxlwire.joint_unit import LINEAR, ROTARY
@@ -154,6 +155,8 @@ def _verdict(result: Compiled) -> str:
 
 
 def _tables(result: Compiled) -> Iterator[Table]:
+    from dxlrun.compile.report import TableStage  # not above: the help of the verb needs none of it
+
     report = result.report
     joints, rate = report["joints"], result.rate
     yield _joints(joints)
@@ -162,8 +165,8 @@ def _tables(result: Compiled) -> Iterator[Table]:
         yield _servos({(servo["bus"], servo["id"]): servo for servo in servos}.values())
     groups = ((name, ", ".join(joints)) for name, joints in report["groups"].items())
     yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), groups)
-    yield Table.listing("Devices", _DEVICES, report["devices"])
-    yield _sensors(report["sensors"])
+    for feature, stage in stages(TableStage):
+        yield stage.table(report[feature.name])
     yield _controllers(report["controllers"], len(joints))
     yield _buses(report["buses"], rate)
     yield Table.listing("Policies", _POLICIES, report["policies"])
@@ -177,17 +180,6 @@ def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
     return ((Column(name, kind), key) for name, key in keys.items())
 
 
-def _listed(key: str) -> Callable[[Row], Value]:
-    return lambda row: ", ".join(row[key])
-
-
-_DEVICES: Columns[Row] = [
-    *_named("name", device="name", bus="bus", model="model"),
-    (Column("ID"), "id"),
-    (Column("states", "text"), _listed("states")),
-    (Column("commands", "text"), _listed("commands")),
-    (Column("addresses read", "text"), _listed("reads")),
-]
 _POLICIES: Columns[PolicyRow] = [
     *_named("name", policy="name"),
     *_named("text", does="does", **{"when the loop is gone": "without_loop"}),
@@ -275,21 +267,6 @@ def _servos(servos: Iterable[Row]) -> Table:
         (Column("goals, deg"), lambda row: f"{degrees(row['lower'])}..{degrees(row['upper'])}"),
     ]
     return Table.listing("Servos (deg from raw 0)", columns, servos)
-
-
-def _sensors(sensors: Sequence[Row]) -> Table:
-    columns: Columns[Row] = [
-        *_named("name", sensor="name", type="type", **{"from": "distribution"}),
-        (Column("rate", form="{:g} Hz"), "rate"),
-        (Column("timeout", form="{:g} ms"), lambda row: row["timeout"] * 1e3),
-        (
-            Column("when lost", "text"),
-            lambda row: "the run ends" if row["on_lost"] == "stop" else "the run goes on",
-        ),
-        (Column("states", "text"), _listed("states")),
-        *[(Column("senses link", "text"), _listed("links"))] * any(row["links"] for row in sensors),
-    ]
-    return Table.listing("Sensors", columns, sensors)
 
 
 def _controllers(controllers: Sequence[Row], joints: int) -> Table:

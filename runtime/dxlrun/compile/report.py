@@ -6,8 +6,9 @@ Angles in rad, of servos from their raw 0; lengths in m, times in s, rates in Hz
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
@@ -17,15 +18,29 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.control.monitors import list_monitors
 from dxlrun.description.joints.mechanics import Limits
-from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan, SensorPlan
+from dxlrun.features import stages
+from dxlrun.output.table import Table
+from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
-from dxlwire.bus_plan import BusPlan, DevicePlan, ServoPlan
+from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.joint_unit import LINEAR
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
 Row = dict[str, Any]  # What JSON has of one thing
+
+
+@dataclass(frozen=True)
+class TableStage:
+    """`STAGE` of `table.py`: what `dxlrun check` shows of a feature."""
+
+    FILE: ClassVar[str] = "table"
+
+    rows: Callable[[Plan], Iterable[Row]]
+    """Rows of the feature in a plan. JSON has them under the feature's name."""
+    table: Callable[[Sequence[Row]], Table]
+    """Returns the table of these rows."""
 
 
 def check_report(
@@ -39,8 +54,7 @@ def check_report(
         "rate": rate,
         "joints": [_joint(joint, servos) for joint in joints],
         "groups": plan.groups,
-        "devices": [_device(bus, device) for bus in buses for device in bus.devices],
-        "sensors": [_sensor(sensor) for sensor in loop.sensors],
+        **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],
         "policies": policy_rows(loop.policies, buses),
@@ -117,37 +131,6 @@ def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:
 
 def _described(servo: DescribedServo) -> Row:
     return {name: getattr(servo, name) for name in ("bus", "id", "model", "reference", "direction", "motor")}
-
-
-def _sensor(sensor: SensorPlan) -> Row:
-    return {
-        "name": sensor.name,
-        "type": sensor.type,
-        "distribution": sensor.distribution,
-        "rate": 1e9 / sensor.period_ns,
-        "timeout": sensor.timeout_ns * 1e-9,
-        "on_lost": sensor.on_lost,
-        "states": sensor.states,
-        "links": sensor.links,
-    }
-
-
-def _states(device: DevicePlan) -> tuple[str, ...]:
-    """Return the names of a device's states, in the order of the cycle's record."""
-    fields = [field for block in device.blocks for field in block.fields]
-    return tuple(field.state for field in sorted(fields, key=lambda field: field.column))
-
-
-def _device(bus: BusPlan, device: DevicePlan) -> Row:
-    return {
-        "name": device.name,
-        "bus": bus.name,
-        "id": device.servo_id,
-        "model": device.model,
-        "states": _states(device),
-        "commands": [command.name for command in device.commands],
-        "reads": [f"{block.address}..{block.address + block.length - 1}" for block in device.blocks],
-    }
 
 
 def _controller(plan: ControllerPlan, rate: float) -> Row:

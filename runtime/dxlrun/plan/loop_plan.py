@@ -254,14 +254,15 @@ def _or_inf(limit: float | None) -> float:
 
 
 class SourcePlan(msgspec.Struct, frozen=True):
-    """Something that is no joint and has states: a device on a bus, or a sensor with a process of its own."""
+    """Something that is not a joint and has states or commands: an entry of a feature's section."""
 
     name: str
-    kind: Literal["device", "sensor"]
+    kind: str  # Word for it in sentences: `device`
     states: tuple[str, ...]  # Names of its states: `angular_velocity.x`
     commands: tuple[str, ...] = ()  # Names of what may be commanded, of a device: `led`
     ranges: tuple[tuple[float, float], ...] = ()  # Lowest and highest value of each command, SI units
     label: str = ""  # As sentences name it: `imu (ID 241 on bus main)`
+    commandable: bool = False  # Its entry in the file may name commands
 
 
 class SensorPlan(msgspec.Struct, frozen=True):

@@ -63,7 +63,7 @@ from dxlrun.remote.named.joints import (
     require_reboots,
     states_of,
 )
-from dxlrun.remote.named.named_commands import DEVICE_COMMANDS, INTERFACES, device_command, joint_command
+from dxlrun.remote.named.named_commands import INTERFACES, SOURCE_VALUES, joint_command, source_command
 from dxlrun.remote.named.parameters import Change, changed, parameters_of
 from dxlrun.remote.network.commander import Commander
 from dxlrun.remote.network.openapi import openapi
@@ -173,7 +173,7 @@ class GatewayApp:
         link.take_servo_limits = preparation.take_servo_limits
         self._log = log
         self._allowances = {one.rate: Allowance(one.rate, now) for one in REQUESTS if one.rate}
-        self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}
+        self._commanded = {one.name: one for one in link.plan.loop.sources if one.commandable}
         self._commander = Commander(now)
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
@@ -446,15 +446,15 @@ class GatewayApp:
     async def command(self, asked: Asked[bytes]) -> Executed[int]:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         kind, content = asked.part("kind"), asked.body
-        query, device = asked.http.query_params, self._devices.get(asked.part())
-        if device is not None and kind == DEVICE_COMMANDS:
-            name, content = device_command(
-                device, content, self._plans(), self._active, self._preparation.takes
+        query, source = asked.http.query_params, self._commanded.get(asked.part())
+        if source is not None and kind == SOURCE_VALUES:
+            name, content = source_command(
+                source, content, self._plans(), self._active, self._preparation.takes
             )
             loaded = self._link.controllers[name]
         else:
             loaded = self._known(asked)
-        units = query.get("units") == "true" and device is None
+        units = query.get("units") == "true" and source is None
         seconds = asked.number("in", 0.0) if "in" in query else None
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
             raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
@@ -669,7 +669,7 @@ class GatewayApp:
         name = asked.part()
         loaded = self._link.controllers.get(name)
         if loaded is None:
-            raise unknown_controllers([name], (*self._link.controllers, *self._devices))
+            raise unknown_controllers([name], (*self._link.controllers, *self._commanded))
         return loaded
 
 

@@ -73,6 +73,7 @@ def compile_devices(compilation: Compilation) -> Contribution:
                 commands=tuple(written),
                 ranges=tuple((command.lowest, command.highest) for command in plan.commands),
                 label=f"{name} (ID {device.id} on bus {device.bus})",
+                commandable=True,
             )
         )
         links = None if body is None else body.urdf.links

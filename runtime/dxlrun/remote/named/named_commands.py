@@ -1,9 +1,9 @@
-"""Commands by name: of some joints, or of a device; a controller's own command is made of them.
+"""Commands by name: of some joints, or of a source; a controller's own command is made of them.
 
 Each command of the standard controllers has one number a joint and interface (`positions`, `velocities`,
 `efforts`, `pwm`), or is a trajectory. A trajectory that may be one of some `joints` names only these. In all
 other commands the joints that are not named get their newest goals, as the gateway reads them when the
-request arrives; what another client sends in the same few milliseconds may be replaced. Values for a device
+request arrives; what another client sends in the same few milliseconds may be replaced. Values for a source
 go to the controller that commands it now.
 """
 
@@ -23,8 +23,8 @@ from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
-DEVICE_COMMANDS = "device_commands"
-"""The command of controllers that take values for devices: `{"values": {"board/led": 1}}`."""
+SOURCE_VALUES = "device_commands"
+"""Command of controllers that take values for sources, such as devices: `{"values": {"board/led": 1}}`."""
 POINT_SPEED = 0.5
 """rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
 _SHORTEST_S = 0.1
@@ -184,17 +184,17 @@ def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: C
     return max(_SHORTEST_S, *ways)
 
 
-# Devices
+# Sources
 
 
-def device_command(
-    device: SourcePlan,
+def source_command(
+    source: SourcePlan,
     body: bytes,
     controllers: Sequence[ControllerPlan],
     active: Callable[[ControllerPlan], bool],
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> tuple[str, bytes]:
-    """Return the controller that is given values for a device, and its command as JSON.
+    """Return the controller that gets values for a source, and its command as JSON.
 
     `body` is JSON with a value for each command, `{"led": 1}`, SI units. Raises RefusedRequest.
     """
@@ -202,26 +202,26 @@ def device_command(
         given = msgspec.json.decode(body, type=dict[str, object])
     except (msgspec.MsgspecError, RecursionError) as error:
         raise invalid(f"{error}; write for example led=1") from error
-    ranges = dict(zip(device.commands, device.ranges, strict=True))
+    ranges = dict(zip(source.commands, source.ranges, strict=True))
     if not ranges:
-        raise invalid(f"{device.label} has no commands; name items under its `commands` in the robot file")
+        raise invalid(f"{source.label} has no commands; name items under its `commands` in the robot file")
     if not given:
-        raise invalid(f"{device.label}: no command is named; it has {', '.join(ranges)}")
+        raise invalid(f"{source.label}: no command is named; it has {', '.join(ranges)}")
     for name, value in given.items():
         if name not in ranges:
             fields: dict[str, Field] = {
-                "controller": device.name,
+                "controller": source.name,
                 "kind": name[:80],
-                "known": device.commands,
+                "known": source.commands,
             }
-            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], device.commands)})
+            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], source.commands)})
         lowest, highest = ranges[name]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise invalid(f"{device.name}/{name} = {str(value)[:40]} is no number")
+            raise invalid(f"{source.name}/{name} = {str(value)[:40]} is no number")
         if not lowest <= value <= highest:
             problem = f"{value:g} lies outside {lowest:g} to {highest:g}"
-            raise refused(Code.BEYOND_LIMITS, {"controller": device.name, "kind": name, "problem": problem})
-    values = {f"{device.name}/{name}": value for name, value in given.items()}
+            raise refused(Code.BEYOND_LIMITS, {"controller": source.name, "kind": name, "problem": problem})
+    values = {f"{source.name}/{name}": value for name, value in given.items()}
     chosen = {_commander(name, controllers, active, takes) for name in values}
     if len(chosen) > 1:
         raise invalid(f"{', '.join(values)} are commanded by {', '.join(sorted(chosen))}: send one at a time")
@@ -234,12 +234,12 @@ def _commander(
     active: Callable[[ControllerPlan], bool],
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> str:
-    """Return the active controller that takes values for a command of a device; raises RefusedRequest."""
+    """Return the active controller that takes values for a command of a source; raises RefusedRequest."""
     claiming = [plan for plan in controllers if name in plan.source_commands]
     now = [plan for plan in claiming if active(plan)]
-    if now and DEVICE_COMMANDS in takes(now[0]):
+    if now and SOURCE_VALUES in takes(now[0]):
         return now[0].name
-    able = [plan.name for plan in claiming if DEVICE_COMMANDS in takes(plan)]
+    able = [plan.name for plan in claiming if SOURCE_VALUES in takes(plan)]
     if able:
         hint = f"`dxlrun switch --activate {able[0]}"
         hint += f" --deactivate {now[0].name}`" if now else "`"

@@ -1,0 +1,50 @@
+"""Table of the sensors, as `dxlrun check` shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+from dxlrun.compile.report import Row, TableStage
+from dxlrun.output.table import Column, Table, Value
+from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.plan.robot_plan import Plan
+
+
+def sensor_rows(plan: Plan) -> Iterator[Row]:
+    """Yield a row for each sensor, in the order of the file."""
+    return map(_sensor, plan.loop.sensors)
+
+
+def sensor_table(sensors: Sequence[Row]) -> Table:
+    """Return the table of these sensors."""
+    columns: list[tuple[Column, str | Callable[[Row], Value]]] = [
+        (Column("sensor", "name"), "name"),
+        (Column("type", "name"), "type"),
+        (Column("from", "name"), "distribution"),
+        (Column("rate", form="{:g} Hz"), "rate"),
+        (Column("timeout", form="{:g} ms"), lambda row: row["timeout"] * 1e3),
+        (
+            Column("when lost", "text"),
+            lambda row: "the run ends" if row["on_lost"] == "stop" else "the run goes on",
+        ),
+        (Column("states", "text"), lambda row: ", ".join(row["states"])),
+        *[(Column("senses link", "text"), lambda row: ", ".join(row["links"]))]
+        * any(row["links"] for row in sensors),
+    ]
+    return Table.listing("Sensors", columns, sensors)
+
+
+STAGE = TableStage(rows=sensor_rows, table=sensor_table)
+
+
+def _sensor(sensor: SensorPlan) -> Row:
+    return {
+        "name": sensor.name,
+        "type": sensor.type,
+        "distribution": sensor.distribution,
+        "rate": 1e9 / sensor.period_ns,
+        "timeout": sensor.timeout_ns * 1e-9,
+        "on_lost": sensor.on_lost,
+        "states": sensor.states,
+        "links": sensor.links,
+    }
