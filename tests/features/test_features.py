@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
+import dxlrun.features
 from dxlrun.compile.contribution import CompileStage
 from dxlrun.description.robot import Robot, robot_form
-from dxlrun.features import stages
+from dxlrun.features import FEATURES, stages
 from dxlrun.features.feature import Feature, Section
 
 
 def test_each_feature_has_the_section_of_its_name() -> None:
-    sections = {feature.name: section for feature, section in stages(Section)}
+    sections = {feature.name: section for feature, section in stages(Section, FEATURES)}
     assert {name: section.name for name, section in sections.items()} == {name: name for name in sections}
     assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys()
 
@@ -38,7 +40,9 @@ def test_broken_file_of_feature_is_an_error(tmp_path: Path, monkeypatch: pytest.
         feature.stage(CompileStage)
 
 
-@pytest.mark.parametrize("feature", [feature for feature, _ in stages(Section)], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "feature", [feature for feature, _ in stages(Section, FEATURES)], ids=lambda each: each.name
+)
 def test_form_of_feature_imports_no_file_of_the_run(feature: Feature) -> None:
     code = (
         f"import sys, {feature.package}.form; "
@@ -46,3 +50,20 @@ def test_form_of_feature_imports_no_file_of_the_run(feature: Feature) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_broken_section_of_plugin_leaves_robots_usable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "wrong_plugin.py").write_text(
+        "from dxlrun.features.feature import Feature\n"
+        "def dxlrun_features():\n"
+        "    return [Feature('lamps', 'wrong_plugin'), Feature('devices', 'dxlrun.features.devices')]\n"
+    )
+    point = EntryPoint("wrong", "wrong_plugin", "dxlrun")
+    monkeypatch.setattr(dxlrun.features, "entry_points", lambda group: [point])
+    installed, broken = dxlrun.features._installed.__wrapped__()
+    assert installed == FEATURES
+    assert broken.keys() == {"lamps", "devices"}
+    assert "is there already" in broken["devices"]

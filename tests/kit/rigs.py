@@ -32,7 +32,9 @@ from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
+from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.features import FEATURES
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -310,7 +312,7 @@ def make_rig(
         lambda: beats.append(clock.now_ns()),
         take_over=take_over,
         sources=sources,
-        source_commands=commands,
+        parts=FeatureParts(FEATURES, (), commands, {}),
     )
     rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
     rig.sources, rig.device_commands = sources, commands

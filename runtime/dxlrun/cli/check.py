@@ -165,7 +165,7 @@ def _tables(result: Compiled) -> Iterator[Table]:
         yield _servos({(servo["bus"], servo["id"]): servo for servo in servos}.values())
     groups = ((name, ", ".join(joints)) for name, joints in report["groups"].items())
     yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), groups)
-    for feature, stage in stages(TableStage):
+    for feature, stage in stages(TableStage, result.plan.features):
         yield stage.table(report[feature.name])
     yield _controllers(report["controllers"], len(joints))
     yield _buses(report["buses"], rate)

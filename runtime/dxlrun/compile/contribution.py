@@ -54,6 +54,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Links of the URDF whose orientation its sources have, by source."""
     texts: Mapping[str, str] = {}
     """Contents of the files that its section names, by path."""
+    plan: bytes = b""
+    """Whatever its part in the run needs beside that, encoded; `BusContext.plan` has it."""
     sensors: tuple[SensorPlan, ...] = ()
     """Processes that sample its sources."""
 

@@ -54,7 +54,7 @@ def check_report(
         "rate": rate,
         "joints": [_joint(joint, servos) for joint in joints],
         "groups": plan.groups,
-        **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage)},
+        **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage, plan.features)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],
         "policies": policy_rows(loop.policies, buses),

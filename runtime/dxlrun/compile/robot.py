@@ -42,7 +42,9 @@ from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
-from dxlrun.features import stages
+from dxlrun.features import installed_features, stages
+from dxlrun.features.feature import Feature
+from dxlrun.log.identity import distribution_name
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 from dxlwire.bus_plan import BusPlan
@@ -154,8 +156,11 @@ def compile_robot(
     check_twins(file, {name: joint.table for name, joint in joints.items()})
     body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
+    features = _used_features(file)
     compilation = Compilation(file, plugins, joints, body)
-    by_feature = {feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage)}
+    by_feature = {
+        feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage, features)
+    }
     contributions = tuple(by_feature.values())
     sources = tuple(source for each in contributions for source in each.sources)
     sensors = tuple(sensor for each in contributions for sensor in each.sensors)
@@ -224,8 +229,12 @@ def compile_robot(
         simulation=simulation,
         groups=description.groups,
         gateway=robot.processes.gateway.enabled,
-        packages=plugins.packages_of(loop.controllers, sensors, _models(buses)) | _physics(simulation, buses),
+        packages=plugins.packages_of(loop.controllers, sensors, _models(buses))
+        | _physics(simulation, buses)
+        | _packages(features),
         mechanics=compile_mechanics(joints),
+        features=features,
+        feature_plans={name: each.plan for name, each in by_feature.items() if each.plan},
     )
     return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
@@ -234,6 +243,21 @@ def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
     """Return the models of all servos and devices."""
     servos = {servo.model for bus in buses for servo in bus.servos}
     return frozenset(servos | {device.model for bus in buses for device in bus.devices})
+
+
+def _used_features(file: RobotFile) -> tuple[Feature, ...]:
+    """Return our features, and those of plug-ins whose sections the file has."""
+    known = installed_features()
+    return tuple(each for each in known if not each.distribution or file.marks.has((each.name,)))
+
+
+def _packages(features: Iterable[Feature]) -> dict[str, str]:
+    """Return the packages of the plug-ins whose sections the robot file has, with their distributions."""
+    return {
+        each.package.partition(".")[0]: distribution_name(each.distribution)
+        for each in features
+        if each.distribution
+    }
 
 
 def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:

@@ -24,6 +24,7 @@ import pluggy
 if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
     from dxlrun.contract.controller import Controller
     from dxlrun.contract.sensor import Sensor
+    from dxlrun.features.feature import Feature
 
 GROUP = "dxlrun"
 CONTRACT_VERSION = 4
@@ -68,6 +69,14 @@ class HookSpecs:
     @hookspec
     def dxlrun_commands(self) -> Sequence[Command]:  # type: ignore[empty-body]  # a signature
         """Return the verbs that the package adds to the command line; import nothing heavy for it."""
+
+    @hookspec
+    def dxlrun_features(self) -> Sequence[Feature]:  # type: ignore[empty-body]  # a signature
+        """Return the features of the package: sections that it adds to the robot file.
+
+        `Feature("lights", "my_package.lights")` has the files of the section `lights` in that package; see
+        `dxlrun.tooling.features`. Import nothing heavy for it: the stage that needs a file imports it.
+        """
 
     @hookspec
     def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature

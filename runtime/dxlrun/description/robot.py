@@ -34,7 +34,7 @@ from dxlrun.description.units import (
     Share,
     SizeOrDuration,
 )
-from dxlrun.features import stages
+from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Section
 
 
@@ -306,7 +306,7 @@ class Robot(Form):
 @cache
 def robot_form() -> type[Robot]:
     """Return the form of a robot file with the sections of all features."""
-    sections = [section for _, section in stages(Section)]
+    sections = [section for _, section in stages(Section, installed_features())]
     definitions: dict[str, Any] = {each.name: (each.form, each.field) for each in sections}
     form = create_model(Robot.__name__, __base__=Robot, __doc__=Robot.__doc__, **definitions)
     order = [*Robot.model_fields]

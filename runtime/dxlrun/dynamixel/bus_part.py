@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.features import stages
+from dxlrun.features.feature import Feature
 from dxlwire.bus_plan import BusPlan
 from dxlwire.exchange.bus import Lines
 from dxlwire.transaction import Program
@@ -32,7 +33,36 @@ class BusContext:
     """Newest samples of the bus."""
     commands: Floats
     """Commands of all sources in the cycle's record, SI units; NaN is not commanded."""
+    command_names: Sequence[str]
+    """Names of these commands, such as `light/led`."""
+    plan: bytes
+    """`Contribution.plan` of the feature."""
     events: EventSink
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureParts:
+    """Features of a robot, and the commands that they execute on its buses."""
+
+    features: Sequence[Feature]
+    command_names: Sequence[str]
+    """Names of the commands of all sources, in the order of the cycle's record."""
+    commands: Floats
+    """These commands in the record."""
+    plans: Mapping[str, bytes]
+    """`Contribution.plan` by feature."""
+
+    def attach(
+        self, idle: IdleScheduler, reads: CyclicReads, samples: BusSamples, events: EventSink
+    ) -> tuple[BusPart, ...]:
+        """Return the parts of features on one bus, in the order of the features."""
+        found: list[BusPart] = []
+        for feature, stage in stages(BusStage, self.features):
+            plan = self.plans.get(feature.name, b"")
+            context = BusContext(idle, reads, samples, self.commands, self.command_names, plan, events)
+            if (part := stage.attach(context)) is not None:
+                found.append(part)
+        return tuple(found)
 
 
 class BusPart(Protocol):
@@ -51,16 +81,21 @@ class BusPart(Protocol):
         """Add programs to the idle time after this cycle."""
 
 
+def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
+    """Read nothing at the start."""
+    yield from ()
+
+
 @dataclass(frozen=True)
 class BusStage:
     """`STAGE` of `runtime.py`: the part of a feature in the loop's process."""
 
     FILE: ClassVar[str] = "runtime"
 
-    inspect: Callable[[BusPlan, Findings], Program[None]]
-    """Reads at the start, after the servos were inspected and before any of them gets torque."""
     attach: Callable[[BusContext], BusPart | None]
     """Called once for each bus before the start. None if the feature has nothing on this bus."""
+    inspect: Callable[[BusPlan, Findings], Program[None]] = inspect_nothing
+    """Reads at the start, after the servos were inspected and before any of them gets torque."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +111,11 @@ class SafeStage:
     """Returns a sentence for each failure, and raises nothing."""
 
 
-def load_safe_stages() -> None:
-    """Import now what `make_safe` needs: when it is called, an import may not be possible any more."""
-    for _ in stages(SafeStage):
-        pass
+def safe_stages(features: Iterable[Feature]) -> tuple[SafeStage, ...]:
+    """Import what `make_safe` needs: when that is called, an import may not be possible any more."""
+    return tuple(stage for _, stage in stages(SafeStage, features))
 
 
-def make_safe(lines: Lines) -> tuple[str, ...]:
+def make_safe(lines: Lines, features: Iterable[SafeStage]) -> tuple[str, ...]:
     """Leave everything on the lines safe that is not a servo; return a sentence for each failure."""
-    return tuple(problem for _, stage in stages(SafeStage) for problem in stage.make_safe(lines))
+    return tuple(problem for stage in features for problem in stage.make_safe(lines))

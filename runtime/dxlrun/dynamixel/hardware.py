@@ -9,9 +9,9 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
+from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.bus_part import load_safe_stages, make_safe
+from dxlrun.dynamixel.bus_part import FeatureParts, make_safe, safe_stages
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -23,6 +23,7 @@ from dxlrun.dynamixel.servo.torque_limits import reduced_torque_limits, restore_
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.dynamixel.wire_reports import WireReports
 from dxlrun.errors import PortError, StartUpError
+from dxlrun.features import FEATURES
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import Clock
@@ -67,17 +68,16 @@ class DynamixelHardware:
         beat: Callable[[], None],
         take_over: bool = False,
         sources: SourceStates | None = None,
-        source_commands: Floats | None = None,
+        parts: FeatureParts | None = None,
         refusals: Callable[[], Sequence[str]] | None = None,
     ) -> None:
         """`refusals` looks at where the servos stand, which the states then have, before any gets torque, and
         returns why the robot must not start, one sentence each.
 
-        `sources`, `source_commands`: of the cycle's record.
+        `sources`: of the cycle's record. `parts`: the features of the robot; None: ours, without commands.
 
         Raises NotCompiled where the exchange kernel was not compiled.
         """
-        load_safe_stages()
         self._lines = Lines(plans, ports, clock, packets, beat)
         self._plans, self._buses = self._lines.plans, self._lines.buses
         self._ports = ports
@@ -100,9 +100,10 @@ class DynamixelHardware:
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
         self._samples = Samples(self._plans, states, sources or SourceStates.empty(), reports)
-        commands = np.empty(0) if source_commands is None else source_commands
+        parts = parts or FeatureParts(FEATURES, (), np.empty(0), {})
+        self._safe_stages = safe_stages(parts.features)
         self._servos = tuple(
-            Servos(idle, states, arrays, commands, events)
+            Servos(idle, states, arrays, parts, events)
             for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
         )
         self._pairs = tuple(zip(self._buses, self._servos, strict=True))
@@ -115,7 +116,7 @@ class DynamixelHardware:
         shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
         self._kernel = Kernel(self._lines, shared, self._samples, goals.values, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
-        self._start_up = StartUp(self._lines, self._servos, events)
+        self._start_up = StartUp(self._lines, self._servos, events, parts.features)
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
@@ -395,7 +396,7 @@ class DynamixelHardware:
         self._make_rest_safe()
 
     def _make_rest_safe(self) -> None:
-        for problem in make_safe(self._lines):
+        for problem in make_safe(self._lines, self._safe_stages):
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:

@@ -123,7 +123,7 @@ class HardwareLayers:
         self.states = states
         self.goals = goals
         self._layers: list[PreparedLayer] = []
-        for _, stage in stages(LayerStage):
+        for _, stage in stages(LayerStage, plan.features):
             layer = stage.prepare(plan, self.states, self.goals, events)
             if layer is not None:
                 self._layers.append(layer)

@@ -6,20 +6,73 @@ share belongs to the room of that stage. `feature.py` describes the files; `FEAT
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 
-from dxlrun.features.feature import Feature, S
+from dxlrun.features.feature import Feature, S, Section
 
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
     Feature("sensors", "dxlrun.features.sensors"),
     Feature("mechanics", "dxlrun.features.mechanics"),
 )
-"""In the order in which every stage asks them; their states are in the cycle's record in this order."""
+"""In the order in which every stage asks them; their states are in the cycle's record in this order.
+
+Devices are the first, because their plans count columns of the record from 0.
+"""
 
 
-def stages(kind: type[S]) -> Iterator[tuple[Feature, S]]:
+def stages(kind: type[S], features: Iterable[Feature]) -> Iterator[tuple[Feature, S]]:
     """Yield the features that take part in a stage, each with its `STAGE`."""
-    for feature in FEATURES:
+    for feature in features:
         if (stage := feature.stage(kind)) is not None:
             yield feature, stage
+
+
+def installed_features() -> tuple[Feature, ...]:
+    """Return all features that a robot file may have: ours, then those of plug-ins by name."""
+    return _installed()[0]
+
+
+def broken_features() -> dict[str, str]:
+    """Return the features of plug-ins that cannot be used, with the reason, by name."""
+    return _installed()[1]
+
+
+@cache
+def _installed() -> tuple[tuple[Feature, ...], dict[str, str]]:
+    found = {feature.name: feature for feature in FEATURES}
+    broken: dict[str, str] = {}
+    for point in sorted(entry_points(group="dxlrun"), key=lambda each: each.name):
+        features: list[Feature] = []
+        with suppress(Exception, SystemExit):  # foreign code: `dxlrun plugins` says why it cannot be used
+            features += _features_of(point)
+        for feature in features:
+            try:
+                section = feature.stage(Section)
+            except (Exception, SystemExit) as error:
+                broken[feature.name] = (
+                    f"the section {feature.name} of {feature.distribution} cannot be used "
+                    f"({type(error).__name__}: {error}); report it to its author"
+                )
+                continue
+            if section is None or section.name != feature.name or feature.name in found:
+                broken[feature.name] = (
+                    f"{feature.distribution} offers the section {feature.name}, which "
+                    + ("is there already" if feature.name in found else "its form.py does not have")
+                    + "; report it to its author"
+                )
+                continue
+            found[feature.name] = feature
+    return tuple(found.values()), broken
+
+
+def _features_of(point: EntryPoint) -> Iterator[Feature]:
+    """Yield the features of one plug-in; raises whatever its code raises."""
+    hook = getattr(point.load(), "dxlrun_features", None)
+    publisher = "" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+    for feature in () if hook is None else hook():
+        yield replace(feature, distribution=publisher)

@@ -55,7 +55,11 @@ class Feature:
     """A feature by its name and the package that has its files."""
 
     name: str
+    """Key of its section in the robot file, such as `devices`."""
     package: str
+    """Package with its files, such as `dxlrun.features.devices`."""
+    distribution: str = ""
+    """Publisher of the plug-in that has the package: `name version`. Empty for the features of dxlrun."""
 
     def stage(self, kind: type[S]) -> S | None:
         """Return what the feature does in one stage, or None if it has no such file."""

@@ -8,6 +8,8 @@ import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import Mark
+from dxlrun.features import FEATURES
+from dxlrun.features.feature import Feature
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -57,6 +59,10 @@ class Plan(msgspec.Struct, frozen=True):
     sensors, servo models, physics and hooks of the loop."""
     mechanics: MechanicsPlan = MechanicsPlan()
     """Which servos move which joints; empty: each joint has one servo."""
+    features: tuple[Feature, ...] = FEATURES
+    """Features that take part in the run."""
+    feature_plans: dict[str, bytes] = {}
+    """What a feature compiled for its own part in the run, by its name."""
 
     @property
     def urdf(self) -> str | None:

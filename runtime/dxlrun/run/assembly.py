@@ -21,6 +21,7 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.sensors.readings import Readings
+from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
 from dxlrun.plan.policy_plan import Last
@@ -137,7 +138,9 @@ def assemble(
         beat,
         take_over=take_over,
         sources=record.sources,
-        source_commands=record.source_commands,
+        parts=FeatureParts(
+            plan.features, plan.loop.source_commands, record.source_commands, plan.feature_plans
+        ),
         refusals=layers.refusals,
     )
     hardware = layers.build(servos)

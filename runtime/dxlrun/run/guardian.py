@@ -32,9 +32,11 @@ from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime
 from dxlrun.description.bus import SIMULATED
-from dxlrun.dynamixel.bus_part import load_safe_stages, make_safe
+from dxlrun.dynamixel.bus_part import make_safe, safe_stages
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
+from dxlrun.features import FEATURES
+from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
 from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
@@ -77,6 +79,7 @@ class GuardianJob:
     """Process ID."""
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this."""
+    features: tuple[Feature, ...] = FEATURES
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +158,7 @@ class SafeStop:
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
-        load_safe_stages()
+        self._safe_stages = safe_stages(job.features)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
@@ -171,14 +174,14 @@ class SafeStop:
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
         """Stop the joints that would go on moving with their torque on; return a sentence for each."""
         lines, packets = self._take_over(descriptors)
-        sentences = (*stand(lines), *make_safe(lines))
+        sentences = (*stand(lines), *make_safe(lines, self._safe_stages))
         packets.commit()
         return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
         lines, packets = self._take_over(descriptors)
-        outcome, unsafe = limp(lines), make_safe(lines)
+        outcome, unsafe = limp(lines), make_safe(lines, self._safe_stages)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
         servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"

@@ -206,6 +206,7 @@ def guardian_job(
         memory=memory,
         supervisor=os.getpid(),
         epoch_offset_ns=epoch_offset_ns,
+        features=plan.features,
     )
 
 

@@ -12,6 +12,7 @@ each module is a page of names, and each name is imported when it is first used.
 | `files` | YAML files of a package's own, checked as robot files are |
 | `robots` | robot and motion files: read, compile |
 | `plans` | the compiled robot, as a run and each log have it |
+| `features` | sections that a package adds to the robot file |
 | `runs` | running a robot: in processes, on virtual time |
 | `servos` | single servos on a line that no run uses |
 | `live` | robots that run: addresses, keys, messages as they come |

@@ -28,6 +28,7 @@ from dxlrun.control.controllers.single_files import class_in_file, file_of, publ
 from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
+from dxlrun.features import broken_features
 from dxlrun.log.identity import distribution_name
 from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
@@ -277,7 +278,7 @@ def load_plugins(
     raises passes through: the loop's process counts its threads there, and again when a controller was
     configured. Itself raises nothing.
     """
-    broken: dict[str, str] = {}
+    broken = dict(broken_features())
     loaded: list[LoadedPlugIn] = []
     # the order must not depend on the file system: two runs load the same plug-ins in the same order
     found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]

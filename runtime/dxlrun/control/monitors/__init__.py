@@ -6,17 +6,17 @@ its own in `monitor.py`. Neither the loop nor `check` changes for it.
 
 from __future__ import annotations
 
+from dxlrun import features
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.lost_servos import LostServos
 from dxlrun.control.monitors.monitor import Monitor, MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
-from dxlrun.features import stages
 from dxlrun.plan.loop_plan import LoopPlan
 
 
 def list_monitors() -> tuple[type[Monitor], ...]:
     """Return all monitors, in the order of a cycle and of the policies that `check` shows."""
-    return (LostServos, *(stage.monitor for _, stage in stages(MonitorStage)))
+    return (LostServos, *(stage.monitor for _, stage in features.stages(MonitorStage, features.FEATURES)))
 
 
 def build_monitors(plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> tuple[Monitor, ...]:

@@ -10,9 +10,9 @@ from collections.abc import Generator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.bus_part import BusContext, BusPart, BusStage
+from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
@@ -23,7 +23,6 @@ from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.errors import counted
-from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.control_table import control_table
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -52,10 +51,10 @@ class Servos:
         idle: IdleScheduler,
         states: States,
         samples: BusSamples,
-        source_commands: Floats,
+        parts: FeatureParts,
         events: EventSink,
     ) -> None:
-        """`source_commands`: of all sources of the robot."""
+        """`parts`: the features that are on the bus, too."""
         plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
         self._bus = idle.bus
@@ -69,9 +68,7 @@ class Servos:
         self.goals = GoalArrays(plan)  # Builds the sync write
         self.reads = CyclicReads(plan, samples, idle.bus.owed)
         """The job that reads every servo and every device once."""
-        context = BusContext(idle, self.reads, samples, source_commands, events)
-        attached = (stage.attach(context) for _, stage in stages(BusStage))
-        self._parts: tuple[BusPart, ...] = tuple(part for part in attached if part is not None)
+        self._parts = parts.attach(idle, self.reads, samples, events)
         """The share of features on this bus, in their order."""
         self.life = Life(idle, self.reads, events)  # The state of each servo
         self._reboots = Reboots(self.life)

@@ -25,6 +25,7 @@ from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.features import stages
+from dxlrun.features.feature import Feature
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import control_table
 from dxlwire.exchange.bus import Lines
@@ -68,11 +69,14 @@ class StartUp:
     Each raises StartUpError with all problems of its stage, PortError when a line is gone.
     """
 
-    def __init__(self, lines: Lines, servos: Sequence[Servos], events: EventSink) -> None:
+    def __init__(
+        self, lines: Lines, servos: Sequence[Servos], events: EventSink, features: Sequence[Feature]
+    ) -> None:
         self._plans = lines.plans
         self._lines = lines
         self._servos = servos
         self._events = events
+        self._features = features
         self._times = [ReplyTimes() for _ in lines.plans]
         """Lateness of the replies on each bus."""
 
@@ -80,8 +84,8 @@ class StartUp:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
         found = [Findings() for _ in self._plans]
         self._run(lambda plan, found: survey(plan, take_over, found), found)
-        for _, feature in stages(BusStage):
-            self._run(feature.inspect, found)
+        for _, stage in stages(BusStage, self._features):
+            self._run(stage.inspect, found)
         self._judge(found)
         _refuse(self._late_replies(), for_replies=True)
         self.stage(settle_bus)

@@ -1,0 +1,39 @@
+"""Checks of the lights against joints and control tables."""
+
+from __future__ import annotations
+
+import msgspec
+
+from dxlrun.tooling.features import Compilation, CompileStage, Contribution, SourcePlan
+from dxlrun.tooling.verbs import suggestion
+from dxlrun_lights import form
+from dxlrun_lights.plan import Light
+
+
+def compile_lights(compilation: Compilation) -> Contribution:
+    """Return the lights as commands of one source, `lights/NAME`, from 0 (off) to 1 (on)."""
+    file, found = compilation.file, dict[str, Light]()
+    lights = form.STAGE.of(file.robot)
+    for name, light in lights.items():
+        mark = file.at("lights", name, "joint")
+        if light.joint not in file.robot.joints:
+            what = f"light {name} is on {light.joint}, which is not a joint"
+            file.error(mark, what, suggestion(light.joint, tuple(file.robot.joints)))
+        elif (joint := compilation.joints.get(light.joint)) is not None:
+            servo = joint.servos[0]
+            if (led := servo.table.items.get("led")) is None:
+                what = f"light {name} is on {light.joint}, whose {servo.table.model} has no item led"
+                file.error(
+                    mark, what, "name a joint whose servo has one; `dxlrun models MODEL` lists the items"
+                )
+            else:
+                found[name] = Light(servo.described.title, led.address)
+    if len(found) < len(lights):  # without a source, no controller is blamed for its commands
+        return Contribution(names=("lights",))
+    source = SourcePlan(
+        "lights", "light", (), tuple(found), ((0.0, 1.0),) * len(found), label="lights", commandable=True
+    )
+    return Contribution(("lights",), sources=(source,), plan=msgspec.json.encode(found))
+
+
+STAGE = CompileStage(compile_lights)

@@ -1,0 +1,16 @@
+"""Form of the section `lights`."""
+
+from __future__ import annotations
+
+from dxlrun.tooling.features import Form, Name, Section, key
+
+
+class Light(Form):
+    """A light: the LED of a servo."""
+
+    joint: Name = key("Joint whose first servo has the LED.", "pan_joint")
+
+
+STAGE: Section[dict[str, Light]] = Section(
+    "lights", dict[Name, Light], key("LEDs of servos, by name.", "{left: {joint: pan_joint}}", {})
+)

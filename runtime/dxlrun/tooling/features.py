@@ -1,0 +1,49 @@
+"""Features: the names for a section that a package adds to the robot file.
+
+A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
+`Section` in `form.py`, `CompileStage` in `compile.py`, `LayerStage` in `layer.py`, `BusStage` in
+`runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. All but the first may be missing. The hook
+`dxlrun_features` registers it:
+
+    from dxlrun import hookimpl
+    from dxlrun.tooling.features import Feature
+
+    @hookimpl
+    def dxlrun_features() -> list[Feature]:
+        return [Feature("lights", "dxlrun_lights")]
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlwire.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.compile.contribution import BusDevice as BusDevice
+    from dxlrun.compile.contribution import Compilation as Compilation
+    from dxlrun.compile.contribution import CompileStage as CompileStage
+    from dxlrun.compile.contribution import Contribution as Contribution
+    from dxlrun.compile.problems import RobotFile as RobotFile
+    from dxlrun.compile.report import Row as Row
+    from dxlrun.compile.report import TableStage as TableStage
+    from dxlrun.description.form import Form as Form
+    from dxlrun.description.form import Name as Name
+    from dxlrun.description.form import key as key
+    from dxlrun.description.form import refuse as refuse
+    from dxlrun.dynamixel.bus_part import BusContext as BusContext
+    from dxlrun.dynamixel.bus_part import BusPart as BusPart
+    from dxlrun.dynamixel.bus_part import BusStage as BusStage
+    from dxlrun.dynamixel.bus_part import SafeStage as SafeStage
+    from dxlrun.dynamixel.findings import Findings as Findings
+    from dxlrun.dynamixel.hardware_layer import HardwareLayer as HardwareLayer
+    from dxlrun.dynamixel.hardware_layer import LayerStage as LayerStage
+    from dxlrun.dynamixel.hardware_layer import PreparedLayer as PreparedLayer
+    from dxlrun.features.feature import Feature as Feature
+    from dxlrun.features.feature import Section as Section
+    from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
+    from dxlwire.exchange.idle import Urgency as Urgency
+    from dxlwire.plan.planning import plan_line as plan_line
+    from dxlwire.transaction import Program as Program
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
