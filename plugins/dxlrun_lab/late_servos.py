@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from dxlrun import Log
 from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlsim import LedgerEntry
-from dxlwire import PacketKind
+from dxlwire import BITS_PER_BYTE, PacketKind
 
-_BITS_A_BYTE = 10
 Longs = NDArray[np.int64]
 Sent = Sequence[tuple[int, int]]
 """When a host began to write, ns, and how many bytes; all that it wrote, in order."""
@@ -49,7 +48,7 @@ def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, L
         packets = sorted((p for p in log.packets if p.bus == index), key=lambda packet: packet.first_ns)
         sent = [(p.first_ns, len(p.data)) for p in packets if p.kind is PacketKind.INSTRUCTION]
         rate = plan_of(log).by_name.get(name, LoggedBus()).baud_rate
-        byte_ns = _BITS_A_BYTE * 1e9 / rate if rate else 0.0
+        byte_ns = BITS_PER_BYTE * 1e9 / rate if rate else 0.0
         read, idle = _waits(log.cycles, transactions(by_bus[name], sent, byte_ns))
         in_read, in_idle = np.maximum(in_read, read), np.maximum(in_idle, idle)
     return in_read, in_idle

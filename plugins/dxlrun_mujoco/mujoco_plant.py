@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import InputError
-from dxlrun.compile.simulation import INSTALL_MUJOCO, NEEDS_MUJOCO
 from dxlsim import (
     JAMMED_NM,
     CoupledServo,
@@ -60,12 +59,8 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
     """Return what makes the plant of these bodies.
 
     Joints that the URDF lacks, or does not draw as hinges (those in m: as slides), move without it. Raises
-    InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
+    ImportError when MuJoCo cannot be loaded, InputError when it cannot take the URDF, or would move nothing.
     """
-    try:
-        import mujoco  # noqa: F401 (it may be there and yet not load)
-    except ImportError as error:
-        raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
     from xml.etree import ElementTree  # only robots with a URDF need it
 
     try:

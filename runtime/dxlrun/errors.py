@@ -12,6 +12,7 @@ Exception
     ├── ServoFault                 a servo refused a tool's request, or did not answer
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
+    ├── RunGone                    the run ended while a client steered it
     ├── Refused                    a running robot refused a request; exit code 2: the request was wrong
     ├── GoalTimeout (TimeoutError) a goal has not ended in the time that was given
     └── LogError (ValueError)      a log cannot be read; exit code 2
@@ -41,6 +42,7 @@ __all__ = [
     "Problem",
     "ProcessFault",
     "Refused",
+    "RunGone",
     "ServoFault",
     "StartUpError",
     "counted",
@@ -118,6 +120,10 @@ class ControllerFault(DxlrunError, RuntimeError):
 
 class ProcessFault(DxlrunError, RuntimeError):
     """A process of the run ended, hung, or could not be started."""
+
+
+class RunGone(DxlrunError):
+    """The run ended, or cannot be steered any more, while a client worked on it."""
 
 
 class LogError(DxlrunError, ValueError):

@@ -25,7 +25,7 @@ import dxlrun as face
 from dxlrun import RemoteRobot, connect
 from dxlrun.remote.live.listening import Listening
 from dxlrun.testing import plan_of
-from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
+from dxlrun.tooling.runs import VirtualLink
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
@@ -67,9 +67,7 @@ class Virtual:
     """A robot on virtual time, which is what `connect` finds."""
 
     def __init__(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.link = RobotOnVirtualTime(
-            plan_of(ROOT / "robots" / f"{name}.yaml"), log=None, each_cycle=lambda cycle: None
-        )
+        self.link = VirtualLink(plan_of(ROOT / "robots" / f"{name}.yaml"))
         self.robot = RemoteRobot(name, self.link)
         self.faults = FaultScript([])
         self.faults.attach(self.link.simulated.buses)

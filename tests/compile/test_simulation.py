@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import sys
 from pathlib import Path
 
 import pytest
@@ -196,6 +197,14 @@ def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
     )
     with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
         simulation_of(compile_text(_with_bodies(SIMULATED, loose)).plan)
+
+
+@pytest.mark.needs("physics")
+def test_mujoco_that_cannot_be_loaded_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = compile_text(_with_bodies(SIMULATED)).plan
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"needs MuJoCo.*pip install 'dxlrun\[physics\]'"):
+        simulation_of(plan)
 
 
 def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all() -> None:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from tests.kit.anew import written_anew
 
-from dxlrun.control.schedule import Schedule
+from dxlrun.control.deadlines import Deadlines
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import open_log, read_log
 from dxlrun_analysis.latency import latency_log, tables
@@ -67,7 +67,7 @@ def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int]
     clock = LateClock(late)
     if stop_after:
         buffer.words[Place.STOP] = 1
-    measure(clock, Schedule(PERIOD), len(late), buffer)
+    measure(Deadlines(PERIOD, clock), len(late), buffer)
     times = buffer.wake_ups()
     assert buffer.words[Place.DONE] == len(times)
     buffer.close()

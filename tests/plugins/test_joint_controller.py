@@ -26,8 +26,8 @@ from dxlrun.description.robot import ControllerEntry
 from dxlrun.log.identity import IDENTITY_NAME
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.testing import plan_of, read_log, simulated_robot
+from dxlrun.tooling.runs import VirtualLink
 from dxlrun_analysis.replay import Setting, replay_log
-from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
 
 SHORT = Path(__file__).with_name("short")
 WAVE = (SHORT / "wave.py").read_text()
@@ -151,7 +151,7 @@ def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
 
 
 def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Written) -> None:
-    link = RobotOnVirtualTime(plan_of(written()), log=None, each_cycle=lambda cycle: None)
+    link = VirtualLink(plan_of(written()))
     robot = RemoteRobot("short", link)
     try:
         values = {one.name: one.value for one in robot.parameter_table("head")}

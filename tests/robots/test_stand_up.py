@@ -18,7 +18,7 @@ from dxlrun.cli.steering.written import Written
 from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.client import RemoteGoal, RemoteRobot
 from dxlrun.testing import plan_of
-from dxlrun_lab.guided.virtual_rig import RobotOnVirtualTime
+from dxlrun.tooling.runs import VirtualLink
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
@@ -35,7 +35,7 @@ class Stage:
 
     def __init__(self, directory: Path) -> None:
         self.path = directory / "run.mcap"
-        self.link = RobotOnVirtualTime(PLAN, log=self.path, each_cycle=lambda cycle: None)
+        self.link = VirtualLink(PLAN, log=self.path)
         (self.bus,) = self.link.simulated.buses
         self.faults = FaultScript([])
         self.faults.attach([self.bus])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -255,12 +254,6 @@ def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(text, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
         mujoco_plant(UrdfBodies(text, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(caught.value.sentences) == 1
-
-
-def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"pip install 'dxlrun\[physics\]'"):
-        mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
 
 
 @pytest.mark.needs("physics")

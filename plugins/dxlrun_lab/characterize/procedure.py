@@ -17,7 +17,7 @@ from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
 from dxlrun_lab.guided.segment import Recorded, Segment
-from dxlwire.control_table import control_table
+from dxlwire import find_table
 
 Measurement = Literal["rate", "response", "speed", "dead_band", "gap"]
 MEASUREMENTS: Final[tuple[Measurement, ...]] = get_args(Measurement)
@@ -368,6 +368,6 @@ def _lead_of(gap: float) -> int:
 def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
     """Return the registers of a servo's dead band, ticks: as the file declares them, else as shipped."""
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
-    table = control_table(joint.servo.model, protocol)
+    table = find_table(joint.servo.model, protocol)
     shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}
     return shipped | {one.name: one.value for one in joint.servo.registers if one.name in shipped}

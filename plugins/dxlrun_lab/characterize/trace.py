@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 from dxlrun_lab.guided.experiment import Joint
 from dxlrun_lab.guided.segment import Recorded
-from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.plan.line import BITS_PER_BYTE
+from dxlwire import BITS_PER_BYTE, BusPlan, ServoPlan
 
 
 class Trace(msgspec.Struct, frozen=True):

@@ -37,7 +37,7 @@ def characterize(
     tolerance
         Largest deviation of a joint from its path when commands lie apart.
     """
-    from dxlrun.description.units import angle
+    from dxlrun.tooling.verbs import angle
     from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize
     from dxlrun_lab.characterize.tables import parts, results
 

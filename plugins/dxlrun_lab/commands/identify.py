@@ -135,7 +135,7 @@ def _check_output(target: Path, joints: tuple[str, ...]) -> None:
 
 
 def _write(target: Path, joint: str, found: Identified) -> None:
-    from dxlrun.description.joints.motor_file import motor_text
+    from dxlrun.tooling.robots import motor_text
 
     comment = "\n".join((f"{joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
     write_target(target, motor_text(found.motor, found.uncertainty, comment=comment))

@@ -199,7 +199,7 @@ def _announced(settings: Settings, load: str) -> str:
 
 
 def _duration(option: str, text: str) -> int:
-    from dxlrun.description.units import duration
+    from dxlrun.tooling.verbs import duration
 
     try:
         return duration(text, bare="s")

@@ -63,7 +63,7 @@ class RecordedPart:
         """The tolerance, rad; None: none is given. Raises InputError for one that is none."""
         if self.tolerance is None:
             return None
-        from dxlrun.description.units import angle
+        from dxlrun.tooling.verbs import angle
 
         try:
             allowed = angle(self.tolerance)

@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 
 from dxlrun import DxlrunError, Refused
+from dxlrun.tooling.live import RunGone
 from dxlrun.tooling.plans import JointPlan, Plan
-from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunGone
+from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig
 from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
-from dxlwire.bus_plan import ServoPlan
-from dxlwire.modes import Mode, mode_of
+from dxlwire import Mode, ServoPlan, mode_of
 
 APPROACH_RAD_S: Final = 0.5
 """Highest speed on the way to where a segment begins."""

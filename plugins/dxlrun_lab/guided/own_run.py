@@ -13,8 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dxlrun import ProcessFault, RemoteRobot
-from dxlrun.remote.sockets import sockets
-from dxlrun.tooling.live import SocketLink
+from dxlrun.tooling.live import SocketLink, sockets
 
 _CODE = """
 import ctypes, signal, sys

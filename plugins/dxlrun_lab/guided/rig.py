@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import DxlrunError, InputError, LogError, Refused, RemoteRobot
-from dxlrun.channels.answers import Code
+from dxlrun.tooling.live import Code, RunGone
 from dxlrun.tooling.logs import LogFollower
 from dxlrun.tooling.plans import Plan, RecordingPlan, from_json
 from dxlrun.tooling.records import Event, EventCode, GoalReport
@@ -33,10 +33,6 @@ _LOG_S = 5.0
 Cycles = NDArray[np.void]
 Look = Callable[[], tuple[Cycles, Sequence[Event]]]
 """Returns the cycles and events since the last call."""
-
-
-class RunGone(DxlrunError):
-    """The run ended, or cannot be steered any more, in the middle of an experiment."""
 
 
 class RunningController(NamedTuple):

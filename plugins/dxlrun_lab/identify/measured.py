@@ -18,7 +18,7 @@ from dxlrun import InputError
 from dxlrun.tooling.records import Torque
 from dxlrun_lab.identify.model import STEP_S, Control, Floats, Pieces
 from dxlrun_lab.identify.servo import Servo
-from dxlwire.modes import Mode
+from dxlwire import Mode
 
 PIECE_S = 1.0
 """s of a piece that are compared"""

@@ -14,7 +14,7 @@ from dxlrun.tooling.verbs import suggestion
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
 from dxlsim import SAMPLING_S, SLOPE_TICK, SLOPE_TIMES_P, Motor, motor_of
-from dxlwire.control_table import ControlTable, control_table
+from dxlwire import ControlTable, find_table
 
 
 class Servo(msgspec.Struct, frozen=True):
@@ -133,7 +133,7 @@ def servo_of(plan: Plan, joint: str) -> Servo:
     """Return what a plan knows of a joint's servo; raises LookupError for an unknown model."""
     bus, servo = plan.servos_by_joint[joint][0]
     registers = {register.name: register.value for register in servo.registers}
-    table = control_table(servo.model, bus.protocol)
+    table = find_table(servo.model, bus.protocol)
     return Servo(joint, table, servo.reference, servo.direction, registers)
 
 

@@ -34,6 +34,18 @@ class Place(IntEnum):
 SIZE = 8
 
 
+def create_file(name: str, content: bytes = b"") -> int:
+    """Return the descriptor of a nameless file (memfd) with `content`."""
+    descriptor = os.memfd_create(name)
+    os.pwrite(descriptor, content, 0)
+    return descriptor
+
+
+def read_file(descriptor: int) -> bytes:
+    """Return everything in a nameless file, wherever its offset is."""
+    return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
+
+
 class Buffer:
     """The memory of one block; a nameless file."""
 

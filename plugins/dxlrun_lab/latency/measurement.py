@@ -21,13 +21,11 @@ from pathlib import Path
 import msgspec
 
 from dxlrun import InputError, ProcessFault
-from dxlrun.channels.process import memory_file, start, whole
-from dxlrun.channels.shared_memory import load
-from dxlrun.control import realtime
-from dxlrun.control.realtime import Grant
+from dxlrun.tooling import realtime
+from dxlrun.tooling.realtime import Grant, load, start_module
 from dxlrun_analysis.latency.conditions import Condition, Settings, order
 from dxlrun_analysis.latency.statistics import Block
-from dxlrun_lab.latency.buffer import Buffer, Place
+from dxlrun_lab.latency.buffer import Buffer, Place, create_file, read_file
 from dxlrun_lab.latency.wake_ups import Job
 from dxlrun_lab.stress import Stress
 
@@ -86,7 +84,7 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
         if built.returncode:
             first = (built.stderr.strip().splitlines() or ["no reason given"])[0]
             raise InputError(f"the yardstick c was not compiled: {first}")
-        program = memory_file("yardstick", target.read_bytes())
+        program = create_file("yardstick", target.read_bytes())
     try:
         yield f"/proc/{os.getpid()}/fd/{program}"
     finally:
@@ -150,7 +148,7 @@ class _Process:
         self._condition = condition
         self._period_ns = settings.period_ns
         self._buffer = Buffer.create(iterations)
-        self._grants, self._errors = memory_file("grants"), memory_file("stderr")
+        self._grants, self._errors = create_file("grants"), create_file("stderr")
         job = Job(
             parent=os.getpid(),
             scheduler=settings.scheduler(condition, realtime.may_lock()),
@@ -160,7 +158,7 @@ class _Process:
             grants=self._grants,
             yardstick=yardstick if condition.in_c else "",
         )
-        self._process = start(
+        self._process = start_module(
             "dxlrun_lab.latency.wake_ups",
             [msgspec.json.encode(job).decode()],
             (self._buffer.descriptor, self._grants),
@@ -214,13 +212,13 @@ class _Process:
         except subprocess.TimeoutExpired:
             raise ProcessFault(f"the process that measures {self._condition.label} does not end") from None
         if code:
-            last = (whole(self._errors).decode(errors="replace").strip().splitlines() or [""])[-1]
+            last = (read_file(self._errors).decode(errors="replace").strip().splitlines() or [""])[-1]
             how = signal.Signals(-code).name if code < 0 else last or f"exit code {code}"
             raise ProcessFault(f"the process that measures {self._condition.label} ended ({how})")
 
     def grants(self) -> tuple[Grant, ...]:
         """Return what the operating system granted."""
-        return msgspec.json.decode(whole(self._grants), type=tuple[Grant, ...])
+        return msgspec.json.decode(read_file(self._grants), type=tuple[Grant, ...])
 
     def block(self, number: int) -> Block:
         """Return what it has measured until now."""

@@ -16,13 +16,10 @@ import time
 
 import msgspec
 
-from dxlrun.channels.shared_memory import store
-from dxlrun.control import realtime
-from dxlrun.control.realtime import Pacing
-from dxlrun.control.schedule import Schedule
+from dxlrun.tooling import realtime
 from dxlrun.tooling.plans import SchedulerPlan
+from dxlrun.tooling.realtime import Deadlines, store
 from dxlrun_lab.latency.buffer import Buffer, Place
-from dxlwire.clock import Clock, MonotonicClock
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -44,36 +41,27 @@ class Job(msgspec.Struct, frozen=True):
     """Path of the program in C; empty: wait as the loop does."""
 
 
-def measure(clock: Clock, schedule: Schedule, iterations: int, buffer: Buffer) -> None:
-    """Wait for so many deadlines, or until the front process asks for the end, and note both times of each.
-
-    Deadlines that passed before the wait for them began are left out, as in a run with `overrun: skip`.
-    """
+def measure(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
+    """Wait for so many deadlines, or until the front process asks for the end, and note both times."""
     words = buffer.words
     done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
     place = int(Place.WAKE_UPS)
-    schedule.start(clock.now_ns())
     for number in range(1, iterations + 1):
-        deadline_ns = schedule.due_ns
-        woken_ns = clock.wait_until(deadline_ns)
-        words[place] = deadline_ns
-        words[place + 1] = woken_ns
+        words[place], words[place + 1] = deadlines.wait()
         place += 2
         store(words, done, number)  # both times are seen before it
         if words[stop]:
             return
-        schedule.advance(schedule.following(clock.now_ns(), "skip"))
 
 
 def run(job: Job) -> None:
     """Prepare this process, measure, and leave the times it took in the buffer."""
     buffer = Buffer(job.buffer)
     grants = realtime.apply(job.scheduler)
-    clock = MonotonicClock()
+    deadlines = Deadlines(job.period_ns)
     if job.iterations and not job.yardstick:
-        pacing = Pacing(clock, job.scheduler.polling_ns)
-        grants = (*grants, pacing.measure(job.period_ns, lambda: None))
-        buffer.words[Place.MARGIN_NS] = clock.spin_ns
+        grants = (*grants, deadlines.measure_margin(job.scheduler.polling_ns))
+        buffer.words[Place.MARGIN_NS] = deadlines.margin_ns
     os.pwrite(job.grants, msgspec.json.encode(grants), 0)
     if job.yardstick:
         words = (job.buffer, job.iterations, job.period_ns, int(job.scheduler.lock_memory))
@@ -81,9 +69,8 @@ def run(job: Job) -> None:
     if not job.iterations:
         return
     buffer.touch()
-    schedule = Schedule(job.period_ns)
     begin_cpu_ns, begin_ns = time.process_time_ns(), time.monotonic_ns()
-    measure(clock, schedule, job.iterations, buffer)
+    measure(deadlines, job.iterations, buffer)
     buffer.words[Place.CPU_NS] = time.process_time_ns() - begin_cpu_ns
     buffer.words[Place.WALL_NS] = time.monotonic_ns() - begin_ns
 

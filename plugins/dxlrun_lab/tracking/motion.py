@@ -10,10 +10,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
 from dxlrun import Floats, InputError
-from dxlrun.compile.motions import LEAD_NS, TRAJECTORY, samples_of
-from dxlrun.compile.problems import Problems
-from dxlrun.compile.samples import Sample
-from dxlrun.tooling.plans import Plan
+from dxlrun.tooling.plans import Plan, ScheduledCommand
 from dxlrun.tooling.robots import read_motion
 from dxlrun_controllers.laws.spline import CUBIC, solve
 
@@ -50,32 +47,55 @@ class DesiredMotion(msgspec.Struct, frozen=True):
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
     """Return the motion of a file that the plan plays. Raises InputError where it is not one of one joint."""
-    motion = read_motion(path, plan.groups)
-    samples = samples_of(motion, 0, Problems())
-    joints = sorted({joint for sample in samples for joint in sample.targets})
-    parts = len(motion.motion.motions)
+    parts = len(read_motion(path, plan.groups).motion.motions)
+    commands = plan.loop.commands
+    joints = next(one.joints for one in plan.loop.controllers if one.name == commands[0].controller)
     if parts != 1 or len(joints) != 1:
         what = f"{parts} parts" if parts != 1 else f"one of {len(joints)} joints"
         raise InputError(
             f"the experiment compares how one joint follows one motion, and {path} has {what}; "
             "give a motion file with one part that moves one joint"
         )
-    if len(samples) < 2 or samples[0].targets[joints[0]].position is None:
+    points, lead_ns = _points(commands)
+    if len(points) < 2 or not points[0].positions:
         raise InputError(
             f"the experiment compares positions, and {path} has not two of them; give --play another motion"
         )
-    lead = plan.loop.commands[0].kind == TRAJECTORY
-    return _desired(joints[0], path, samples, lead=lead)
-
-
-def _desired(joint: str, path: Path, samples: Sequence[Sample], *, lead: bool) -> DesiredMotion:
-    targets = [sample.targets[joint] for sample in samples]
-    first_ns = samples[0].t_ns
-    times = np.array([sample.t_ns - first_ns for sample in samples]) * 1e-9
-    positions = np.array([target.position for target in targets], np.float64)
-    given = np.array([np.nan if target.velocity is None else target.velocity for target in targets])
+    times = np.array([point.time_ns - points[0].time_ns for point in points]) * 1e-9
+    positions = np.array([point.positions[0] for point in points], np.float64)
+    given = np.array([point.velocities[0] if point.velocities else np.nan for point in points])
     # where the file gives no velocity, the slope between the neighbours
     velocities = np.where(np.isfinite(given), given, np.gradient(positions, times))
-    lead_ns = (LEAD_NS if first_ns == 0 else first_ns) if lead else 0
     at, position, velocity = (tuple(one.tolist()) for one in (times, positions, velocities))
-    return DesiredMotion(joint, str(path), at, position, velocity, lead_ns)
+    return DesiredMotion(joints[0], str(path), at, position, velocity, lead_ns)
+
+
+class _Point(msgspec.Struct):
+    """Targets of the joints at a moment, as commands of controllers have them."""
+
+    time: float = 0.0
+    """s"""
+    positions: tuple[float, ...] = ()
+    velocities: tuple[float, ...] = ()
+
+    @property
+    def time_ns(self) -> int:
+        """The moment, ns."""
+        return round(self.time * 1e9)
+
+
+class _Trajectory(msgspec.Struct):
+    points: tuple[_Point, ...] = ()
+    start_in: float = 0.0
+    """s"""
+
+
+def _points(commands: Sequence[ScheduledCommand]) -> tuple[Sequence[_Point], int]:
+    """Return the points of a motion, and the time from its first command to the first of them, ns."""
+    trajectory = msgspec.json.decode(commands[0].request, type=_Trajectory)
+    if trajectory.points:
+        return trajectory.points, round(trajectory.start_in * 1e9) + trajectory.points[0].time_ns
+    points = [msgspec.json.decode(command.request, type=_Point) for command in commands]
+    for point, command in zip(points, commands, strict=True):
+        point.time = command.at_ns * 1e-9
+    return points, 0

@@ -12,8 +12,8 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun import InputError
-from dxlrun.control.realtime import allow, guardian_priority, highest_priority
 from dxlrun.tooling.plans import Plan, ScheduleName
+from dxlrun.tooling.realtime import missing_priority
 from dxlrun.tooling.verbs import suggestion
 
 
@@ -59,13 +59,13 @@ def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
 
 def require_right(setups: Sequence[Setup], plan: Plan) -> None:
     """Raise InputError where a set-up needs a priority that this user may not have."""
-    priorities = (guardian_priority(one.plan(plan).loop.scheduler) for one in setups if one.real_time)
-    needed = max(priorities, default=0)
-    if highest_priority() >= needed:
+    real_time = [one for one in setups if one.real_time]
+    missing = [line for one in real_time if (line := missing_priority(one.plan(plan).loop.scheduler))]
+    if not missing:
         return
-    refused = " and ".join(one.name for one in setups if one.real_time)
+    refused = " and ".join(one.name for one in real_time)
     normal = ",".join(one.name for one in SETUPS if not one.real_time)
     raise InputError(
         f"{refused} would run with real-time priority, which this user may not take: allow it with "
-        f"`{allow('rtprio', needed)}` and log in again, or measure the others with --setups {normal}"
+        f"`{missing[0]}` and log in again, or measure the others with --setups {normal}"
     )

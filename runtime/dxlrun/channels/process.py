@@ -37,7 +37,7 @@ def spare_core(taken: Collection[int]) -> int:
     return max(allowed.difference(taken) or allowed)
 
 
-def start(
+def start_module(
     module: str, arguments: Sequence[str], descriptors: Iterable[int], errors: int
 ) -> subprocess.Popen[bytes]:
     """Execute `python -m module` in a session of its own, so that a terminal's Ctrl-C does not reach it.
@@ -72,7 +72,7 @@ def whole(descriptor: int) -> bytes:
 class Printed(io.TextIOBase):
     """Takes what plug-ins print, unbuffered and bounded: a controller that prints each cycle fills no memory.
 
-    `descriptor` is the nameless file that `start` made the process' output; --debug shows it.
+    `descriptor` is the nameless file that `start_module` made the process' output; --debug shows it.
     """
 
     def __init__(self, descriptor: int, most: int = 1 << 20) -> None:
@@ -300,7 +300,7 @@ class Child(Generic[Received]):
         self.name = name
         self.channel, theirs = message_channel(received)
         control = ["--control-fd", str(theirs.fileno())]
-        self.process: subprocess.Popen[bytes] = start(
+        self.process: subprocess.Popen[bytes] = start_module(
             module, [*arguments, *control], [*descriptors, theirs.fileno()], stderr
         )
         theirs.close()

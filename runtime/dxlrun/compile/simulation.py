@@ -201,7 +201,10 @@ def simulation_of(plan: Plan) -> SimulationConfig:
         from dxlsim.motion.mechanics import plant_of  # not above: no check needs it
 
         bodies = sensed.bodies
-        plant_of(bodies, sensed.couplings)
+        try:
+            plant_of(bodies, sensed.couplings)
+        except ImportError as error:  # MuJoCo may be installed and yet not load
+            raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
     return SimulationConfig(
         tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED),
         bodies=bodies,

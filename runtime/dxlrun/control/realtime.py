@@ -418,6 +418,12 @@ def highest_priority() -> int:
     return 0 if limit is None else _finite(resource.getrlimit(limit)[0], 99)
 
 
+def missing_priority(plan: SchedulerPlan) -> str:
+    """Return the command that lets this user take the priorities of a plan; empty where they may already."""
+    needed = guardian_priority(plan)
+    return "" if highest_priority() >= needed else allow("rtprio", needed)
+
+
 def lowest_nice() -> int:
     """Return the lowest nice value that this process may take by its limit (RLIMIT_NICE, getrlimit(2)).
 

@@ -278,7 +278,7 @@ class Guardian:
             os.getpid(),
             given.epoch_offset_ns,
         )
-        return process.start(
+        return process.start_module(
             "dxlrun.run.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
             [*job.memory.of_loop, *descriptors, channel],

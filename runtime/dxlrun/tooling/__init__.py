@@ -15,6 +15,7 @@ each module is a page of names, and each name is imported when it is first used.
 | `features` | sections that a package adds to the robot file |
 | `runs` | running a robot: in processes, on virtual time |
 | `servos` | single servos on a line that no run uses |
+| `realtime` | processes that wait for deadlines as the loop does |
 | `live` | robots that run: addresses, keys, messages as they come |
 | `logs` | logs: finding, reading, following |
 | `records` | the contents of a log: cycles, packets, events, commands |

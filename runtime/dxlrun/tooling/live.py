@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.channels.answers import Code as Code
+    from dxlrun.errors import RunGone as RunGone
     from dxlrun.remote.client import Executed as Executed
     from dxlrun.remote.live.live_messages import LiveMessages as LiveMessages
     from dxlrun.remote.live.states import RobotStates as RobotStates
@@ -36,5 +38,6 @@ if TYPE_CHECKING:
     from dxlrun.remote.server import serve_clients as serve_clients
     from dxlrun.remote.sockets import Address as Address
     from dxlrun.remote.sockets import SocketLink as SocketLink
+    from dxlrun.remote.sockets import sockets as sockets
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

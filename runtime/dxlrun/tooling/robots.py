@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from dxlrun.description.document import read_file as read_file
     from dxlrun.description.including import Source as Source
     from dxlrun.description.including import read_sources as read_sources
+    from dxlrun.description.joints.motor_file import motor_text as motor_text
     from dxlrun.description.motion import parse_motion as parse_motion
     from dxlrun.description.motion import read_motion as read_motion
     from dxlrun.description.reading import Description as Description

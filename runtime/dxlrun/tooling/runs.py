@@ -27,5 +27,6 @@ if TYPE_CHECKING:
     from dxlrun.run.run_summary import RunOptions as RunOptions
     from dxlrun.run.supervisor import run_robot as run_robot
     from dxlrun.run.virtual_run import VirtualRobot as VirtualRobot
+    from dxlrun.testing.virtual_link import VirtualLink as VirtualLink
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from dxlrun.cli.inputs import write_report as write_report
     from dxlrun.cli.steering.goals import cancel_goals as cancel_goals
     from dxlrun.cli.steering.steer import connect_robot as connect_robot
+    from dxlrun.description.units import angle as angle
     from dxlrun.description.units import angular_velocity as angular_velocity
+    from dxlrun.description.units import duration as duration
     from dxlrun.errors import missing_extra as missing_extra
     from dxlrun.errors import suggestion as suggestion
 else:

@@ -198,7 +198,7 @@ def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: P
 def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
     swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, cycle: int
 ) -> None:
-    usual = virtual_rig.RobotOnVirtualTime
+    usual = virtual_rig.VirtualLink
 
     def losing(plan: Plan, **more: Any) -> object:
         def lose(number: int) -> None:
@@ -208,7 +208,7 @@ def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
         robot = usual(plan, **{**more, "each_cycle": lose})
         return robot
 
-    monkeypatch.setattr(virtual_rig, "RobotOnVirtualTime", losing)
+    monkeypatch.setattr(virtual_rig, "VirtualLink", losing)
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", "2")
     assert done.code == 1
     result = result_of(done.out)

@@ -13,10 +13,11 @@ import pytest
 
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import DxlrunError, Refused
+from dxlrun.tooling.live import RunGone
 from dxlrun_lab.guided import experiment
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Joint, perform
-from dxlrun_lab.guided.rig import RunGone, RunningController
+from dxlrun_lab.guided.rig import RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript

@@ -107,7 +107,7 @@ def pretend(monkeypatch):
             return next(left)
 
         monkeypatch.setattr(experiment, "run_robot", run_robot)
-        monkeypatch.setattr(setups, "highest_priority", lambda: 99)
+        monkeypatch.setattr(setups, "missing_priority", lambda scheduler: "")
         return plans
 
     return pretend
@@ -228,7 +228,7 @@ def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
 
 
 def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, runs, monkeypatch):
-    monkeypatch.setattr(setups, "highest_priority", lambda: 0)
+    monkeypatch.setattr(realtime, "highest_priority", lambda: 0)
     said = run_short(dxlrun, runs)
     assert (said.code, said.out) == (2, "")
     assert said.err.startswith(
@@ -240,5 +240,5 @@ def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, 
 
 def test_without_that_right_the_normal_setups_are_measured(dxlrun, runs, pretend, monkeypatch):
     pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
-    monkeypatch.setattr(setups, "highest_priority", lambda: 0)
+    monkeypatch.setattr(realtime, "highest_priority", lambda: 0)
     assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0

@@ -1,5 +1,7 @@
 """A robot on virtual time in three lines: for authors of plug-ins, and for dxlrun's own tests.
 
+What only dxlrun's own tests need belongs in `tests/kit`.
+
 from dxlrun.testing import simulated_robot
 
 robot = simulated_robot("robots/bioloid_torso.yaml", duration_s=2.0)

@@ -1,0 +1,46 @@
+"""Deadlines: the waits of the loop, for programs that measure this machine."""
+
+from __future__ import annotations
+
+from dxlrun.control.realtime import Grant, Pacing
+from dxlrun.control.schedule import Schedule
+from dxlwire.clock import Clock, MonotonicClock
+
+
+class Deadlines:
+    """One deadline each period, waited for with the clock and the schedule of the loop.
+
+    Deadlines that passed before the wait for them began are left out, as in a run with `overrun: skip`.
+    The first is one period after the first call of `wait`.
+    """
+
+    def __init__(self, period_ns: int, clock: Clock | None = None) -> None:
+        """`clock`: waits instead of the machine's clock, for tests."""
+        self._machine = MonotonicClock()
+        self._clock = clock or self._machine
+        self._schedule = Schedule(period_ns)
+        self._started = False
+
+    def measure_margin(self, most_ns: int | None) -> Grant:
+        """Measure for how long the clock is polled before a deadline, and poll for that time from now on.
+
+        Args:
+            most_ns: Longest time, as `SchedulerPlan.polling_ns`; None: a share of the period.
+        """
+        return Pacing(self._machine, most_ns).measure(self._schedule.period_ns, lambda: None)
+
+    @property
+    def margin_ns(self) -> int:
+        """How long before a deadline the clock is polled."""
+        return self._machine.spin_ns
+
+    def wait(self) -> tuple[int, int]:
+        """Wait for the next deadline; return it and the time after the wake-up, ns."""
+        schedule, clock = self._schedule, self._clock
+        if self._started:
+            schedule.advance(schedule.following(clock.now_ns(), "skip"))
+        else:
+            schedule.start(clock.now_ns())
+            self._started = True
+        deadline_ns = schedule.due_ns
+        return deadline_ns, clock.wait_until(deadline_ns)

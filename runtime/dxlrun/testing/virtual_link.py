@@ -1,0 +1,233 @@
+"""A robot on virtual time that answers the client of a running one."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import selectors
+import socket
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from starlette.types import Message
+
+from dxlrun.channels import heartbeat, mailbox, ring
+from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
+from dxlrun.channels.events import LONGEST_EVENT, Event
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.mailbox import Mailbox
+from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicMessage
+from dxlrun.channels.ring import Payload, RecordKind, RingWriter
+from dxlrun.channels.tagged import decode
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.errors import RunGone
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.remote.gateway import GatewayApp
+from dxlrun.remote.job import Descriptors
+from dxlrun.remote.link import Link
+from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.requests.table import Role
+from dxlrun.run.virtual_run import VirtualRobot
+
+_EVENTS_CAPACITY = 1 << 20
+"""Bytes; the gateway looks after each cycle."""
+
+
+class VirtualLink:
+    """Link to a robot whose loop runs in a thread, in turns with its client: one of both waits.
+
+    `RemoteRobot(plan.robot, VirtualLink(plan))` is a client like any other. The gateway of a run answers, in
+    the client's turn: where it would wait, the robot runs a cycle. So two runs do exactly the same.
+
+    Args:
+        plan: Plan whose buses are simulated.
+        log: Path of the log; None: there is none.
+        client: Name of the client for the log.
+        each_cycle: Gets the number of each cycle, in the robot's turn, so that tests can inject faults.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        *,
+        log: Path | None = None,
+        client: str = "client",
+        each_cycle: Callable[[int], None] = lambda cycle: None,
+    ) -> None:
+        self.name = plan.robot
+        self.each_cycle = each_cycle
+        self._client = client.encode()
+        self._cycles: list[bytes] = []
+        self._events: list[Event] = []
+        loop = plan.loop
+        size = loop.layout.size
+        memory = Descriptors(
+            heartbeat=heartbeat.create(),
+            cycles=ring.create("cycles", cycle_capacity(loop.period_ns, size), size),
+            events=ring.create("events", _EVENTS_CAPACITY, LONGEST_EVENT),
+            guardian=ring.create("guardian", _EVENTS_CAPACITY, LONGEST_EVENT),
+            mailbox=mailbox.create(MOST_CONTROLLERS),
+            answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
+            messages=ring.create("messages", LEAST_CAPACITY, LONGEST_RECORD),
+        )
+        self._heartbeat = Heartbeat(memory.heartbeat)
+        messages = RingWriter(memory.messages)
+        self._cycle_ring = RingWriter(memory.cycles)
+        self._rings = {Event: RingWriter(memory.events), OpenedTopic: messages, TopicMessage: messages}
+        self.simulated = VirtualRobot(plan, log=log, watch=self._watch)
+        self.simulated.robot.loop.steering.inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
+        self.gateways_link = Link(plan, memory)
+        for descriptor in astuple(memory):
+            os.close(descriptor)
+        joints = {joint.name: joint for joint in loop.joints}
+        preparation = Preparation(
+            joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups
+        )
+        log_path = str(log) if log else None
+        seconds = itertools.count()  # one a request: a client may make as many as it likes
+        self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()
+        self._waiting = _VirtualTime(lambda: self.now_s, self.turn)
+        self._closing = False
+        self._robots_turn, self._our_turn = threading.Semaphore(0), threading.Semaphore(0)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._our_turn.acquire()
+        if self._error is not None:
+            raise self._error
+        self._heartbeat.enter(Phase.RUNNING)
+
+    # The robot's turn
+
+    def _run(self) -> None:
+        try:
+            self.simulated.run()
+        except BaseException as error:  # it is raised in the client's turn
+            self._error = error
+        finally:
+            self._our_turn.release()
+
+    def _watch(self, kind: RecordKind, payload: Payload) -> None:
+        if kind is RecordKind.TAGGED:
+            found = decode(payload)
+            if type(found) in self._rings:
+                self._rings[type(found)].append(kind, payload)
+            if isinstance(found, Event):
+                self._events.append(found)
+        elif kind is RecordKind.CYCLE:
+            self._cycle_ring.append(kind, payload)
+            cycle = self.simulated.record.cycle
+            if cycle < 0:  # the record before the first cycle
+                return
+            self._cycles.append(bytes(payload))
+            self._heartbeat.cycle(self.simulated.cycles + 1, self.simulated.skipped)
+            self.each_cycle(cycle)
+            if not self._closing:
+                self._our_turn.release()
+                self._robots_turn.acquire()
+
+    # The client's turn
+
+    @property
+    def now_s(self) -> float:
+        """Virtual time, s."""
+        return self.simulated.clock.now_ns() * 1e-9
+
+    def turn(self) -> None:
+        """Let the robot run a cycle, and the gateway read what that left. Raises RunGone after its end."""
+        if not self._thread.is_alive():
+            result = self.simulated.result
+            detail = str(self._error or (result.detail if result else ""))
+            raise RunGone(f"the run of {self.name} ended{f': {detail}' if detail else ''}")
+        self._robots_turn.release()
+        self._our_turn.acquire()
+        if self._error is not None or self.simulated.result is not None:
+            self._thread.join()
+        self.gateways_link.collect()
+
+    def new(self) -> tuple[NDArray[np.void], Sequence[Event]]:
+        """Return the cycles and events since the last call."""
+        cycles = np.frombuffer(b"".join(self._cycles), self.simulated.record.layout.dtype)
+        events, self._cycles, self._events = self._events, [], []
+        return cycles, events
+
+    # What a client asks
+
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Let the gateway answer a request; raises RunGone where that takes a cycle of a run that ended."""
+        self.gateways_link.collect()
+        return self._waiting.run_until_complete(self._answer(method, path, body or b""))
+
+    async def _answer(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
+        path, _, query = path.partition("?")
+        scope = {
+            "type": "http",
+            "method": method,
+            "path": path,
+            "query_string": query.encode(),
+            "headers": [(b"x-dxlrun-client", self._client)],
+            "client": ("process of the client", Role.ADMIN),
+        }
+        answer: list[Message] = []
+
+        async def receive() -> Message:
+            return {"type": "http.request", "body": body}
+
+        async def send(message: Message) -> None:
+            answer.append(message)
+
+        await self._gateway(scope, receive, send)
+        return answer[0]["status"], b"".join(message["body"] for message in answer[1:])
+
+    def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
+        """There are none: messages would come only while a request waits. Raises OSError."""
+        raise OSError("a run on virtual time has no streams; its log has every message")
+
+    @property
+    def alive(self) -> bool:
+        """True while it runs."""
+        return self._thread.is_alive()
+
+    def ends(self) -> bool:
+        """Return whether it has ended."""
+        return not self.alive
+
+    def close(self) -> None:
+        """End the run."""
+        if self._thread.is_alive():
+            self.simulated.stop.request()
+            self._closing = True
+            self._robots_turn.release()
+            self._thread.join()
+        self._waiting.close()
+
+
+class _VirtualTime(asyncio.SelectorEventLoop):
+    """Event loop on virtual time: where it would wait, `turn` lets that pass."""
+
+    def __init__(self, now_s: Callable[[], float], turn: Callable[[], None]) -> None:
+        self._now_s = now_s
+        super().__init__(_Turns(turn))
+
+    def time(self) -> float:
+        """Return virtual time, s."""
+        return self._now_s()
+
+
+class _Turns(selectors.SelectSelector):
+    """Selector that never waits."""
+
+    def __init__(self, turn: Callable[[], None]) -> None:
+        super().__init__()
+        self._turn = turn
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Return what is ready; where nothing could be yet, after a turn."""
+        if timeout is None or timeout > 0:
+            self._turn()
+        return super().select(0)

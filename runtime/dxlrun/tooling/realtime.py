@@ -1,0 +1,29 @@
+"""Real time: what the operating system grants a process, and deadlines as the loop of a run waits for them.
+
+How late this machine wakes a process, which `apply` would prepare as the process of a loop:
+
+    from dxlrun.tooling.realtime import Deadlines
+
+    deadline_ns, woken_ns = Deadlines(period_ns=1_000_000).wait()
+    print(woken_ns - deadline_ns, "ns late")
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlwire.faces import lazy_face
+
+if TYPE_CHECKING:
+    from dxlrun.channels.process import start_module as start_module
+    from dxlrun.channels.shared_memory import load as load
+    from dxlrun.channels.shared_memory import store as store
+    from dxlrun.control.deadlines import Deadlines as Deadlines
+    from dxlrun.control.realtime import Grant as Grant
+    from dxlrun.control.realtime import apply as apply
+    from dxlrun.control.realtime import keep_awake as keep_awake
+    from dxlrun.control.realtime import lock_memory as lock_memory
+    from dxlrun.control.realtime import may_lock as may_lock
+    from dxlrun.control.realtime import missing_priority as missing_priority
+else:
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
