@@ -11,8 +11,9 @@ from tests.kit.loops import GateRig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.control import gate
-from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.compiled import load_compiled
+from dxlwire.errors import NotCompiled
 from dxlwire.joint_unit import LINEAR, ROTARY
 from dxlwire.modes import Mode
 
@@ -85,8 +86,8 @@ def test_goals_and_what_was_done_are_those_of_the_law(seed, count, cycles):
 
 def test_a_gate_of_another_source_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "gate.c").write_text("int changed;")
-    with pytest.raises(StartUpError, match=r"^the compiled gate is missing: install dxlrun again"):
-        gate.compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)
+    with pytest.raises(NotCompiled, match=r"^the compiled gate is missing: install dxlrun again"):
+        load_compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)
     (tmp_path / "libgate.so").write_bytes(gate.SOURCE.with_name("libgate.so").read_bytes())
-    with pytest.raises(StartUpError, match=r"^the compiled gate is of another source than gate\.c"):
-        gate.compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)
+    with pytest.raises(NotCompiled, match=r"^the compiled gate is of another source than gate\.c"):
+        load_compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.contract.hardware import Hardware
-from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.gate import Gate
 from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
+
+if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
+    from dxlrun.control.controllers.manager import Manager
+    from dxlrun.control.gate import Gate
 
 
 @dataclass(slots=True)
