@@ -2,8 +2,8 @@
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
 `Section` in `form.py`, `CompileStage` in `compile.py`, `LayerStage` in `layer.py`, `BusStage` in
-`runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. All but the first may be missing. The hook
-`dxlrun_features` registers it:
+`runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. All but the first may be missing. Forms
+are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature
@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.compile.report import Row as Row
     from dxlrun.compile.report import TableStage as TableStage
-    from dxlrun.description.form import Form as Form
-    from dxlrun.description.form import Name as Name
-    from dxlrun.description.form import key as key
-    from dxlrun.description.form import refuse as refuse
     from dxlrun.dynamixel.bus_part import BusContext as BusContext
     from dxlrun.dynamixel.bus_part import BusPart as BusPart
     from dxlrun.dynamixel.bus_part import BusStage as BusStage

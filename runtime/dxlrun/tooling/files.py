@@ -1,4 +1,4 @@
-"""Files: YAML files of a package's own, checked as robot files are.
+"""Files: forms of YAML files of a package's own and of its section of the robot file.
 
 A model says which keys there are. Everything that is wrong with a file is reported at once, with its place.
 
@@ -22,6 +22,7 @@ from dxlwire.faces import lazy_face
 if TYPE_CHECKING:
     from dxlrun.description.document import KeyPath as KeyPath
     from dxlrun.description.form import Form as Form
+    from dxlrun.description.form import Name as Name
     from dxlrun.description.form import key as key
     from dxlrun.description.form import refuse as refuse
     from dxlrun.description.yaml_file import read_yaml as read_yaml

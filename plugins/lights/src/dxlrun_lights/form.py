@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dxlrun.tooling.features import Form, Name, Section, key
+from dxlrun.tooling.features import Section
+from dxlrun.tooling.files import Form, Name, key
 
 
 class Light(Form):
