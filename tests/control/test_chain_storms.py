@@ -229,7 +229,7 @@ def storm(seed: int) -> Judge:
     judge = Judge(robot, nodes)
     robot.hardware.mode_cycles = lambda: dice.choice((0, 0, 2, 5))
 
-    def idle(deadline_ns):
+    def idle(deadline_ns, time_ns):
         cycle = len(robot.sink.cycles)
         if robot.manager.switching.groups:
             judge.waiting.add(cycle)

@@ -73,7 +73,7 @@ def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
         grid.period_ns = robot.loop.schedule.period_ns
         assert record.active == 0b111
 
-    def before(deadline_ns):
+    def before(deadline_ns, time_ns):
         dice = chance.random()
         if dice < 0.002:
             robot.ask("rate", rate=chance.choice(RATES))
@@ -130,7 +130,7 @@ def test_memory_is_flat_and_nothing_is_collected(made):
     cycles, marks = max(CYCLES, 12_000), []
     robot.build().keep_nothing()
 
-    def idle_time(deadline_ns):
+    def idle_time(deadline_ns, time_ns):
         cycle = robot.record.cycle + 1
         before(cycle)
         if cycle in (1000, cycles - 1):

@@ -70,10 +70,11 @@ def test_an_end_between_two_deadlines_runs_the_cycles_before_it(robot):
 def test_the_bus_gets_the_gap_before_each_deadline(robot):
     robot.build(end_ns=3 * PERIOD_NS)
     gaps = []
-    robot.hardware.idle = lambda until_ns: gaps.append((robot.clock.now_ns(), until_ns))
+    robot.hardware.idle = lambda until_ns, time_ns: gaps.append((robot.clock.now_ns(), until_ns, time_ns))
     robot.loop.run()
-    assert [until for _, until in gaps] == robot.column("scheduled_ns")
-    assert all(now < until for now, until in gaps)
+    assert [until for _, until, _ in gaps] == robot.column("scheduled_ns")
+    assert [time for _, _, time in gaps] == [cycle * PERIOD_NS for cycle in range(3)]
+    assert all(now < until for now, until, _ in gaps)
 
 
 def test_a_stop_ends_after_a_whole_cycle(robot):

@@ -133,7 +133,7 @@ def test_less_torque_lasts_its_time_at_each_of_its_steps(robot):
 def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot):
     robot.build(policies=PolicyPlan(on_exit=POSE))
     robot.ask("pause")
-    robot.hardware.idle = lambda _: robot.stop.request() if len(robot.sink.cycles) == 3 else None
+    robot.hardware.idle = lambda *_: robot.stop.request() if len(robot.sink.cycles) == 3 else None
     robot.loop.run()
     assert robot.patience == [PAUSED_CYCLE_NS, PERIOD_NS]
 
@@ -142,9 +142,9 @@ def test_of_two_policies_that_end_a_run_the_first_one_counts(robot):
     plan = PolicyPlan(on_lost_servo=Policy(POSE.steps, "hold"), on_stale_command=LIMP)
     robot.build(policies=plan)
 
-    def both(_):
-        robot.loop._give_up("on_lost_servo", "j0 is lost")
-        robot.loop._give_up("on_stale_command", "the stream ended")
+    def both(*_):
+        robot.loop._actions.end_run("on_lost_servo", "j0 is lost")
+        robot.loop._actions.end_run("on_stale_command", "the stream ended")
 
     robot.hardware.idle = both
     result = robot.loop.run()

@@ -99,7 +99,7 @@ class Run:
     def run(self, sequence):
         robot, steps = self.robot, self.steps(sequence)
 
-        def idle(deadline_ns):
+        def idle(deadline_ns, time_ns):
             self.updated.clear()
             self.broken = False
             kind, data = next(steps, ("end", {}))

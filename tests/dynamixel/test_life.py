@@ -277,7 +277,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     rig.restless = 0.02
     story.servo.silence(False)
     rig.cycle(idle=False)
-    rig.hardware._servos[0].look()  # the read is due, and waits for idle time
+    rig.hardware._servos[0].look(0)  # the read is due, and waits for idle time
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     rig.cycles(20)

@@ -166,7 +166,7 @@ class Hardware:
         goals = self.record.goals
         self.written.append((goals.position.copy(), goals.velocity.copy()))
 
-    def idle(self, until_ns: int) -> None:
+    def idle(self, until_ns: int, time_ns: int) -> None:
         pass
 
     def follow_goals(self, rows: Sequence[int]) -> None:
@@ -346,7 +346,7 @@ class Robot:
             self.build(**plan)
         place = 0
 
-        def before(_: int) -> None:
+        def before(*_: int) -> None:
             nonlocal place
             acts = at.get(place, ())
             for act in acts if isinstance(acts, list | tuple) else [acts]:

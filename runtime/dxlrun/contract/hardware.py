@@ -76,8 +76,11 @@ class Hardware(Protocol):
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; the next start-up takes it back."""
 
-    def idle(self, until_ns: int) -> None:
-        """Use the idle time before the next cycle; return before `until_ns` by a margin."""
+    def idle(self, until_ns: int, time_ns: int) -> None:
+        """Use the idle time before the next cycle; return before `until_ns` by a margin.
+
+        `time_ns`: the controllers' time of that cycle.
+        """
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""

@@ -229,7 +229,7 @@ class Loop:
         """Wait for the deadline, then read, take commands, update, gate and write."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
         cycle, deadline_ns = schedule.cycle, schedule.due_ns
-        self.hardware.idle(deadline_ns)
+        self.hardware.idle(deadline_ns, schedule.grid_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
         time_ns = schedule.begin(woken_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)

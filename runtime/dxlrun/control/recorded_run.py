@@ -137,7 +137,7 @@ class RecordedHardware:
         np.copyto(sources.valid[:count], row["source_valid"][:count])
         np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
 
-    def idle(self, until_ns: int) -> None:
+    def idle(self, until_ns: int, time_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
         if self.index == self._inputs.end:
             raise PortError("the log ends")

@@ -23,7 +23,11 @@ if TYPE_CHECKING:  # the guardian makes the robot safe without numpy
 
 @dataclass(frozen=True, slots=True)
 class BusContext:
-    """One bus, as the part of a feature sees it."""
+    """One bus, as the part of a feature sees it.
+
+    Writes and reads of a part are programs: generators that yield transactions of `plan_line(idle.plan)` and
+    get a `Reply` for each. `idle` executes them between two cycles, by their `Urgency`.
+    """
 
     idle: IdleScheduler
     """Programs for the time between two cycles; it has the plan of the bus, too."""
@@ -36,8 +40,9 @@ class BusContext:
     command_names: Sequence[str]
     """Names of these commands, such as `light/led`."""
     plan: bytes
-    """`Contribution.plan` of the feature."""
+    """`Contribution.plan` of the feature; empty if it has none."""
     events: EventSink
+    """Events for the log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,14 +76,37 @@ class BusPart(Protocol):
     def judge_replies(self, now_ns: int) -> None:
         """Report what changed with the replies of this cycle.
 
-        Called in the cycles in which the parser read, which has every unexpected reply.
+        Called only in cycles that the parser read: the exchange kernel reads the others, in which every reply
+        came as planned. What is due by time belongs in `schedule_idle_work`.
+
+        Args:
+            now_ns: Time of the run's clock, that of `Reply.last_ns`.
         """
 
     def recover_line(self) -> None:
-        """Assume that whatever is on the bus was without power: its line was gone and is open again."""
+        """Assume that whatever is on the bus was without power: its line was gone and is open again.
 
-    def schedule_idle_work(self) -> None:
-        """Add programs to the idle time after this cycle."""
+        Its servos answer later, each with a call of `recover_servo`.
+        """
+
+    def recover_servo(self, servo: int) -> None:
+        """Assume that a servo has forgotten its registers: it was lost or rebooted, and is in order again.
+
+        Also called when a client gave the servo torque, because a limp servo may have rebooted unnoticed.
+
+        Args:
+            servo: Index in the plan's servos.
+        """
+
+    def schedule_idle_work(self, time_ns: int) -> None:
+        """Add programs to the idle time before the coming cycle; called once a cycle.
+
+        A program that is added in each cycle fills the bus: add one when it has something to do and the one
+        before has ended.
+
+        Args:
+            time_ns: Controllers' time of the coming cycle, from 0. It stands still while the run is paused.
+        """
 
 
 def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
@@ -102,20 +130,31 @@ class BusStage:
 class SafeStage:
     """`STAGE` of `safe.py`: what a feature leaves safe at the end of a run.
 
-    Called in the loop's process, or in the guardian after the loop died, so it imports no numpy.
+    Called at every end of a run, after torque off, or after the joints were stopped where torque stays on.
+    The loop's process does that, or the guardian after the loop died, so the file imports no numpy and uses
+    nothing that `runtime.py` has found.
     """
 
     FILE: ClassVar[str] = "safe"
 
-    make_safe: Callable[[Lines], tuple[str, ...]]
-    """Returns a sentence for each failure, and raises nothing."""
+    make_safe: Callable[[Lines, bytes], tuple[str, ...]]
+    """Gets the lines and `Contribution.plan` of the feature. Returns a sentence for each failure: they
+    become warnings in the log. Raises nothing. `lines.run` executes one program for each of `lines.plans`."""
 
 
-def safe_stages(features: Iterable[Feature]) -> tuple[SafeStage, ...]:
-    """Import what `make_safe` needs: when that is called, an import may not be possible any more."""
-    return tuple(stage for _, stage in stages(SafeStage, features))
+@dataclass(frozen=True, slots=True)
+class SafeEnd:
+    """The stages that make a robot safe, each with the plan of its feature."""
 
+    stages: tuple[tuple[SafeStage, bytes], ...]
 
-def make_safe(lines: Lines, features: Iterable[SafeStage]) -> tuple[str, ...]:
-    """Leave everything on the lines safe that is not a servo; return a sentence for each failure."""
-    return tuple(problem for stage in features for problem in stage.make_safe(lines))
+    @classmethod
+    def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
+        """Import what `make_safe` needs: when that is called, an import may not be possible any more."""
+        return cls(
+            tuple((stage, plans.get(feature.name, b"")) for feature, stage in stages(SafeStage, features))
+        )
+
+    def make_safe(self, lines: Lines) -> tuple[str, ...]:
+        """Leave safe what features have on the lines; return a sentence for each failure."""
+        return tuple(problem for stage, plan in self.stages for problem in stage.make_safe(lines, plan))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.dynamixel.bus_part import FeatureParts, make_safe, safe_stages
+from dxlrun.dynamixel.bus_part import FeatureParts, SafeEnd
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -101,7 +101,7 @@ class DynamixelHardware:
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
         self._samples = Samples(self._plans, states, sources or SourceStates.empty(), reports)
         parts = parts or FeatureParts(FEATURES, (), np.empty(0), {})
-        self._safe_stages = safe_stages(parts.features)
+        self._safe_end = SafeEnd.of(parts.features, parts.plans)
         self._servos = tuple(
             Servos(idle, states, arrays, parts, events)
             for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
@@ -332,7 +332,7 @@ class DynamixelHardware:
                 with suppress(PortError):  # as with goals: the next read names the bus
                     bus.send(packet)
 
-    def idle(self, until_ns: int) -> None:
+    def idle(self, until_ns: int, time_ns: int = 0) -> None:
         """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so."""
         if not self._look:
             now_ns = self._now_ns()
@@ -355,7 +355,7 @@ class DynamixelHardware:
                 work.abandon()
                 servos.abandon()
             else:
-                servos.look()
+                servos.look(time_ns)
                 if work.tasks and work.begin(latest):
                     bus.load(work)
                     working.append(bus)
@@ -396,7 +396,7 @@ class DynamixelHardware:
         self._make_rest_safe()
 
     def _make_rest_safe(self) -> None:
-        for problem in make_safe(self._lines, self._safe_stages):
+        for problem in self._safe_end.make_safe(self._lines):
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:

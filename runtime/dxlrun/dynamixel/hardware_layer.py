@@ -76,9 +76,9 @@ class HardwareLayer:
         """Let no servo exert more than a fraction of its own limit."""
         self._hardware.limit_torque(fraction)
 
-    def idle(self, until_ns: int) -> None:
+    def idle(self, until_ns: int, time_ns: int) -> None:
         """Use the idle time of the buses."""
-        self._hardware.idle(until_ns)
+        self._hardware.idle(until_ns, time_ns)
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo."""

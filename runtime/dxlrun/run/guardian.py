@@ -15,8 +15,8 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -32,7 +32,7 @@ from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime
 from dxlrun.description.bus import SIMULATED
-from dxlrun.dynamixel.bus_part import make_safe, safe_stages
+from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.features import FEATURES
@@ -80,6 +80,8 @@ class GuardianJob:
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this."""
     features: tuple[Feature, ...] = FEATURES
+    feature_plans: Mapping[str, bytes] = field(default_factory=dict)
+    """`Contribution.plan` by feature."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +160,7 @@ class SafeStop:
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
-        self._safe_stages = safe_stages(job.features)
+        self._safe_end = SafeEnd.of(job.features, job.feature_plans)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
@@ -174,14 +176,14 @@ class SafeStop:
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
         """Stop the joints that would go on moving with their torque on; return a sentence for each."""
         lines, packets = self._take_over(descriptors)
-        sentences = (*stand(lines), *make_safe(lines, self._safe_stages))
+        sentences = (*stand(lines), *self._safe_end.make_safe(lines))
         packets.commit()
         return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
         lines, packets = self._take_over(descriptors)
-        outcome, unsafe = limp(lines), make_safe(lines, self._safe_stages)
+        outcome, unsafe = limp(lines), self._safe_end.make_safe(lines)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
         servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"

@@ -207,6 +207,7 @@ def guardian_job(
         supervisor=os.getpid(),
         epoch_offset_ns=epoch_offset_ns,
         features=plan.features,
+        feature_plans=plan.feature_plans,
     )
 
 

@@ -24,7 +24,10 @@ class Lights:
         """Write every LED again: a servo without power has forgotten it."""
         self._written.clear()
 
-    def schedule_idle_work(self) -> None:
+    def recover_servo(self, servo: int) -> None:
+        """Do nothing."""
+
+    def schedule_idle_work(self, time_ns: int) -> None:
         """Write the LEDs whose command changed."""
         for column, (servo_id, address) in self._places.items():
             lit = int(self._context.commands[column] >= 0.5)  # NaN, not commanded, is off

@@ -84,7 +84,12 @@ class DesiredState:
         self._show(index, mode)
 
     def returned(self, index: int, mode: Mode) -> None:
-        """Record that a servo returned in a mode; another one that was requested meanwhile follows."""
+        """Record that a servo returned in a mode; another one that was requested meanwhile follows.
+
+        Features restore what they wrote to it.
+        """
+        for part in self._life.parts:
+            part.recover_servo(index)
         if self._changing[index]:
             return  # its change is next in idle time, and reads the mode then
         if mode == self._modes[index]:

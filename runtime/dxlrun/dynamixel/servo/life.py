@@ -36,7 +36,7 @@ and which are read in a cycle follows from the state, and is changed nowhere els
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum, unique
 from types import MappingProxyType
 
@@ -46,6 +46,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.dynamixel.bus_part import BusPart
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -207,11 +208,15 @@ class Loss(msgspec.Struct):
 class Life:
     """The state of each servo of one bus, and what follows from it; programs that drive it wait in `idle`."""
 
-    def __init__(self, idle: IdleScheduler, reads: CyclicReads, events: EventSink) -> None:
+    def __init__(
+        self, idle: IdleScheduler, reads: CyclicReads, events: EventSink, parts: Sequence[BusPart] = ()
+    ) -> None:
+        """`parts`: of features, which learn that a servo returned."""
         count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
         self.plan = idle.plan
         self.events = events
+        self.parts = parts
         self.idle = idle
         self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
         self.states = [ServoState.LIMP] * count  # The state of each servo

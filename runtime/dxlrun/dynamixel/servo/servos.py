@@ -70,7 +70,7 @@ class Servos:
         """The job that reads every servo and every device once."""
         self._parts = parts.attach(idle, self.reads, samples, events)
         """The share of features on this bus, in their order."""
-        self.life = Life(idle, self.reads, events)  # The state of each servo
+        self.life = Life(idle, self.reads, events, self._parts)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
         """Modes and registers that the servos shall have."""
@@ -287,18 +287,20 @@ class Servos:
         if not self.life.calm:
             self._offline.expire()
 
-    def look(self) -> None:
+    def look(self, time_ns: int) -> None:
         """Let the coming idle time read what is due beside the cyclic reads, one servo at a time.
 
         That is the hardware error of a servo that raised an alert, the torque limit of one that may have shut
         down, and torque enable of one that waits for its goals. Only a servo that answers is read.
+
+        `time_ns`: the controllers' time of the coming cycle, for the parts of features.
         """
         self._report_noise(self.life.now_ns())
         if not self.life.calm:
             self._offline.look()
         self._slow.look()
         for part in self._parts:
-            part.schedule_idle_work()
+            part.schedule_idle_work(time_ns)
         if not self._reading and (due := self._due()) is not None:
             index, what, program = due
             self._reading, self._read_last = True, index

@@ -85,6 +85,9 @@ class Devices:
         for index in range(len(self._losses)):
             self._leave(index, _Loss(now_ns, now_ns, missed=0, reported=True))
 
+    def recover_servo(self, servo: int) -> None:
+        """Do nothing: a device returns without its neighbors."""
+
     def _miss(self, index: int, now_ns: int) -> None:
         garbled = any(self._reads.garbled[member] for member in self._members[index])
         servos = len(self._plan.servos)
@@ -119,7 +122,7 @@ class Devices:
 
     # Idle time
 
-    def schedule_idle_work(self) -> None:
+    def schedule_idle_work(self, time_ns: int) -> None:
         """Let the coming idle time ask those that do not answer, and write what is commanded."""
         now_ns = self._idle.now_ns()
         for index, loss in enumerate(self._losses):

@@ -12,14 +12,14 @@ from dxlwire.plan.retry import limit_patience, retry, setup_line
 from dxlwire.transaction import Outcome, Program
 
 
-def write_safe_values(lines: Lines) -> tuple[str, ...]:
+def write_safe_values(lines: Lines, plan: bytes) -> tuple[str, ...]:
     """Write the safe value of every command that has one; return a sentence for each that failed.
 
-    Raises nothing. A line without devices gets no byte.
+    Raises nothing. A line without devices gets no byte. `plan` is empty: buses have the plans of devices.
     """
-    if not any(device.commands for plan in lines.plans for device in plan.devices):
+    if not any(device.commands for bus in lines.plans for device in bus.devices):
         return ()
-    found = lines.run([limit_patience(_write_safe_values(plan)) for plan in lines.plans])
+    found = lines.run([limit_patience(_write_safe_values(bus)) for bus in lines.plans])
     return tuple(problem for problems in found for problem in problems or ())
 
 
