@@ -60,7 +60,7 @@ def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
     values = {"CONTRACT_VERSION", "Commands", "Floats", "States"}
     assert (
         set(re.findall(r"^### `(\w+)`", names, re.MULTILINE))
-        == {*dxlrun.__all__, "simulated_robot"} - units - values
+        == {*dxlrun.__all__, "simulated_robot", "installed"} - units - values
     )
     pages = {page.name for page in pkgutil.iter_modules(dxlrun.tooling.__path__)}
     tables = dict(re.findall(r"^### `dxlrun.tooling.(\w+)`\n(.*?)(?=^### |\Z)", names, re.M | re.S))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from tests.kit.decoded import decode_packets
 
@@ -17,14 +19,15 @@ from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingW
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
 from dxlrun.plan.policy_plan import TORQUE_STAYS
-from dxlrun.run.guardian import SafeStop
+from dxlrun.run.guardian import GuardianJob, SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
-from dxlrun.testing import plan_of, simulated_robot
+from dxlrun.testing import installed, plan_of, simulated_robot
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketKind
 
 Start = Callable[..., Any]
+LIGHTS = Path(__file__).parents[2] / "plugins/lights"
 pytestmark = pytest.mark.usefixtures("no_memory_left")
 
 POLICIES = """\
@@ -175,6 +178,21 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_s
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
+
+
+def test_guardian_makes_the_feature_of_a_package_safe(tmp_path, monkeypatch):
+    with installed(LIGHTS):
+        robot = simulated_robot(LIGHTS / "lights.yaml", duration_s=0.4)
+        robot.robot.hardware.start()
+        leds = [servo.registers for servo in robot.buses[0].servos]
+        leds[0]["led"] = leds[1]["led"] = 1
+        job = guardian_job(robot.plan, {}, create_memory(robot.plan), take_over=False)
+        safe_stop = SafeStop(msgspec.json.decode(msgspec.json.encode(job), type=GuardianJob))
+        packets = PacketBatch(Handover(lambda kind, payload: None))
+        lines = Lines(robot.plan.buses, VirtualPorts(robot.clock, robot.buses), robot.clock, packets)
+        monkeypatch.setattr(safe_stop, "_take_over", lambda _: (lines, packets))
+        safe_stop.limp((), "it died", Severity.ERROR)
+        assert [each["led"] for each in leds] == [0, 0]
 
 
 @pytest.mark.parametrize("silent", [False, True])

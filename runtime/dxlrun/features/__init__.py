@@ -37,6 +37,11 @@ def installed_features() -> tuple[Feature, ...]:
     return _installed()[0]
 
 
+def forget_installed() -> None:
+    """Look for installed features again when they are needed next."""
+    _installed.cache_clear()
+
+
 def broken_features() -> dict[str, str]:
     """Return the features of plug-ins that cannot be used, with the reason, by name."""
     return _installed()[1]

@@ -11,19 +11,35 @@ assert robot.record.states.valid.all()
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import invalidate_caches
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from dxlrun.compile.robot import compile_robot
 from dxlrun.description.frames.tree import FrameTree
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
+from dxlrun.description.robot import robot_form
 from dxlrun.errors import InputError
+from dxlrun.features import forget_installed
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 
-__all__ = ["FrameTree", "Log", "VirtualRobot", "kinematics", "plan_of", "read_log", "simulated_robot"]
+__all__ = [
+    "FrameTree",
+    "Log",
+    "VirtualRobot",
+    "installed",
+    "kinematics",
+    "plan_of",
+    "read_log",
+    "simulated_robot",
+]
 
 
 def plan_of(
@@ -75,3 +91,44 @@ def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None)
             f"{robot} names no URDF, so nothing is known of its frames; write `model: {{urdf: ...}}`"
         )
     return FrameTree.of(plan.urdf, plan.frames)
+
+
+@contextmanager
+def installed(project: str | Path) -> Iterator[None]:
+    """Let dxlrun find a package while the block runs, as `pip install -e PROJECT` does.
+
+    For tests of a section of the robot file that run without an installation. What dxlrun reads of
+    `pyproject.toml` are name, version and entry points; the package is in `PROJECT/src`.
+
+        with installed("plugins/lights"):
+            plan = plan_of("plugins/lights/lights.yaml")
+        print(plan.feature_plans["lights"])
+
+    Args:
+        project: Directory with `pyproject.toml`.
+    """
+    own = tomllib.loads((Path(project) / "pyproject.toml").read_text())["project"]
+    name, version = own["name"], own["version"]
+    with TemporaryDirectory() as site:
+        info = Path(site) / f"{name.replace('-', '_')}-{version}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        with (info / "entry_points.txt").open("w") as file:
+            for group, points in own.get("entry-points", {}).items():
+                print(
+                    f"[{group}]", *(f"{key} = {value}" for key, value in points.items()), sep="\n", file=file
+                )
+        before = sys.path.copy()
+        sys.path[:0] = [site, str(Path(project).absolute() / "src")]
+        _look_for_packages()
+        try:
+            yield
+        finally:
+            sys.path[:] = before
+            _look_for_packages()
+
+
+def _look_for_packages() -> None:
+    invalidate_caches()
+    forget_installed()
+    robot_form.cache_clear()

@@ -38,8 +38,12 @@ if TYPE_CHECKING:
     from dxlrun.features.feature import Feature as Feature
     from dxlrun.features.feature import Section as Section
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
+    from dxlwire.exchange.bus import Lines as Lines
     from dxlwire.exchange.idle import Urgency as Urgency
     from dxlwire.plan.planning import plan_line as plan_line
+    from dxlwire.plan.retry import limit_patience as limit_patience
+    from dxlwire.plan.retry import retry as retry
     from dxlwire.transaction import Program as Program
+    from dxlwire.transaction import Reply as Reply
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -12,7 +12,7 @@ from dxlrun_lights.plan import Light
 
 def compile_lights(compilation: Compilation) -> Contribution:
     """Return the lights as commands of one source, `lights/NAME`, from 0 (off) to 1 (on)."""
-    file, found = compilation.file, dict[str, Light]()
+    file, found, owners = compilation.file, dict[str, Light](), dict[tuple[str, int], str]()
     lights = form.STAGE.of(file.robot)
     for name, light in lights.items():
         mark = file.at("lights", name, "joint")
@@ -21,13 +21,17 @@ def compile_lights(compilation: Compilation) -> Contribution:
             file.error(mark, what, suggestion(light.joint, tuple(file.robot.joints)))
         elif (joint := compilation.joints.get(light.joint)) is not None:
             servo = joint.servos[0]
+            place = (servo.described.bus, servo.described.id)
             if (led := servo.table.items.get("led")) is None:
                 what = f"light {name} is on {light.joint}, whose {servo.table.model} has no item led"
                 file.error(
                     mark, what, "name a joint whose servo has one; `dxlrun models MODEL` lists the items"
                 )
+            elif (other := owners.setdefault(place, name)) != name:
+                what = f"light {name} is on {light.joint}, whose LED is light {other}"
+                file.error(mark, what, "name another joint, or take one of the lights out")
             else:
-                found[name] = Light(servo.described.title, led.address)
+                found[name] = Light(light.joint, *place, led.address)
     if len(found) < len(lights):  # without a source, no controller is blamed for its commands
         return Contribution(names=("lights",))
     source = SourcePlan(

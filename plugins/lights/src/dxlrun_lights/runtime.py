@@ -5,51 +5,70 @@ from __future__ import annotations
 import msgspec
 
 from dxlrun.tooling.features import BusContext, BusStage, Program, Urgency, plan_line
-from dxlrun_lights.plan import Light
+from dxlrun_lights.plan import Light, decode_lights
+
+RETRY_NS = 1_000_000_000  # A servo without a reply costs a timeout, so it is not written in each cycle
+
+
+class Led(msgspec.Struct):
+    """The LED of a light."""
+
+    light: Light
+    servo: int  # Index in the servos of the bus
+    column: int  # Its command in `BusContext.commands`
+    shown: int | None = None  # What the servo acknowledged last; None: not known
+    writing: bool = False
+    due_ns: int = 0  # Controllers' time from which on it may be written
 
 
 class Lights:
     """The lights of one bus."""
 
-    def __init__(self, context: BusContext, places: dict[int, tuple[int, int]]) -> None:
-        """`places`: ID and address of the LED of each light, by the column of its command."""
+    def __init__(self, context: BusContext, leds: list[Led]) -> None:
         self._context = context
-        self._places = places
-        self._written: dict[int, int] = {}
+        self._leds = leds
 
     def judge_replies(self, now_ns: int) -> None:
         """Do nothing: LEDs are not read."""
 
     def recover_line(self) -> None:
         """Write every LED again: a servo without power has forgotten it."""
-        self._written.clear()
+        for led in self._leds:
+            led.shown = None
 
     def recover_servo(self, servo: int) -> None:
-        """Do nothing."""
+        """Write the LED of a servo again, at once: it has forgotten it."""
+        for led in self._leds:
+            if led.servo == servo:
+                led.shown, led.due_ns = None, 0
 
     def schedule_idle_work(self, time_ns: int) -> None:
-        """Write the LEDs whose command changed."""
-        for column, (servo_id, address) in self._places.items():
-            lit = int(self._context.commands[column] >= 0.5)  # NaN, not commanded, is off
-            if self._written.get(column, 0) != lit:
-                self._written[column] = lit
-                name = self._context.command_names[column]
-                self._context.idle.add(self._write(servo_id, address, lit), Urgency.STEERED, name)
+        """Write the LEDs that are not as commanded; at the start of a run that is not known."""
+        for led in self._leds:
+            lit = int(self._context.commands[led.column] >= 0.5)  # NaN, not commanded, is off
+            if led.shown != lit and not led.writing and led.due_ns <= time_ns:
+                led.writing, led.due_ns = True, time_ns + RETRY_NS
+                name = self._context.command_names[led.column]
+                self._context.idle.add(self._write(led, lit), Urgency.STEERED, name, led.servo)
 
-    def _write(self, servo_id: int, address: int, lit: int) -> Program[None]:
-        yield plan_line(self._context.idle.plan).write(servo_id, address, bytes([lit]))
+    def _write(self, led: Led, lit: int) -> Program[None]:
+        line, light = plan_line(self._context.idle.plan), led.light
+        reply = yield line.write(light.servo_id, light.address, bytes([lit]))
+        led.writing = False
+        if reply.answered:  # a lost write is repeated when it is due
+            led.shown, led.due_ns = lit, 0
 
 
 def attach_lights(context: BusContext) -> Lights | None:
     """Return the lights of a bus; None if it has none."""
-    ids = {servo.joint: servo.servo_id for servo in context.idle.plan.servos}
-    lights = msgspec.json.decode(context.plan, type=dict[str, Light])
-    places = {
-        context.command_names.index(f"lights/{name}"): (ids[light.servo], light.address)
-        for name, light in lights.items()
-        if light.servo in ids
-    }
-    return Lights(context, places) if places else None
+    bus = context.idle.plan
+    servos = {servo.servo_id: index for index, servo in enumerate(bus.servos)}
+    leds = [
+        Led(light, servos[light.servo_id], context.command_names.index(f"lights/{name}"))
+        for name, light in decode_lights(context.plan).items()
+        if light.bus == bus.name
+    ]
+    return Lights(context, leds) if leds else None
 
 
 STAGE = BusStage(attach_lights)

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import msgspec
-
 from dxlrun.tooling.features import Row, TableStage
 from dxlrun.tooling.output import Column, Table
 from dxlrun.tooling.plans import Plan
-from dxlrun_lights.plan import Light
+from dxlrun_lights.plan import decode_lights
 
 
 def light_rows(plan: Plan) -> Iterator[Row]:
     """Yield a row for each light."""
-    for name, light in msgspec.json.decode(plan.feature_plans["lights"], type=dict[str, Light]).items():
-        yield {"name": name, "joint": light.servo}
+    for name, light in decode_lights(plan.feature_plans["lights"]).items():
+        yield {"name": name, "joint": light.joint, "bus": light.bus, "id": light.servo_id}
 
 
 def light_table(rows: Sequence[Row]) -> Table:
     """Return the table of these lights."""
-    return Table.listing(
-        "Lights", [(Column("light", "name"), "name"), (Column("joint", "name"), "joint")], rows
-    )
+    columns = [
+        (Column("light", "name"), "name"),
+        (Column("joint", "name"), "joint"),
+        (Column("bus", "name"), "bus"),
+        (Column("ID"), "id"),
+    ]
+    return Table.listing("Lights", columns, rows)
 
 
 STAGE = TableStage(rows=light_rows, table=light_table)
