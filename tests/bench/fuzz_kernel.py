@@ -244,9 +244,10 @@ class Side:
         """
         self.hardware._look = True
         _, servos = self.hardware._pairs[number]
-        for index, loss in enumerate(servos.devices._losses):
+        losses = [(part, *each) for part in servos._parts for each in enumerate(part._losses)]
+        for devices, index, loss in losses:
             if loss is not None and not loss.probing and rng.random() < 0.7:
-                servos.devices._take_back(index, loss)
+                devices._take_back(index, loss)
         match rng.randrange(7):
             case 0 | 1:
                 plan = self.hardware._plans[number].servos[servo]

@@ -7,7 +7,7 @@ import pytest
 from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
-import dxlrun as dxlrun_package
+import dxlwire
 from dxlrun.cli.tools.models import runs, unit_of
 from dxlrun.contract.hookspecs import HookSpecs
 from dxlwire.control_table import all_tables, control_table
@@ -192,6 +192,6 @@ def test_the_page_shows_hooks_that_there_are():
 
 
 def test_the_page_names_files_that_there_are():
-    folder = Path(dxlrun_package.__file__).parent / "dynamixel" / "control_table" / "tables"
+    folder = Path(dxlwire.__file__).parent / "control_table" / "tables"
     for name in re.findall(r"`(\w[\w-]*\.toml)`", PAGE):
         assert list(folder.rglob(name)), name

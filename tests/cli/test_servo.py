@@ -139,7 +139,7 @@ def test_a_servo_is_found_without_its_address(one):
 
 def test_an_id_that_answers_in_two_places_is_asked_about(dxlrun, monkeypatch):
     found = (FoundServo(2.0, 57_600, 1, "XM430-W350"), FoundServo(1.0, 1_000_000, 1, "AX-12A"))
-    monkeypatch.setattr(scanning, "find", lambda *_: found)
+    monkeypatch.setattr(scanning, "find_servo", lambda *_: found)
     master, slave = os.openpty()
     said = dxlrun("servo", os.ttyname(slave), 1, "get")
     os.close(master)

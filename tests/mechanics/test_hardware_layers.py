@@ -82,6 +82,7 @@ class OffsetFeature(Feature):
 def with_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     """Register the layer next to the loop."""
     monkeypatch.setattr(features, "FEATURES", (OffsetFeature("offset", ""), *features.FEATURES))
+    monkeypatch.setattr(features, "_installed", features._installed.__wrapped__)
 
 
 def _moved(tmp_path: Path, log: Path | None = None) -> tuple[float, float]:

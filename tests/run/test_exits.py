@@ -394,7 +394,7 @@ def test_a_run_listens_on_one_socket_that_only_its_user_may_open(start, listenin
     (path,) = map(Path, found.unix)
     assert stat.S_ISSOCK(path.stat().st_mode)
     assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
-    simulation = Path(f"/proc/{run.child('dxlsim')}/fd")
+    simulation = Path(f"/proc/{run.child('dxlrun.run.simulation_process')}/fd")
     terminals = {os.readlink(each) for each in simulation.iterdir()} | {
         os.readlink(each) for each in Path(f"/proc/{run.child('dxlrun.run.guardian')}/fd").iterdir()
     }

@@ -14,12 +14,13 @@ from dxlrun.channels.answers import Code, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.halt import HALT_NS, STILL, STILL_NS
+from dxlrun.control.halt import HALT_NS, STILL_NS, STILL_SPEEDS
 from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import replay_log
+from dxlwire.joint_unit import ROTARY
 
 ROBOT = """\
 name: halting
@@ -103,14 +104,14 @@ def test_joints_in_every_mode_come_to_rest_and_hold(halted):
     robot, log, command = halted
     cycles = log.cycles
     during = cycles["velocity"][at(log, HALTED_S) - 2]
-    assert (np.abs(during) > 2 * STILL).tolist() == [True, True, True, True], during
+    assert (np.abs(during) > 2 * STILL_SPEEDS[ROTARY]).tolist() == [True, True, True, True], during
     answer = robot.inbox.answers[command.number]
     assert isinstance(answer, Done)
     assert answer.halted is not None
     assert STILL_NS * 1e-9 < answer.halted.seconds < 2.0
-    assert answer.halted.velocity <= STILL
+    assert answer.halted.velocity <= STILL_SPEEDS[ROTARY]
     after = cycles[at(log, HALTED_S + answer.halted.seconds) + 2 :]
-    assert np.abs(after["velocity"]).max() <= STILL
+    assert np.abs(after["velocity"]).max() <= STILL_SPEEDS[ROTARY]
     assert np.ptp(after["position"], axis=0).max() < 0.03
     assert not np.any(after["active"] & 0b11110)
     assert np.all(after["active"] & 1), "the broadcaster goes on"
@@ -168,7 +169,7 @@ def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path):
 
 
 def test_a_joint_that_cannot_stop_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("dxlrun.control.halt.STILL", -1.0)
+    monkeypatch.setattr("dxlrun.control.halt.STILL_SPEEDS", dict.fromkeys(STILL_SPEEDS, -1.0))
     command = loop("halt")
     robot, _ = ran(tmp_path, {1.2: [*GO, command]}, seconds=1.4 + HALT_NS * 1e-9)
     answer = robot.inbox.answers[command.number]

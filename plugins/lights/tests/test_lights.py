@@ -1,4 +1,4 @@
-"""The section `lights` on simulated servos and virtual time; the servos' LED registers judge it."""
+"""The section `lights` (add-a-section.md) on virtual time; the LED registers of the servos judge it."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
     (file,) = runs.cache_directory().rglob("*.parquet")
     data = file.read_bytes()
     if damage == "code":
-        monkeypatch.setattr(runs, "code_hashes", lambda: {runs.RUNTIME: "0" * 64})
+        monkeypatch.setattr(runs, "runtime_hash", lambda: "0" * 64)
     elif damage == "text":
         file.write_text("no table")
     else:

@@ -13,7 +13,7 @@ from dxlrun.channels.messages import (
     MOST_CAPACITY,
     MessageRing,
     OpenedTopic,
-    Topic,
+    PublishedTopic,
     TopicMessage,
     message_capacity,
     usual_message,
@@ -22,7 +22,7 @@ from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
 from dxlrun.channels.tagged import decode
 from dxlrun.messages.definition import MessageType
 
-TOPIC = Topic("/wave/state", MessageType("mine/msg/State", "float64 amount\n"), ("pan", "tilt"))
+TOPIC = PublishedTopic("/wave/state", MessageType("mine/msg/State", "float64 amount\n"), ("pan", "tilt"))
 
 
 def made(capacity: int = LEAST_CAPACITY) -> tuple[MessageRing, RingReader]:
