@@ -9,9 +9,8 @@ from typing import Annotated, NamedTuple
 from pydantic import AfterValidator
 
 from dxlrun import InputError
-from dxlrun.tooling.files import Form, key, read_yaml, refuse
+from dxlrun.tooling.files import Form, key, read_yaml, refuse, suggestion
 from dxlrun.tooling.live import Address, ListedAddress
-from dxlrun.tooling.verbs import suggestion
 
 
 def _line(text: str) -> str:

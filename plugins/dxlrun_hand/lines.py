@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 
 from dxlrun import InputError, PortError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.robots import SIMULATED
 from dxlrun.tooling.servos import ToolLine, TunablePort
-from dxlrun.tooling.verbs import suggestion
 from dxlrun_hand.dialogue import Dialogue
 from dxlwire import lasting_name
 

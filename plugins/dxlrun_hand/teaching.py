@@ -10,9 +10,10 @@ from typing import Any, cast
 import numpy as np
 
 from dxlrun import GoalState, InputError, JointUnit, Refused, RemoteRobot, ServoFault
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.output import write_target
 from dxlrun.tooling.plans import ControllerPlan
-from dxlrun.tooling.verbs import cancel_goals, suggestion
+from dxlrun.tooling.verbs import cancel_goals
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, ending_with, yes

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun import InputError, RemoteRobot
-from dxlrun.tooling.verbs import suggestion
+from dxlrun.tooling.files import suggestion
 
 Row = Mapping[str, Any]
 """A part of `RemoteRobot.info`."""

@@ -71,6 +71,9 @@ class Outcome(IntEnum):
 class Reply(msgspec.Struct):
     """What came of a transaction; of several statuses it shows the newest.
 
+    A program gets it from `yield`. A write may be lost, or done without an acknowledgement that arrives:
+    nothing repeats it, so a program keeps only what was `answered` as written.
+
     A bus reuses one object for all its transactions, so a job takes what it needs before it continues;
     programs get their own.
     """

@@ -9,8 +9,8 @@ import pyarrow as pa
 from pyarrow import csv
 
 from dxlrun import LogError, LogReader
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.topics import bus_topic
-from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABLE, tables_of
 
 

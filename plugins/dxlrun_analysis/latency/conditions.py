@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dxlrun import InputError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.plans import Policy, SchedulerPlan
-from dxlrun.tooling.verbs import suggestion
 
 YARDSTICK = "c"
 POLICIES: tuple[Policy, ...] = ("other", "round_robin", "fifo")

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun import ROTARY, InputError, JointUnit
-from dxlrun.tooling.verbs import suggestion
+from dxlrun.tooling.files import suggestion
 
 Floats: TypeAlias = NDArray[np.float64]
 What: TypeAlias = Literal["goals", "states"]

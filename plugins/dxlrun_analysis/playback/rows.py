@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 
 from dxlrun import InputError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import JointPlan
-from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import SplinePath, fit, tolerances
 

@@ -11,9 +11,9 @@ import yaml
 from msgspec.structs import replace
 
 from dxlrun import InputError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan
 from dxlrun.tooling.robots import PlugIns, compile_texts, replan_controller
-from dxlrun.tooling.verbs import suggestion
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 

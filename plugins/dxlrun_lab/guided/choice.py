@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from msgspec.structs import replace
 
 from dxlrun import LINEAR, InputError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import JointPlan, Plan
-from dxlrun.tooling.verbs import angle, suggestion
+from dxlrun.tooling.verbs import angle
 from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
 

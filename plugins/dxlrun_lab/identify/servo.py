@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from dxlrun import InputError, Log
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.plans import Plan, from_json
-from dxlrun.tooling.verbs import suggestion
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
 from dxlsim import SAMPLING_S, SLOPE_TICK, SLOPE_TIMES_P, Motor, motor_of

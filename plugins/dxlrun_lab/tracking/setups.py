@@ -12,9 +12,9 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun import InputError
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import Plan, ScheduleName
 from dxlrun.tooling.realtime import missing_priority
-from dxlrun.tooling.verbs import suggestion
 
 
 class Setup(msgspec.Struct, frozen=True):

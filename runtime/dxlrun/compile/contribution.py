@@ -25,6 +25,7 @@ class Compilation(msgspec.Struct, frozen=True):
     """Problems are added to it."""
     plugins: PlugIns
     joints: Mapping[str, CompiledJoint]
+    """Joints without mistakes: one with a mistake is reported already."""
     body: CompiledUrdf | None
     """The robot's URDF; None if it has none."""
 
@@ -43,7 +44,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """The share of one feature in a plan."""
 
     names: tuple[str, ...] = ()
-    """Entries of its section that have states, those with mistakes included."""
+    """Names of all its sources, also of those that a mistake leaves out: no controller is blamed for naming
+    one."""
     buses: frozenset[str] = frozenset()
     """Buses that the entries of its section name."""
     sources: tuple[SourcePlan, ...] = ()

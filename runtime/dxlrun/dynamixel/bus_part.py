@@ -123,7 +123,8 @@ class BusStage:
     attach: Callable[[BusContext], BusPart | None]
     """Called once for each bus before the start. None if the feature has nothing on this bus."""
     inspect: Callable[[BusPlan, Findings], Program[None]] = inspect_nothing
-    """Reads at the start, after the servos were inspected and before any of them gets torque."""
+    """Reads at the start, after the servos were inspected and before any of them gets torque. What it adds to
+    `Findings.problems`, one sentence each, refuses the start. It does not get `Contribution.plan`."""
 
 
 @dataclass(frozen=True)

@@ -28,5 +28,6 @@ if TYPE_CHECKING:
     from dxlrun.description.yaml_file import read_yaml as read_yaml
     from dxlrun.errors import Mark as Mark
     from dxlrun.errors import Problem as Problem
+    from dxlrun.errors import suggestion as suggestion
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

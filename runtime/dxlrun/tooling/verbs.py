@@ -43,6 +43,5 @@ if TYPE_CHECKING:
     from dxlrun.description.units import angular_velocity as angular_velocity
     from dxlrun.description.units import duration as duration
     from dxlrun.errors import missing_extra as missing_extra
-    from dxlrun.errors import suggestion as suggestion
 else:
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

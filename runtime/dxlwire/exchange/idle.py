@@ -28,7 +28,10 @@ WHOLE_BUS = -1  # Instead of a servo: the program is about no single one
 
 @unique
 class Urgency(IntEnum):
-    """The order of programs: a lower number goes first, between two transactions of others if need be."""
+    """The order of programs: a lower number goes first, between two transactions of others if need be.
+
+    A program other than SLOW that never finds enough time is executed at the cost of the next cycle.
+    """
 
     MODE = 0  # A joint has no goal until its mode is there
     REPAIR = 1  # What a servo is owed: its torque, its alert, its return

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import DxlrunError, InputError, running
+from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.output import leave_real_time, print_warning, progress_bar, show
-from dxlrun.tooling.verbs import suggestion
 
 if TYPE_CHECKING:
     from types import FrameType

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from dxlrun.tooling.features import Compilation, CompileStage, Contribution, SourcePlan
-from dxlrun.tooling.verbs import suggestion
+from dxlrun.tooling.files import suggestion
 from dxlrun_lights import form
 from dxlrun_lights.plan import Light
 
