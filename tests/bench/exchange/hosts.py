@@ -140,7 +140,8 @@ class Ours:
         """Exchange, and use idle time for servos that did not answer, until all get goals again."""
         for _ in range(_MOST_RECOVERIES):
             self.exchange()
-            self._hardware.idle(time.monotonic_ns() + _IDLE_NS)
+            now_ns = time.monotonic_ns()
+            self._hardware.idle(now_ns + _IDLE_NS, now_ns)
             if (self._torque == Torque.ON).all():
                 return
 
