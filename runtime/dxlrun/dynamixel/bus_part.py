@@ -145,17 +145,27 @@ class SafeStage:
 
 @dataclass(frozen=True, slots=True)
 class SafeEnd:
-    """The stages that make a robot safe, each with the plan of its feature."""
+    """The stages that make a robot safe, each with its feature and the plan of that."""
 
-    stages: tuple[tuple[SafeStage, bytes], ...]
+    stages: tuple[tuple[Feature, SafeStage, bytes], ...]
 
     @classmethod
     def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
         """Import what `make_safe` needs: when that is called, an import may not be possible any more."""
-        return cls(
-            tuple((stage, plans.get(feature.name, b"")) for feature, stage in stages(SafeStage, features))
-        )
+        found = stages(SafeStage, features)
+        return cls(tuple((feature, stage, plans.get(feature.name, b"")) for feature, stage in found))
 
     def make_safe(self, lines: Lines) -> tuple[str, ...]:
         """Leave safe what features have on the lines; return a sentence for each failure."""
-        return tuple(problem for stage, plan in self.stages for problem in stage.make_safe(lines, plan))
+        sentences: list[str] = []
+        for feature, stage, plan in self.stages:
+            try:
+                sentences += stage.make_safe(lines, plan)
+            except Exception as error:  # foreign code: the other features are made safe all the same
+                author = (
+                    f"; report it to the author of {feature.distribution}" if feature.distribution else ""
+                )
+                sentences.append(
+                    f"the section {feature.name} was not left safe ({type(error).__name__}: {error}){author}"
+                )
+        return tuple(sentences)
