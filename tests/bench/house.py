@@ -106,11 +106,11 @@ def read_sources(commit: str) -> dict[str, str]:
     """Return the text of each source file of a commit, or of the working tree, by its path."""
     folders = ("runtime", "plugins", "tests")
     if not commit:
-        tracked = git("ls-files", *folders).decode().splitlines()
-        return {path: (ROOT / path).read_text() for path in tracked if path.endswith(CODE)}
+        files = (path for folder in folders for path in sorted((ROOT / folder).rglob("*")))
+        return {f"{path.relative_to(ROOT)}": path.read_text() for path in files if path.name.endswith(CODE)}
     with tarfile.open(fileobj=io.BytesIO(git("archive", commit, *folders))) as tar:
-        files = {member.name: tar.extractfile(member) for member in tar if member.name.endswith(CODE)}
-        return {path: file.read().decode() for path, file in files.items() if file is not None}
+        members = {member.name: tar.extractfile(member) for member in tar if member.name.endswith(CODE)}
+        return {path: file.read().decode() for path, file in members.items() if file is not None}
 
 
 def is_product(path: str) -> bool:
