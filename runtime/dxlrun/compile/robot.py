@@ -44,7 +44,6 @@ from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Feature
-from dxlrun.log.identity import distribution_name
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 from dxlwire.bus_plan import BusPlan
@@ -253,11 +252,12 @@ def _used_features(file: RobotFile) -> tuple[Feature, ...]:
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:
     """Return the packages of the plug-ins whose sections the robot file has, with their distributions."""
-    return {
-        each.package.partition(".")[0]: distribution_name(each.distribution)
-        for each in features
-        if each.distribution
-    }
+    used = [each for each in features if each.distribution]
+    if not used:
+        return {}
+    from dxlrun.log.identity import distribution_name  # not above: most robots use no such section
+
+    return {each.package.partition(".")[0]: distribution_name(each.distribution) for each in used}
 
 
 def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:
