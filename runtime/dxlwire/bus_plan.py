@@ -187,11 +187,6 @@ class ServoPlan(msgspec.Struct, frozen=True):
     unit: JointUnit = ROTARY  # Of the joint's positions
 
     @property
-    def slow_states(self) -> frozenset[SlowState]:
-        """States that are read between the cycles; another one stays NaN for the whole run."""
-        return frozenset(SLOW_STATES[name] for name in self.slow if name in SLOW_STATES)
-
-    @property
     def own_name(self) -> str:
         """A name that no other servo has."""
         return self.name or self.joint

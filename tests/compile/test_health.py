@@ -75,10 +75,8 @@ def test_slow_registers_and_who_gets_torque_back() -> None:
     assert [servo.torque_on_return for servo in bus.servos] == [True, False, True]
     (bus,) = compile_text(text()).plan.buses
     assert bus.servos[0].slow == ("present_input_voltage", "present_temperature")
-    assert bus.servos[0].slow_states == {"voltage", "temperature"}
     (bus,) = compile_text(text(bus="slow_registers: {items: []}")).plan.buses
     assert bus.servos[0].slow == ()
-    assert bus.servos[0].slow_states == set()
     assert bus.slow_period_ns == 1_000_000_000  # of the servos' clocks, which tell their reboots
 
 

@@ -187,8 +187,8 @@ class RingWriter(_Ring):
 
 
 class RingReader(_Ring):
-    """One reader of a ring, at its own pace. Raises ValueError when the memory is no ring, NotCompiled where
-    what reads was not compiled.
+    """One reader of a ring, at its own pace. Raises ValueError if the memory does not hold a ring, and
+    NotCompiled if the compiled reader is missing.
 
     Whatever the memory holds, no method raises, and each takes a time that the longest record bounds.
     """

@@ -103,7 +103,7 @@ RENAMED: Mapping[str, Mapping[str, str]] = {
     "teach": {"--speed": "--velocity"},
     "view": {"--port": "--listen :PORT"},
 }
-"""By verb and option of an earlier version: what is written now."""
+"""New names of renamed options, by verb and old option."""
 
 
 def is_verb(word: str) -> bool:
