@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import functools
 import http.server
-import pkgutil
 import re
 import threading
 from collections.abc import Iterator
 from html.parser import HTMLParser
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.loaded import loaded
-
-import dxlrun
-import dxlrun.tooling
-from dxlrun.cli.verbs import names as names_of_verbs
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,34 +41,6 @@ def test_each_link_of_the_site_has_a_file(sources: Path) -> None:
     ]
     assert len(links) > 100
     assert [(path.name, link) for path, link in links if not (path.parent / link).exists()] == []
-    assert [
-        path
-        for path in sources.rglob("*.md")
-        if re.search("^<!-- (keys|commands|api|page)", path.read_text(), re.M)
-    ] == []
-
-
-def test_what_the_program_says_of_itself_is_there(sources: Path) -> None:
-    names = (sources / "reference/api.md").read_text()
-    units = {one for one in dxlrun.__all__ if str(getattr(dxlrun, one)).startswith("typing.Annotated")}
-    values = {"CONTRACT_VERSION", "Commands", "Floats", "States"}
-    assert (
-        set(re.findall(r"^### `(\w+)`", names, re.MULTILINE))
-        == {*dxlrun.__all__, "simulated_robot", "installed"} - units - values
-    )
-    pages = {page.name for page in pkgutil.iter_modules(dxlrun.tooling.__path__)}
-    tables = dict(re.findall(r"^### `dxlrun.tooling.(\w+)`\n(.*?)(?=^### |\Z)", names, re.M | re.S))
-    assert {name: sorted(re.findall(r"^\| `(\w+)` ", text, re.M)) for name, text in tables.items()} == {
-        name: sorted(import_module(f"dxlrun.tooling.{name}").__all__) for name in pages
-    }
-    client = names.partition("### `RemoteRobot`")[2].partition("\n### ")[0]
-    methods = {one for one in dir(dxlrun.RemoteRobot) if not one.startswith("_")} - {"name"}
-    assert methods == set(re.findall(r"^#### `(\w+)`", client, re.MULTILINE))
-    verbs = (sources / "reference/commands.md").read_text()
-    sections = dict(re.findall(r"^### ([a-z -]+)\n(.*?)(?=^### |\Z)", verbs, re.MULTILINE | re.DOTALL))
-    assert {name.split()[0] for name in sections} == set(names_of_verbs())
-    assert {"bench rate", "experiment tracking"} <= set(sections)
-    assert all(f"| `{option}" in sections["send"] for option in ("--wait", "--in STR", "--json", "TARGET"))
 
 
 class Names(HTMLParser):

@@ -1,0 +1,245 @@
+"""Write the reference into the pages: run `python docs/generate.py` after a change of a key or a docstring.
+
+A page has marks, and the text between them is generated:
+
+    <!-- keys: NAME -->      table of the keys of a section, from the JSON Schema
+    <!-- commands -->        every command with its options, from its help
+    <!-- api: NAME ... -->   signatures and docstrings of names of `dxlrun` and `dxlrun.testing`
+    <!-- page: NAME -->      table of the names of a module of `dxlrun.tooling`
+    <!-- end -->
+
+`--check` writes nothing and exits with 1 when a page is out of date. The text depends on this repository
+only: installed packages that PACKAGES does not list are ignored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import importlib.metadata
+import inspect
+import io
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from importlib.metadata import Distribution, EntryPoints
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+PACKAGES = (ROOT, ROOT / "plugins/dxlrun_view")
+"""Folders of the distributions whose commands and keys belong to the reference."""
+SOURCES = ("runtime", "plugins", "plugins/dxlrun_view/src")
+MARK = re.compile(
+    r"^(<!-- (keys|commands|api|page):? ?(.*?) ?-->)\n.*?^<!-- end -->$", re.MULTILINE | re.DOTALL
+)
+
+
+class Package(Distribution):
+    """A distribution as its pyproject.toml describes it, installed or not."""
+
+    def __init__(self, folder: Path) -> None:
+        self.project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+
+    def read_text(self, filename: str) -> str | None:
+        """Return the text of a metadata file."""
+        if filename == "METADATA":
+            return f"Name: {self.project['name']}\nVersion: {self.project.get('version', '0')}\n"
+        if filename != "entry_points.txt":
+            return None
+        groups = self.project.get("entry-points", {})
+        lines = [
+            [f"[{group}]", *(f"{name} = {place}" for name, place in found.items())]
+            for group, found in groups.items()
+        ]
+        return "\n".join(line for group in lines for line in group)
+
+    def locate_file(self, path: str | PathLike[str]) -> Path:
+        """Return where a file of the distribution is."""
+        return ROOT / path
+
+
+def use_only_this_repository() -> None:
+    """Import from this tree, and find entry points of PACKAGES only; call it before importing dxlrun."""
+    points = EntryPoints(point for folder in PACKAGES for point in Package(folder).entry_points)
+    installed = importlib.metadata.entry_points
+
+    def entry_points(**selected: str) -> EntryPoints:
+        found = points if selected["group"] in points.groups else installed(group=selected["group"])
+        return found.select(**selected)
+
+    importlib.metadata.entry_points = entry_points  # type: ignore[assignment]  # this process only generates
+    sys.path[:0] = [str(ROOT / source) for source in SOURCES]
+
+
+@cache
+def printed_by(*words: str) -> str:
+    """Return the output of `dxlrun WORDS`."""
+    from dxlrun.cli import main
+
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        main(list(words))
+    return out.getvalue()
+
+
+def values(entry: dict[str, Any]) -> Iterator[str]:
+    """Yield what a key may be, in a few words each."""
+    for one in entry.get("anyOf", ()) or entry.get("oneOf", ()):
+        yield from values(one)
+    kind, inner = entry.get("type"), entry.get("additionalProperties")
+    if "$ref" in entry and not entry["$ref"].endswith(("/argument", "/grouped")):
+        yield f"keys of `{re.split('[./]', entry['$ref'])[-1]}`"
+    elif "enum" in entry or "const" in entry:
+        yield " or ".join(f"`{one}`" for one in entry.get("enum") or [entry["const"]])
+    elif units := re.search(r"\(([\w|/^\\%]+)\)\\s\*\$$", entry.get("pattern", "")):
+        yield "quantity in " + units[1].replace("\\", "").replace("|", ", ")
+    elif kind == "array":
+        items = dict.fromkeys(values(entry.get("items") or entry["prefixItems"][0]))
+        yield f"list of {' or '.join(items)}"
+    elif kind == "object" and isinstance(inner, dict):
+        yield f"by name: {' or '.join(dict.fromkeys(values(inner)))}"
+    elif isinstance(kind, str) and kind not in {"null", "object"}:
+        limits = [entry.get("minimum", entry.get("exclusiveMinimum")), entry.get("maximum")]
+        words = [
+            f"{word} {limit:g}"
+            for word, limit in zip(("from", "to"), limits, strict=True)
+            if limit is not None
+        ]
+        yield " ".join([{"string": "text", "boolean": "`true` or `false`"}.get(kind, kind), *words])
+
+
+def keys(name: str) -> str:
+    """Return the table of the keys of one part of a robot file."""
+    schemas = {kind: json.loads(printed_by("schema", kind)) for kind in ("robot", "motion", "motor")}
+    parts = {**schemas, **{own: part for each in schemas.values() for own, part in each["$defs"].items()}}
+    entries = parts[name]["properties"]
+    common = {"type", "active", "rate", "fallback", "into"} if "fallback" in entries else set()
+    rows = ["| key | value | default | |", "|---|---|---|---|"]
+    for key, entry in entries.items():
+        if key in common and name != "ControllerEntry":
+            continue
+        given, example = entry.get("default"), (entry.get("examples") or [None])[0]
+        default = "" if given is None else f"`{json.dumps(given)}`"
+        about = entry.get("description") or parts.get(entry.get("$ref", "")[8:], entry).get("description", "")
+        words = [
+            *about.partition("\n\n")[0].split(),
+            *([] if example is None else [f"Example: `{example}`."]),
+        ]
+        cells = (f"`{key}`", " or ".join(dict.fromkeys(values(entry))), default, " ".join(words))
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(rows)
+
+
+def help_rows(text: str) -> list[tuple[str, str]]:
+    """Return the rows of a table in a help, those of one line each."""
+    return re.findall(r"^(\S+(?: \S+)*?) {2,}(\S.*)$", re.sub(r"\n {3,}", " ", text), re.MULTILINE)
+
+
+def commands(_: str = "") -> str:
+    """Return a section for each command, in the groups of `dxlrun --help`."""
+    row = r"[a-z-][^\n]*\n(?: {3,}[^\n]*\n)*"
+    parts: list[str] = []
+    for heading, table in re.findall(rf"^([A-Z][^\n]*)\n((?:{row})+)", printed_by("--help"), re.MULTILINE):
+        names = [name for name, _ in help_rows(table) if re.fullmatch("[a-z]+(-[a-z]+)*", name)]
+        parts += [f"## {heading}", *(command(name) for name in names)] if names else []
+    return "\n\n".join(parts)
+
+
+def command(*words: str) -> str:
+    """Return the section of a command: usage, what it does, arguments and options."""
+    text = printed_by(*words, "--help").partition("\nExit codes:")[0]
+    usage, _, rest = text.partition("\n\n")
+    about, *tables = re.split(r"^(Arguments|Parameters|Commands)\n", rest, flags=re.MULTILINE)
+    lines = [f"### {' '.join(words)}", about.strip(), "```\n" + usage.removeprefix("Usage: ") + "\n```"]
+    for heading, table in zip(tables[::2], tables[1::2], strict=True):
+        rows = [(name, what) for name, what in help_rows(table) if name not in {"--debug", "--help -h"}]
+        if heading == "Commands":
+            lines += [command(*words, name) for name, _ in rows if re.fullmatch("[a-z-]+", name)]
+        elif rows:
+            cells = [f"| `{name}` | {what} |".replace("\\", "\\\\") for name, what in rows]
+            lines.append("\n".join(["| | |", "|---|---|", *cells]))
+    return "\n\n".join(lines)
+
+
+def api(names: str) -> str:
+    """Return the docstrings of names of `dxlrun` and `dxlrun.testing`, with those of their methods."""
+    import dxlrun
+    from dxlrun import testing
+
+    parts: list[str] = []
+    for name in names.split():
+        thing = getattr(dxlrun, name, None) or getattr(testing, name)
+        parts += [f"### `{name}`", signature(name, thing), inspect.getdoc(thing) or ""]
+        for own, member in [*vars(thing).items()] if inspect.isclass(thing) else ():
+            function = inspect.unwrap(getattr(member, "__func__", getattr(member, "fget", member)))
+            if not own.startswith("_") and inspect.isfunction(function) and function.__doc__:
+                parts += [f"#### `{own}`", signature(own, member), inspect.getdoc(function) or ""]
+    return "\n\n".join(parts)
+
+
+def signature(name: str, thing: object) -> str:
+    """Return how a function is called; nothing for a class or a property."""
+    function = getattr(thing, "__func__", thing)
+    if not inspect.isfunction(function):
+        return ""
+    text = re.sub(r"'([\w\[\], .|]+)'", r"\1", str(inspect.signature(function)))
+    return f"```python\n{name}{re.sub(r'^.(self|cls)(, )?', '(', text)}\n```"
+
+
+def tooling_page(name: str) -> str:
+    """Return a page of `dxlrun.tooling`: its docstring, and the first line about each of its names."""
+    page = importlib.import_module(f"dxlrun.tooling.{name}")
+    rows = ["| name | |", "|---|---|"]
+    for own in sorted(page.__all__, key=str.lower):
+        thing = getattr(page, own)
+        documented = inspect.isclass(thing) or inspect.isroutine(thing)
+        about = (inspect.getdoc(thing) or "").partition("\n\n")[0] if documented else ""
+        rows.append(f"| `{own}` | {' '.join(about.split())} |")
+    return "\n\n".join([f"### `dxlrun.tooling.{name}`", inspect.getdoc(page) or "", "\n".join(rows)])
+
+
+MAKERS = {"keys": keys, "commands": commands, "api": api, "page": tooling_page}
+
+
+def generate(text: str) -> str:
+    """Return a page with the text between its marks made again."""
+    return MARK.sub(lambda mark: f"{mark[1]}\n\n{MAKERS[mark[2]](mark[3])}\n\n<!-- end -->", text)
+
+
+def handwritten(text: str) -> str:
+    """Return a page without its generated text."""
+    return MARK.sub("", text)
+
+
+def stale_pages(folder: Path = DOCS) -> list[Path]:
+    """Return the pages whose generated text is not that of the code."""
+    return [path for path in sorted(folder.rglob("*.md")) if (text := path.read_text()) != generate(text)]
+
+
+def main() -> int:
+    """Write or check all pages; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit with 1 when a page is out of date"
+    )
+    check = parser.parse_args().check
+    use_only_this_repository()
+    stale = stale_pages()
+    for path in stale:
+        print(
+            f"{path.relative_to(ROOT)}: {'out of date; run python docs/generate.py' if check else 'written'}"
+        )
+        if not check:
+            path.write_text(generate(path.read_text()))
+    return int(check and bool(stale))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
