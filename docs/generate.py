@@ -24,7 +24,7 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import Distribution, EntryPoints
 from os import PathLike
@@ -70,9 +70,8 @@ def use_only_this_repository() -> None:
     points = EntryPoints(point for folder in PACKAGES for point in Package(folder).entry_points)
     installed = importlib.metadata.entry_points
 
-    def entry_points(**selected: str) -> EntryPoints:
-        found = points if selected["group"] in points.groups else installed(group=selected["group"])
-        return found.select(**selected)
+    def entry_points(*, group: str) -> EntryPoints:
+        return points.select(group=group) if group in points.groups else installed(group=group)
 
     importlib.metadata.entry_points = entry_points  # type: ignore[assignment]  # this process only generates
     sys.path[:0] = [str(ROOT / source) for source in SOURCES]
@@ -181,7 +180,7 @@ def api(names: str) -> str:
             function = inspect.unwrap(getattr(member, "__func__", getattr(member, "fget", member)))
             if not own.startswith("_") and inspect.isfunction(function) and function.__doc__:
                 parts += [f"#### `{own}`", signature(own, member), inspect.getdoc(function) or ""]
-    return "\n\n".join(parts)
+    return "\n\n".join(filter(None, parts))
 
 
 def signature(name: str, thing: object) -> str:
@@ -205,7 +204,12 @@ def tooling_page(name: str) -> str:
     return "\n\n".join([f"### `dxlrun.tooling.{name}`", inspect.getdoc(page) or "", "\n".join(rows)])
 
 
-MAKERS = {"keys": keys, "commands": commands, "api": api, "page": tooling_page}
+MAKERS: dict[str, Callable[[str], str]] = {
+    "keys": keys,
+    "commands": commands,
+    "api": api,
+    "page": tooling_page,
+}
 
 
 def generate(text: str) -> str:
@@ -232,10 +236,9 @@ def main() -> int:
     check = parser.parse_args().check
     use_only_this_repository()
     stale = stale_pages()
+    outcome = "out of date; run python docs/generate.py" if check else "written"
     for path in stale:
-        print(
-            f"{path.relative_to(ROOT)}: {'out of date; run python docs/generate.py' if check else 'written'}"
-        )
+        print(f"{path.relative_to(ROOT)}: {outcome}")
         if not check:
             path.write_text(generate(path.read_text()))
     return int(check and bool(stale))

@@ -31,7 +31,7 @@ def test_reference_is_up_to_date() -> None:
 
 def test_stale_page_is_reported_with_the_command(tmp_path: Path) -> None:
     generate = loaded(GENERATE)
-    page = tmp_path / "page.md"
+    page = tmp_path / "page_of_keys.md"
     page.write_text("Before.\n\n<!-- keys: Adapter -->\n| old |\n<!-- end -->\n\nAfter.\n")
     assert generate.stale_pages(tmp_path) == [page]
     page.write_text(generate.generate(page.read_text()))

@@ -1,4 +1,4 @@
-"""commands.md: a wrong file is reported as it says; tests/test_site.py has the commands."""
+"""commands.md: a wrong file is reported as it says; tests/test_reference.py has the commands."""
 
 from __future__ import annotations
 

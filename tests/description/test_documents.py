@@ -41,7 +41,7 @@ from dxlrun.features.sensors.form import SensorEntry
 PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 TABLES = set(re.findall(r"^<!-- keys: (\w+) -->$", PAGE, re.MULTILINE))
-"""Which the site has, from the schema."""
+"""Sections whose tables docs/generate.py writes."""
 
 
 def test_the_examples_of_the_page_are_read() -> None:
