@@ -61,7 +61,7 @@ def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second(
 
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop() -> None:
     plan = compile_text(PAIR + POLICIES).plan
-    rows = {row.name: row for row in policy_rows(plan.loop.policies, plan.buses)}
+    rows = {row.name: row for row in policy_rows(plan)}
     assert rows["on_exit"].does == (
         "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
     )

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Self
 
 import pytest
+from msgspec.structs import replace
 from tests.kit.loops import loop_plan
 
-from dxlrun import features
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import Severity
 from dxlrun.compile.report import policy_rows
@@ -20,7 +20,7 @@ from dxlrun.features.feature import Feature, S
 from dxlrun.features.sensors.monitor import NeededSensors
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SensorPlan, SourcePlan
 from dxlrun.plan.policy_plan import PolicyPlan
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of
 
 ROBOT = """\
 name: pair
@@ -71,20 +71,20 @@ class FarJointsFeature(Feature):
         return found if isinstance(found, kind) else None
 
 
-def test_policy_of_a_new_monitor_needs_no_change_of_loop_and_check(
-    monkeypatch: pytest.MonkeyPatch, tmp_path
-) -> None:
-    monkeypatch.setattr(features, "FEATURES", (*features.FEATURES, FarJointsFeature("far_joints", "")))
+def test_policy_of_a_new_monitor_needs_no_change_of_loop_and_check(tmp_path) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(ROBOT)
-    robot, torque = simulated_robot(path, duration_s=2.0), list[bool]()
+    plan = plan_of(path, duration_s=2.0)
+    features = (*plan.features, FarJointsFeature("far_joints", "", "tests 1"))
+    plan = replace(plan, loop=replace(plan.loop, features=features))
+    robot, torque = VirtualRobot(plan), list[bool]()
     bus = robot.buses[0]
     bus.at(int(0.9e9 * ENDS_S), lambda: torque.extend(bus.servo(one).torque_on for one in (3, 7)))
     result = robot.run()
     assert torque == [False, True]
     assert (result.reason, result.detail) == ("fault", "it is enough; on_fault: limp")
     assert result.cycles < 50 * (ENDS_S + 0.1)
-    rows = [row.name for row in policy_rows(robot.plan.loop.policies, robot.plan.buses)]
+    rows = [row.name for row in policy_rows(plan)]
     assert rows[-2:] == ["on_far_joint", "on_returned_servo"]
 
 

@@ -21,7 +21,7 @@ from dxlrun.description.joints.mechanics import Limits
 from dxlrun.features import stages
 from dxlrun.output.table import Table
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan
-from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
+from dxlrun.plan.policy_plan import POLICIES
 from dxlrun.plan.robot_plan import MotionPart, Plan
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.joint_unit import LINEAR
@@ -57,7 +57,7 @@ def check_report(
         **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage, plan.features)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],
-        "policies": policy_rows(loop.policies, buses),
+        "policies": policy_rows(plan),
         "motions": [_motion(part) for part in parts],
         "graph": _graph(graph_of(loop)),
         "duration": None if loop.end_ns is None else loop.end_ns * 1e-9,
@@ -194,16 +194,17 @@ class PolicyRow(msgspec.Struct, frozen=True):
     without_loop: str  # What of it is left when the loop is gone: what the guardian does
 
 
-def policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> list[PolicyRow]:
+def policy_rows(plan: Plan) -> list[PolicyRow]:
     """Return what happens when something does not go on as planned."""
+    policies = plan.loop.policies
     found: list[tuple[str, str, float]] = []
     for name in POLICIES:
         policy = policies.named(name)
         does = _HELD.get(name, policy.text) if policy.goes_on else policy.text
         found.append((name, does, policy.longest_ns * 1e-9))
-    for monitor in list_monitors():
+    for monitor in list_monitors(plan.features):
         found += ((name, does, 0.0) for name, does in monitor.rows(policies))
-    found.append(("on_returned_servo", _on_returned_servo(buses), 0.0))
+    found.append(("on_returned_servo", _on_returned_servo(plan.buses), 0.0))
     alone = policies.on_fault.last
     return [PolicyRow(name, does, longest, alone) for name, does, longest in found]
 

@@ -208,6 +208,8 @@ def compile_robot(
         sources=sources,
         urdf=urdf,
         sensors=sensors,
+        features=features,
+        feature_plans={name: each.plan for name, each in by_feature.items() if each.plan},
     )
     texts = {**description.included, **motors.texts}
     for each in contributions:
@@ -232,8 +234,6 @@ def compile_robot(
         | _physics(simulation, buses)
         | _packages(features),
         mechanics=compile_mechanics(joints),
-        features=features,
-        feature_plans={name: each.plan for name, each in by_feature.items() if each.plan},
     )
     return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer, Refusal
@@ -28,6 +29,7 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.errors import LogError, PortError
+from dxlrun.features import find_installed
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ServoLimit
@@ -329,6 +331,14 @@ class RecordedRun:
         messages: MessageSink,
         prepare: Callable[[TakenCommand, Callable[[str], Controller[Any] | None]], bytes],
     ) -> None:
+        features = find_installed(plan.features)
+        self._missing = [
+            f"the run had {one.name} of {one.distribution}, which is not installed here: what it watched is "
+            "not replayed"
+            for one in plan.features
+            if one.name not in {each.name for each in features}
+        ]
+        plan = replace(plan, features=features)
         self._inputs, self._plan, self._row = inputs, plan, row
         self._record, self._stop, self._events = CycleRecord(plan.layout), StopFlag(), _NoEvents()
         self._clock = RecordedClock(inputs.start_ns - plan.period_ns)
@@ -354,8 +364,9 @@ class RecordedRun:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """A sentence for each command that was done in the run and is refused now, or the other way round."""
-        return self._inbox.remarks
+        """A sentence for each feature that is not installed, and for each command that was done in the run
+        and is refused now, or the other way round."""
+        return [*self._missing, *self._inbox.remarks]
 
     def run(self, compare: Compare) -> LoopResult:
         """Run all cycles that can be run again.

@@ -37,6 +37,12 @@ def installed_features() -> tuple[Feature, ...]:
     return _installed()[0]
 
 
+def find_installed(features: Iterable[Feature]) -> tuple[Feature, ...]:
+    """Return the installed features with the names of these: a log may name any package to import."""
+    names = {feature.name for feature in features}
+    return tuple(feature for feature in installed_features() if feature.name in names)
+
+
 def forget_installed() -> None:
     """Look for installed features again when they are needed next."""
     _installed.cache_clear()

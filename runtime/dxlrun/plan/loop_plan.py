@@ -11,6 +11,8 @@ import msgspec
 
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
+from dxlrun.features import FEATURES
+from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import SLOW_SPEEDS, PolicyPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
@@ -363,6 +365,10 @@ class LoopPlan(msgspec.Struct, frozen=True):
     sources: tuple[SourcePlan, ...] = ()  # Devices, then sensors
     urdf: str | None = None  # The robot's URDF as it was read; None: the robot file names none
     sensors: tuple[SensorPlan, ...] = ()  # In the order of those of the sources that are sensors
+    features: tuple[Feature, ...] = FEATURES
+    """Features that take part in the run."""
+    feature_plans: dict[str, bytes] = {}
+    """What a feature compiled for its own part in the run, by its name."""
 
     @property
     def origins(self) -> frozenset[str]:

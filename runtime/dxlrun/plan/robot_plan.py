@@ -8,7 +8,6 @@ import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import Mark
-from dxlrun.features import FEATURES
 from dxlrun.features.feature import Feature
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
@@ -59,10 +58,16 @@ class Plan(msgspec.Struct, frozen=True):
     sensors, servo models, physics and hooks of the loop."""
     mechanics: MechanicsPlan = MechanicsPlan()
     """Which servos move which joints; empty: each joint has one servo."""
-    features: tuple[Feature, ...] = FEATURES
-    """Features that take part in the run."""
-    feature_plans: dict[str, bytes] = {}
-    """What a feature compiled for its own part in the run, by its name."""
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Features that take part in the run."""
+        return self.loop.features
+
+    @property
+    def feature_plans(self) -> dict[str, bytes]:
+        """What a feature compiled for its own part in the run, by its name."""
+        return self.loop.feature_plans
 
     @property
     def urdf(self) -> str | None:
