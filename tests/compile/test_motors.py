@@ -230,7 +230,7 @@ def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too() -> None:
     with pytest.raises(RefusedRequest, match="more needs the motor of elbow, which has no motor file"):
         preparation.controller(entry | {"joints": ["elbow"]}, {}, 200.0)
     assert with_settings(loop, [Setting("law", ("scale",), 0.5)], plugins) != loop
-    with pytest.raises(InputError, match="law: the controller needs the motor of elbow"):
+    with pytest.raises(InputError, match="--set law: law needs the motor of elbow"):
         with_settings(loop, [Setting("law", ("joints",), ["elbow"])], plugins)
 
 

@@ -1,3 +1,4 @@
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -12,6 +13,7 @@ from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import robot
 from dxlrun.compile.robot import compile_files
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
+from dxlrun.remote.preparation import Preparation, RefusedRequest
 
 
 class Goals(CommandModel):
@@ -79,6 +81,28 @@ def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
     assert controller.topics == ("/mine/main",)
     (problem,) = problems_in(text.replace("mine:", "bus:"))
     assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "call bus otherwise")
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"type": "forein"},
+        {"type": "position_controllers/JointGroupPositionController", "joints": ["left_arm_joint"]},
+        {"type": "raising"},
+        {"type": "joint_group_position_controller", "joints": ["pam", "left_arm_joint", "left_arm_joint"]},
+        {"type": "joint_group_position_controller", "joints": ["left_arm_joint"], "into": "mine"},
+    ],
+    ids=str,
+)
+def test_an_entry_gets_the_same_sentences_in_a_file_and_from_a_client(entry: dict[str, object]) -> None:
+    said = problems_in(FOREIGN.replace("{type: foreign}", json.dumps(entry)))
+    plugins = robot.load_plugins()
+    loop = compile_text(FOREIGN).plan.loop
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
+    with pytest.raises(RefusedRequest) as refused:
+        preparation.controller({"name": "mine", **entry}, {}, 50.0)
+    assert str(refused.value) == "; ".join(f"{one.what}; {one.fix}" for one in said)
 
 
 HOOKED = """\

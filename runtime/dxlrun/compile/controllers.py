@@ -2,45 +2,42 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TypeVar
 
-import msgspec
 import numpy as np
-from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.compile.contribution import Contribution
+from dxlrun.compile.controller_entry import (
+    CompiledController,
+    WrongEntry,
+    compile_entry,
+    find_offer,
+    plan_entry,
+    require_fit,
+)
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import report_speed
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
-from dxlrun.contract.controller import Interfaces, SpeedPeak
+from dxlrun.contract.controller import SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
-from dxlrun.control.controllers.graph import below
-from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
+from dxlrun.control.controllers.graph import below, rate_divider, rate_fits
+from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.controllers.single_files import file_of, is_of_file
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form import ParametersModel, PlugInEntry
 from dxlrun.description.mistakes.foreign import ros_type
 from dxlrun.description.problems import errors_between_keys, problems_of
 from dxlrun.description.reading import Description
-from dxlrun.description.robot import ControllerEntry
-from dxlrun.errors import Mark, suggestion
+from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlwire.modes import CommandName, Mode, mode_of
+from dxlwire.modes import Mode, mode_of
 from dxlwire.plan.mode_plan import LACKS, controls_speed, model_modes
 
-_RATE_TOLERANCE = 1e-6  # Relative; a loop rate of 33.3 Hz is three times 11.1 Hz
-_OFFERED = (
-    "install the package that offers it into this environment (`pip install PACKAGE`); "
-    "`dxlrun plugins` lists the types that there are"
-)
-_REMOVED = {
-    "joint_limiter": "take it out: the gate keeps all goals within `limits` of their joints",
-}
-"""Types of earlier versions, and what to do instead."""
+Made = TypeVar("Made")
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
     Mode.VELOCITY: "a velocity alone",
@@ -48,17 +45,6 @@ _INTERFACE: Mapping[Mode, str] = {
     Mode.PWM: "a PWM",
     Mode.EFFORT_POSITION: "a position with an effort",
 }
-
-
-class CompiledController(msgspec.Struct, frozen=True):
-    """A controller whose type is known and whose parameters are valid."""
-
-    plan: ControllerPlan
-    offer: Offer
-    parameters: ParametersModel
-    motors: tuple[str, ...] = ()  # Figures of its joints' motors that it needs
-    asked_by: Mapping[CommandName, KeyPath] = {}
-    """The key of its parameters for which it claims a command interface, see `Interfaces`."""
 
 
 def read_controller_files(file: RobotFile) -> dict[str, str]:
@@ -93,7 +79,7 @@ def compile_controllers(
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
     for name, entry in file.robot.controllers.items():
-        plan = entry_plan(name, entry, _every(file, name, entry.rate))
+        plan = plan_entry(name, entry, _every(file, name, entry.rate))
         one = _compiled(file, plan, plugins)
         if one is not None:
             compiled[name] = one
@@ -115,91 +101,71 @@ def compile_controllers(
 
 def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
     """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
-    name, entry = plan.name, file.robot.controllers[plan.name]
+    name, robot = plan.name, file.robot
     offer = _offer(file, name, plan.type, plugins)
     if offer is None:
         return None
-    model = offer.controller.Parameters
-    parameters = parameters_of(file, "controller", name, entry, offer.distribution, model=model)
-    if parameters is None:
-        return None
-    written = entry.parameters
-    wrapping = {joint for joint, described in file.robot.joints.items() if described.wrap}
-    if (found := wrapped(written, offer.controller.Parameters, wrapping)) is not written:
-        parameters = offer.controller.Parameters.model_validate(found)
-        plan = replace(plan, parameters=json.dumps(found))
-    interfaces = _interfaces(file, name, offer, parameters)
-    if interfaces is None:
-        return None
-    try:
-        topics = tuple(offer.controller.topics(parameters))
-    except Exception as error:
-        at_fault(file, "controller", name, offer.distribution, raised("name its topics", error))
-        return None
-    whole = class_plan(plan, offer, interfaces, topics)
-    buses = (f"/bus/{bus}" for bus in file.robot.buses)
-    if taken := set(whole.topics).intersection(buses):
+    wrapping = {joint for joint, described in robot.joints.items() if described.wrap}
+
+    def make() -> CompiledController:
+        groups = file.description.groups
+        return compile_entry(plan, offer, tuple(robot.joints), wrapping=wrapping, groups=groups)
+
+    found = report_entry(file, "controller", name, robot.controllers[name], offer.controller.Parameters, make)
+    buses = {f"/bus/{bus}" for bus in robot.buses}
+    if found is not None and (taken := buses.intersection(found.plan.topics)):
         mark = file.key("controllers", name)
         file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
-    return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
-
-
-def wrapped(
-    parameters: dict[str, object], model: type[ParametersModel], wrapping: Collection[str]
-) -> dict[str, object]:
-    """Return the parameters of a controller with `wrap`, where they leave it out and some joints wrap.
-
-    A controller that cannot wrap them, such as one of velocities, keeps its own.
-    """
-    joints = parameters.get("joints")
-    if "wrap" not in model.model_fields or "wrap" in parameters or not isinstance(joints, list | tuple):
-        return parameters
-    if not (own := [joint for joint in joints if joint in wrapping]):
-        return parameters
-    found = {**parameters, "wrap": own}
-    try:
-        model.model_validate(found)
-    except Exception:  # a plug-in's code; the parameters as written are checked by themselves
-        return parameters
     return found
 
 
-def entry_plan(name: str, entry: ControllerEntry, every: int) -> ControllerPlan:
-    """Return what the entry of a controller says, without what its class asks for."""
-    return ControllerPlan(
-        name=name,
-        type=entry.type,
-        distribution="",
-        parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
-        joints=(),
-        command=(),
-        publishes=(),
-        active=entry.active,
-        every=every,
-        rate=entry.rate,
-        fallback=entry.fallback or "",
-        into=entry.into,
-    )
+def report_entry(  # noqa: PLR0917  an entry, and what is made of it
+    file: RobotFile,
+    kind: str,
+    name: str,
+    entry: PlugInEntry,
+    model: type[ParametersModel],
+    make: Callable[[], Made],
+) -> Made | None:
+    """Return what is made of an entry; None where it has mistakes, which become problems of the file.
+
+    Args:
+        file: Robot file.
+        kind: Word for the class in messages, with which its section is named: `sensor`.
+        name: Name of the entry.
+        entry: Entry of the section.
+        model: Form of its parameters.
+        make: Checks the entry; may raise ValidationError and WrongEntry.
+    """
+    try:
+        return make()
+    except ValidationError as error:
+        prefix = (f"{kind}s", name)
+        beside = sorted(type(entry).model_fields.keys() - {"parameters"})
+        file.extend(
+            problems_of(error, file.marks, prefix, model=model, beside=beside, document=type(file.robot))
+        )
+        between = errors_between_keys(entry.parameters, error, model)
+        if between is not None:
+            replaced = {(*prefix, *path) for path in between[1]}
+            file.extend(problems_of(between[0], file.marks, prefix, model=model, unknown=replaced))
+    except WrongEntry as wrong:
+        _report(file, wrong)
+    return None
 
 
-def class_plan(
-    plan: ControllerPlan, offer: Offer, interfaces: Interfaces, topics: Sequence[str]
-) -> ControllerPlan:
-    """Return the plan of an entry with what the controller's class asks for."""
-    return replace(
-        plan,
-        distribution=offer.distribution,
-        joints=interfaces.joints,
-        command=interfaces.command,
-        publishes=offer.controller.publishes,
-        reference=interfaces.reference,
-        reads=interfaces.reads,
-        provides=interfaces.provides,
-        source_commands=interfaces.device_commands,
-        takeovers=interfaces.takeovers,
-        partial=interfaces.partial,
-        topics=tuple(f"/{plan.name}/{topic}" for topic in topics),
-    )
+def _report(file: RobotFile, wrong: WrongEntry) -> None:
+    for mistake in wrong.mistakes:
+        file.error(_entry_mark(file.description, mistake.at), mistake.what, mistake.fix)
+
+
+def _entry_mark(description: Description, at: KeyPath) -> Mark:
+    """Return the place of an entry, of one of its keys, or of a joint that its parameters name."""
+    if not at[2:]:
+        return description.marks.key(*at)
+    if description.marks.has(at):
+        return description.marks.value(*at)
+    return joint_mark(description, str(at[1]), ".".join(map(str, at[2:])))
 
 
 def _check_graph(
@@ -245,134 +211,26 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
 def _every(file: RobotFile, name: str, rate: float | None) -> int:
     """Return of how many cycles the controller is updated in one; 0 where its rate is wrong."""
     loop = file.robot.loop.rate
-    if rate is None:
-        return 1
-    mark = file.at("controllers", name, "rate")
-    if rate > loop * (1 + _RATE_TOLERANCE):
-        file.error(
-            mark,
-            f"rate {rate:g} Hz of {name} is above the loop's {loop:g} Hz",
-            f"the nearest possible is {loop:g}",
-        )
-        return 0
-    every = max(1, round(loop / rate))
-    if abs(every * rate - loop) > _RATE_TOLERANCE * loop:
-        file.error(
-            mark,
-            f"rate {rate:g} Hz of {name} does not divide the loop's {loop:g} Hz",
-            f"the nearest possible is {loop / every:.6g}",
-        )
-        return 0
-    return every
+    period_ns = round(1e9 / loop)
+    every = rate_divider(rate, period_ns)
+    if rate is None or rate_fits(rate, period_ns):
+        return every
+    problem = "is above" if rate > loop else "does not divide"
+    what = f"rate {rate:g} Hz of {name} {problem} the loop's {loop:g} Hz"
+    file.error(file.at("controllers", name, "rate"), what, f"the nearest possible is {loop / every:.6g}")
+    return 0
 
 
 def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offer | None:
+    ros = ros_type(type_name, plugins.controllers)
     offer = plugins.controllers.get(type_name)
-    mark = file.at("controllers", name, "type")
-    if offer is None and (ros := ros_type(type_name, plugins.controllers)):
-        what, fix, ours = ros
-        file.error(mark, what, fix)
-        return plugins.controllers.get(ours)  # so that its parameters are checked, too
-    if offer is None and is_of_file(type_name):
-        if type_name in plugins.broken:  # else its file could not be read
-            file.error(mark, f"{type_name} of {name} cannot be used", plugins.broken[type_name])
-    elif offer is None:
-        what = f"no plug-in offers the controller type {type_name} of {name}"
-        file.error(mark, what, where_to_get(type_name, tuple(plugins.controllers), plugins.broken))
-    return offer
-
-
-def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]) -> str:
-    """Return how to get a type of plug-ins: another spelling, another package, or the repair of a broken one.
-
-    `known` are the types that there are, `broken` the plug-ins that cannot be used.
-    """
-    if type_name in broken:  # two plug-ins offer it
-        return broken[type_name]
-    if type_name in _REMOVED:
-        return _REMOVED[type_name]
-    close = suggestion(type_name, known, _OFFERED)
-    if not broken:
-        return close
-    why = "; ".join(broken.values())
-    return f"{close} If not: {why}" if close.endswith("?") else why
-
-
-def parameters_of(
-    file: RobotFile,
-    kind: str,
-    name: str,
-    entry: PlugInEntry,
-    distribution: str,
-    *,
-    model: type[ParametersModel],
-) -> ParametersModel | None:
-    """Return the parameters of a plug-in's class, such as a controller; None where they are wrong.
-
-    Args:
-        file: Robot file; problems are added to it.
-        kind: Word for the class in messages, with which its section is named: `sensor`.
-        name: Name of the entry.
-        entry: Entry of the section.
-        distribution: Publisher of the class.
-        model: Form of the parameters.
-    """
+    if offer is None and is_of_file(type_name) and not ros and type_name not in plugins.broken:
+        return None  # its file could not be read, which is reported
     try:
-        return model.model_validate(entry.parameters)
-    except ValidationError as error:
-        prefix = (f"{kind}s", name)
-        beside = sorted(type(entry).model_fields.keys() - {"parameters"})
-        file.extend(
-            problems_of(error, file.marks, prefix, model=model, beside=beside, document=type(file.robot))
-        )
-        between = errors_between_keys(entry.parameters, error, model)
-        if between is not None:
-            replaced = {(*prefix, *path) for path in between[1]}
-            file.extend(problems_of(between[0], file.marks, prefix, model=model, unknown=replaced))
-    except Exception as error:  # a validator of the model is foreign code
-        at_fault(file, kind, name, distribution, raised("check its parameters", error))
-    return None
-
-
-def at_fault(file: RobotFile, kind: str, name: str, distribution: str, breach: tuple[str, str]) -> None:
-    """Add a mistake in the code of a plug-in, and how to fix it."""
-    what, fix = breach
-    file.error(file.key(f"{kind}s", name), f"{kind} {name} ({distribution}) {what}", fix)
-
-
-def raised(what: str, error: Exception) -> tuple[str, str]:
-    """Return what a plug-in's code raised, and how to fix it."""
-    raised = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"cannot {what}: {raised}", "correct its parameters, or its plug-in"
-
-
-def _interfaces(file: RobotFile, name: str, offer: Offer, parameters: ParametersModel) -> Interfaces | None:
-    """Return the interfaces that a controller claims; what its code raises is a problem of the file."""
-    joints = tuple(file.robot.joints)
-    try:
-        interfaces = offer.controller.interfaces(parameters, joints)
-    except Exception as error:
-        at_fault(file, "controller", name, offer.distribution, raised("name its interfaces", error))
-        return None
-    chained = bool(file.robot.controllers[name].into)
-    breach = interfaces_breach(interfaces, chained=chained)
-    if breach is not None:
-        what, fix = breach
-        at_fault(file, "controller", name, offer.distribution, (what, f"report it to its author: {fix}"))
-        return None
-    known = (*joints, *file.description.groups)
-    seen: set[str] = set()
-    good = True
-    for joint in interfaces.joints:
-        mark = joint_mark(file.description, name, joint)
-        if joint not in joints:
-            file.error(mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, known))
-            good = False
-        elif joint in seen:
-            file.error(mark, f"{name} names joint {joint} twice", "name it once")
-            good = False
-        seen.add(joint)
-    return interfaces if good else None
+        return find_offer(name, type_name, plugins)
+    except WrongEntry as wrong:
+        _report(file, wrong)
+    return plugins.controllers.get(ros[2]) if ros else None  # so that its parameters are checked, too
 
 
 def check_robot(
@@ -384,22 +242,16 @@ def check_robot(
     """Refuse controllers that the robot does not fit: motors, servos, the URDF."""
     robot = file.robot
     plans = {name: joint.plan for name, joint in joints.items()}
-    for name, controller in controllers.items():
+    for controller in controllers.values():
         own = [plans[joint] for joint in controller.plan.joints if joint in plans]
         # what is named and could not be used has its own problems
         unread = [one for one in own if one.motor is None and _names_motor(joints[one.name])]
         if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
             continue
         try:
-            found = mismatches(
-                controller.offer.controller, controller.parameters, controller.motors, own, urdf
-            )
-        except Exception as error:
-            breach = raised("compare itself with the robot", error)
-            at_fault(file, "controller", name, controller.offer.distribution, breach)
-            continue
-        for one in found:
-            file.error(_mismatch_mark(file.description, name, one.at), f"{name} {one.what}", one.fix)
+            require_fit(controller, own, urdf)
+        except WrongEntry as wrong:
+            _report(file, wrong)
 
 
 def check_motions(
@@ -423,21 +275,13 @@ def check_motions(
         for peak in sorted(seen, key=lambda peak: -abs(peak.speed)):
             if peak.joint in joints and (peak.joint, peak.at) not in told:
                 told.add((peak.joint, peak.at))
-                mark = _mismatch_mark(file.description, name, peak.at)
+                mark = _entry_mark(file.description, ("controllers", name, *peak.at.split(".")))
                 where = f" at {peak.time:.3f} s, {peak.where}"
                 report_speed(joints[peak.joint].plan, peak.speed, where, mark, file)
 
 
 def _names_motor(joint: CompiledJoint) -> bool:
     return any(servo.described.motor is not None for servo in joint.servos)
-
-
-def _mismatch_mark(description: Description, name: str, at: str) -> Mark:
-    """Return the place of a key of a controller, or else where it names a joint."""
-    path: KeyPath = ("controllers", name, *at.split("."))
-    return (
-        description.marks.value(*path) if description.marks.has(path) else joint_mark(description, name, at)
-    )
 
 
 def compile_modes(

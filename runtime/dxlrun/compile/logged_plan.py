@@ -6,11 +6,11 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from msgspec.structs import replace
 from pydantic import ValidationError
 
+from dxlrun.compile.controller_entry import WrongEntry, compile_entry, require_fit
 from dxlrun.compile.robot import Compiled, compile_robot
-from dxlrun.control.controllers.plugins import PlugIns, mismatches
+from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.description.document import confined
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.reading import read_robot
@@ -76,35 +76,17 @@ def replan_controller(
     offer = plugins.controllers.get(plan.type)
     if offer is None:
         return plan  # the manager reports it
+    wrapping = {name for name, joint in joints.items() if joint.wrap}
     try:
-        parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
-        interfaces = offer.controller.interfaces(parameters, tuple(joints))
+        found = compile_entry(plan, offer, tuple(joints), wrapping=wrapping)
+        require_fit(found, [joints[joint] for joint in found.plan.joints], urdf)
     except ValidationError as error:
         wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
         prefix = change.removesuffix(plan.name)
         raise InputError("\n".join(f"{prefix}{sentence}" for sentence in wrong)) from error
-    except Exception as error:  # foreign code: one sentence instead of its traceback
-        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
-    unknown = [joint for joint in interfaces.joints if joint not in joints]
-    if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
-        what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
-        raise InputError(f"{change}: the controller would want {what}")
-    own = [joints[joint] for joint in interfaces.joints]
-    try:
-        found = mismatches(offer.controller, parameters, interfaces.motors, own, urdf)
-    except Exception as error:  # as above
-        raise InputError(f"{change}: {type(error).__name__}: {error}") from error
-    if found:
-        raise InputError(f"{change}: the controller {found[0].what}")
-    changed = replace(
-        plan,
-        joints=interfaces.joints,
-        command=interfaces.command,
-        reference=interfaces.reference,
-        reads=interfaces.reads,
-        provides=interfaces.provides,
-        source_commands=interfaces.device_commands,
-    )
+    except WrongEntry as error:
+        raise InputError(f"{change}: {error}") from error
+    changed = found.plan
     if changed.references != plan.references:
         raise InputError(f"{change}: the controller would export other references than those of the log")
     if changed.provides != plan.provides:

@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import structs
 from pydantic import ValidationError
 
-from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_samples
 from dxlrun.compile.problems import Problems

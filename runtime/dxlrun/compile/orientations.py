@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 from dxlrun.compile.contribution import Contribution
-from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import suggestion

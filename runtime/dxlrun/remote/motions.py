@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import structs
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.limits import PEAK_OVER_MEAN, check_samples
 from dxlrun.compile.motions import (
     TRAJECTORY,

@@ -16,25 +16,19 @@ from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.compile.controllers import (
+from dxlrun.compile.controller_entry import (
     CompiledController,
-    class_plan,
-    entry_plan,
-    where_to_get,
-    wrapped,
+    WrongEntry,
+    compile_entry,
+    find_offer,
+    plan_entry,
+    require_fit,
 )
 from dxlrun.compile.graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.contract.controller import Interfaces
-from dxlrun.control.controllers.managed import rate_divider, rate_fits
-from dxlrun.control.controllers.plugins import (
-    ControllerClass,
-    Offer,
-    PlugIns,
-    interfaces_breach,
-    mismatches,
-)
+from dxlrun.control.controllers.graph import rate_divider, rate_fits
+from dxlrun.control.controllers.plugins import ControllerClass, PlugIns
 from dxlrun.description.form import Name, ParametersModel
 from dxlrun.description.joints.groups import Groups, without_groups
 from dxlrun.description.problems import sentences_of
@@ -297,20 +291,29 @@ class Preparation:
             raise refused(Code.NAME_TAKEN, {"controller": name, "hint": hint})
         if entry.get("active"):
             raise invalid(f"{name} cannot be active at once; load it, then switch to it")
-        offer = self.plugins.controllers.get(written.type)
-        if offer is None:
-            hint = where_to_get(written.type, tuple(self.plugins.controllers), self.plugins.broken)
-            raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
-        wrapping = {joint.name for joint in self.joints.values() if joint.wrap}
-        parameters = wrapped(written.parameters, offer.controller.Parameters, wrapping)
-        written = written.model_copy(update={"parameters": parameters})
-        interfaces, topics = self._interfaces(name, offer, written)
-        alone = replace(entry_plan(name, written, every=1), active=False)  # the loop knows its own rate
-        plan = class_plan(alone, offer, interfaces, topics)
+        plan = self._compiled(
+            replace(plan_entry(name, written, every=1), active=False)
+        )  # the loop knows its own rate
         known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
         if found := [one for one in self._mistakes((*others.values(), plan), rate) if one not in known]:
-            raise invalid("; ".join(f"{one.what}; {one.fix}" for one in found[:_MOST_MISTAKES]))
+            raise _refuse_entry(found)
         return plan
+
+    def _compiled(self, plan: ControllerPlan) -> ControllerPlan:
+        """Return a controller with what its class asks for; raises RefusedRequest."""
+        model: type[ParametersModel] = ParametersModel
+        try:
+            with bounded(plan.name):
+                offer = find_offer(plan.name, plan.type, self.plugins)
+                model = offer.controller.Parameters
+                wrapping = {joint.name for joint in self.joints.values() if joint.wrap}
+                found = compile_entry(plan, offer, tuple(self.joints), wrapping=wrapping, groups=self.groups)
+                require_fit(found, [self.joints[joint] for joint in found.plan.joints], self.urdf)
+        except ValidationError as error:
+            raise invalid(mistakes(error, plan.name, model)) from error
+        except WrongEntry as wrong:
+            raise _refuse_entry(wrong.mistakes) from wrong
+        return found.plan
 
     def _mistakes(self, plans: Sequence[ControllerPlan], rate: float) -> list[Mistake]:
         """Return what is wrong with the controllers of a run as a graph, at this rate of the loop."""
@@ -321,29 +324,6 @@ class Preparation:
             for plan in plans
         ]
         return list(ControllerGraph(tuple(self.joints), now, self.sources).mistakes())
-
-    def _interfaces(
-        self, name: str, offer: Offer, written: ControllerEntry
-    ) -> tuple[Interfaces, tuple[str, ...]]:
-        """Return the interfaces that a controller's class asks for with these parameters, and its topics."""
-        with plugin_code(name, name, offer.controller.Parameters):
-            parameters = offer.controller.Parameters.model_validate(written.parameters)
-        with plugin_code(name, f"the interfaces of {name} are not known"):
-            interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
-            topics = tuple(offer.controller.topics(parameters))
-        if breach := interfaces_breach(interfaces, chained=bool(written.into)):
-            raise invalid(f"{name} ({offer.distribution}) {breach[0]}; report it to its author: {breach[1]}")
-        if unknown := [joint for joint in interfaces.joints if joint not in self.joints]:
-            hint = suggestion(unknown[0], tuple(self.joints))
-            raise invalid(f"{name} asks for joint {unknown[0]}, which there is not; {hint}")
-        if len(set(interfaces.joints)) != len(interfaces.joints):
-            raise invalid(f"{name} names a joint twice; name it once")
-        joints = [self.joints[joint] for joint in interfaces.joints]
-        with plugin_code(name, f"{name} cannot be compared with the robot"):
-            found = mismatches(offer.controller, parameters, interfaces.motors, joints, self.urdf)
-        if found:
-            raise invalid(f"{name} {found[0].what}; {found[0].fix}")
-        return interfaces, topics
 
 
 # Quantities with units
@@ -480,6 +460,11 @@ def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
     ]
     left = max(0, error.error_count() - _MOST_MISTAKES)
     return "; ".join(sentences) + (f"; and {left} more" if left else "")
+
+
+def _refuse_entry(found: Sequence[Mistake]) -> RefusedRequest:
+    """Return the refusal of a controller's entry."""
+    return invalid("; ".join(_one_line(f"{one.what}; {one.fix}") for one in found[:_MOST_MISTAKES]))
 
 
 def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRequest:

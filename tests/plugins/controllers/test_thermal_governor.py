@@ -187,5 +187,5 @@ def test_a_controller_that_is_loaded_or_replayed_otherwise_is_compared_with_the_
     with pytest.raises(RefusedRequest, match=r"more lets j become 90 deg C hot.*; write limit: 75 at most"):
         preparation.controller(entry | {"limit": 90}, {}, 50.0)
     with_settings(loop, [Setting("hot", ("limit",), 70)], plugins)
-    with pytest.raises(InputError, match="--set hot: the controller lets j become 90 deg C hot"):
+    with pytest.raises(InputError, match="--set hot: hot lets j become 90 deg C hot"):
         with_settings(loop, [Setting("hot", ("limit",), 90)], plugins)

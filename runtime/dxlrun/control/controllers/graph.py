@@ -7,6 +7,7 @@ controller provides: that controller before it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from heapq import heapify, heappop, heappush
@@ -159,3 +160,16 @@ def _sorter(plans: Sequence[ControllerPlan], found: Iterable[Edge]) -> Topologic
     for edge in found:
         before[edge.after].append(edge.before)
     return TopologicalSorter(before)
+
+
+def rate_fits(rate: float | None, period_ns: int) -> bool:
+    """Return whether a controller's own rate can be kept: the loop's is a multiple of it."""
+    if rate is None:
+        return True
+    divider = 1e9 / period_ns / rate if rate > 0 else 0.0
+    return math.isfinite(divider) and round(divider) >= 1 and abs(divider - round(divider)) < 1e-6 * divider
+
+
+def rate_divider(rate: float | None, period_ns: int) -> int:
+    """Return every how many cycles a controller is updated; its rate fits."""
+    return 1 if rate is None else max(1, round(1e9 / period_ns / rate))

@@ -12,7 +12,6 @@ else; what drives it is `switching.py`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum, unique
 from functools import partial
@@ -29,7 +28,7 @@ from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.goals import Commanded, RunningGoal
-from dxlrun.control.controllers.graph import Plans
+from dxlrun.control.controllers.graph import Plans, rate_divider
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
@@ -74,19 +73,6 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
 )
 """Every legal transition. Another one is a mistake of this program, which ends the controller: only what is
 called where a ControllerFault ends it, `activate` and commands, has events that a state lacks."""
-
-
-def rate_fits(rate: float | None, period_ns: int) -> bool:
-    """Return whether a controller's own rate can be kept: the loop's is a multiple of it."""
-    if rate is None:
-        return True
-    divider = 1e9 / period_ns / rate if rate > 0 else 0.0
-    return math.isfinite(divider) and round(divider) >= 1 and abs(divider - round(divider)) < 1e-6 * divider
-
-
-def rate_divider(rate: float | None, period_ns: int) -> int:
-    """Return every how many cycles a controller is updated; its rate fits."""
-    return 1 if rate is None else max(1, round(1e9 / period_ns / rate))
 
 
 class Request(NamedTuple):

@@ -18,10 +18,10 @@ from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts, parted_couplings
 from dxlrun.control.controllers.goals import Commanded, Goals, PlayedMotion, PlayedPart, RunningGoal
-from dxlrun.control.controllers.graph import Plans, commander, update_order
+from dxlrun.control.controllers.graph import Plans, commander, rate_divider, rate_fits, update_order
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
-from dxlrun.control.controllers.managed import Managed, Request, State, rate_divider, rate_fits
+from dxlrun.control.controllers.managed import Managed, Request, State
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import SetModes, Switching, fault_of
 from dxlrun.control.controllers.topics import TopicLog

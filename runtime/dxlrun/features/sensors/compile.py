@@ -6,12 +6,12 @@ import json
 from collections.abc import Collection
 
 from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
-from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to_get
+from dxlrun.compile.controller_entry import PlugInCode, where_to_get
+from dxlrun.compile.controllers import report_entry
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.sensors.offer import SensorOffer, names_breach
 from dxlrun.description.bus import SIMULATED
-from dxlrun.description.form import ParametersModel
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.sensors import form
 from dxlrun.features.sensors.form import SensorEntry
@@ -53,10 +53,9 @@ def _compiled(
             where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
         )
         return None
-    parameters = parameters_of(file, "sensor", name, entry, offer.distribution, model=offer.sensor.Parameters)
-    if parameters is None:
-        return None
-    names = _names(file, name, offer, parameters)
+    names = report_entry(
+        file, "sensor", name, entry, offer.sensor.Parameters, lambda: _names(name, entry, offer)
+    )
     if names is None:
         return None
     states, links, noisy = names
@@ -86,23 +85,22 @@ def _compiled(
 
 
 def _names(
-    file: RobotFile, name: str, offer: SensorOffer, parameters: ParametersModel
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] | None:
-    """Return the states of a sensor, its links, and the states with noise; None where its code is wrong."""
-    sensor = offer.sensor
-    try:
+    name: str, entry: SensorEntry, offer: SensorOffer
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Return the states of a sensor, its links, and the states with noise.
+
+    Raises ValidationError (parameters), and WrongEntry.
+    """
+    sensor, code = offer.sensor, PlugInCode("sensor", name, offer.distribution)
+    parameters = code.parameters(entry.parameters, sensor.Parameters)
+    with code.asked_to("name its states and links"):
         states, links = sensor.states(parameters), sensor.links(parameters)
         breach = names_breach(states, links)
         noisy = () if breach else sensor.noisy(parameters)
-    except Exception as error:  # foreign code
-        at_fault(file, "sensor", name, offer.distribution, raised("name its states and links", error))
-        return None
     if not breach and not (isinstance(noisy, tuple) and set(noisy) <= set(states)):
         breach = f"returns {noisy!r} from noisy", "return a tuple of its states"
     if breach:
-        what, fix = breach
-        at_fault(file, "sensor", name, offer.distribution, (what, f"report it to its author: {fix}"))
-        return None
+        raise code.broken(breach)
     return states, links, noisy
 
 
