@@ -14,9 +14,7 @@ CAUGHT_UP, SKIPPED = [0, 1, 2, 3, 4, 5], [0, 1, 4, 5]
 
 def ran(robot, policy, *hooks, late=(1,), periods=6):
     """Run a robot whose cycles at these places take 2.5 periods; return the numbers of its cycles."""
-    robot.build(end_ns=periods * PERIOD_NS, overrun=policy)
-    robot.loop.overrun_hooks = hooks
-    robot.loop.__post_init__()
+    robot.build(end_ns=periods * PERIOD_NS, overrun=policy, overrun_hooks=hooks)
     robot.run(work=dict.fromkeys(late, 2.5))
     return robot.column("cycle")
 
@@ -76,11 +74,10 @@ def test_a_plug_in_that_fails_is_an_event_and_not_asked_again(robot, decide, why
 
 
 def test_another_rate_is_told_to_the_clock_which_polls_before_each_deadline(robot):
-    told = []
-    robot.build().loop.steering.pace = told.append
+    robot.build()
     assert robot.loop.steering.change_rate(100) is None
     assert robot.loop.steering.change_rate(0).code is Code.RATE_OUT_OF_RANGE
-    assert told == [10_000_000]
+    assert robot.periods == [10_000_000]
 
 
 PLUGIN = """

@@ -244,11 +244,11 @@ def test_a_change_of_rate_keeps_the_share_and_leaves_half_of_a_period_to_others(
     clock, pace, _ = pacing(None, [400_000])
     margins = []
     for period_ns in (20_000_000, 1_000_000, 20_000_000):
-        pace(period_ns)
+        pace.set_period(period_ns)
         margins.append(clock.spin_ns)
     assert margins == [600_000, 100_000, 600_000]
     clock, pace, _ = pacing(1_000_000, [4_000_000])
-    pace(1_000_000)
+    pace.set_period(1_000_000)
     assert clock.spin_ns == 500_000
 
 

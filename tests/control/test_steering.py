@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, plan_of
 
 from dxlrun.channels.answers import Code, Done
@@ -454,8 +453,7 @@ def test_a_controller_that_starts_a_thread_while_it_is_configured_is_refused(lef
         asked.append(name)
         raise PlugInError(f"plug-in {name} started 1 more thread")
 
-    manager = left.build().manager
-    manager._plugins = replace(manager._plugins, after_each=count)
+    left.build().after_each = count
     assert left.run(4, {1: [left.asks("pause"), left.loads("x", **LEFT)]}).reason == "stopped"
     assert "1 more thread" in left.refusals[2]
     assert asked == ["of controller x"]

@@ -15,10 +15,11 @@ from dxlrun.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
+from dxlrun.control.context import ControlContext, StopFlag
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.plugins import Offer, OverrunHook, PlugIns
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.loop import Loop
 from dxlrun.plan.loop_plan import (
     ControllerPlan,
     JointPlan,
@@ -226,10 +227,14 @@ class Robot:
         self.taken: list[Any] = []
         self.patience: list[int] = []
         """How long the guardian is told to let a cycle take, ns"""
+        self.periods: list[int] = []
+        """Other periods than the plan's, which the clock gets, ns"""
         self.commands: list[ScheduledCommand] = []
         self.calls: list[Call] = []
         self.raises: dict[tuple[str, str], Exception] = {}
         """What a controller raises at its next step of a name: `("arm", "update")`"""
+        self.after_each: Callable[[str], None] = idle
+        """What is called after foreign code was imported or configured"""
         self.loop: Any = None
         self._asked = 0
         self._controllers: list[ControllerPlan] = []
@@ -294,38 +299,34 @@ class Robot:
 
     # Runs
 
-    def build(self, end_ns: int | None = None, activity: Any = None, **plan: Any) -> Robot:
+    def build(
+        self,
+        end_ns: int | None = None,
+        activity: Any = None,
+        overrun_hooks: tuple[OverrunHook, ...] = (),
+        **plan: Any,
+    ) -> Robot:
         """Configure the controllers, start the hardware."""
         self.plan = loop_plan(
             self.joints, self._controllers, **{"commands": tuple(self.commands), "end_ns": end_ns} | plan
         )
         self.record = CycleRecord(self.plan.layout)
         self.hardware = Hardware(self.record, self.clock)
-        self.manager = Manager(
-            self.plan,
-            PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"}),
-            self.record,
-            self.events,
-            self.clock,
-            set_modes=self.hardware.set_modes,
-            activity=activity,
-        )
-        self.gate = Gate(self.plan, self.record, self.events)
-        self.loop = Loop(
+        context = ControlContext(
+            plan=self.plan,
+            record=self.record,
             clock=self.clock,
             hardware=self.hardware,
-            manager=self.manager,
-            gate=self.gate,
-            record=self.record,
-            sink=self.sink,
             events=self.events,
-            plan=self.plan,
-            beat=self._beat,
-            stop=self.stop,
+            command_log=self,
             inbox=self.inbox,
-            commands=self,
-            cycle_limit=self.patience.append,
+            supervision=self,
         )
+        missing = {"broken_one": "plug-in broken_one of x 1 cannot be imported"}
+        plugins = PlugIns(self._offers, missing, after_each=self._after_each)
+        self.manager = Manager(context, plugins, activity=activity)
+        self.gate = Gate(self.plan, self.record, self.events)
+        self.loop = Loop(context, self.manager, self.gate, self.sink, overrun_hooks=overrun_hooks)
         self.manager.configure()
         self.hardware.start()
         return self
@@ -377,17 +378,28 @@ class Robot:
 
     def keep_nothing(self) -> None:
         """Record nothing more: memory is what the test measures."""
-        nothing: Any = type("Nothing", (), {"append": idle, "take": idle})()
-        self.calls = self.hardware.written = nothing
+        nothing: Any = type("Nothing", (), {"append": idle})()
+        self.calls = self.hardware.written = self.taken = nothing
         self.sink.append = self.events.emit = self.inbox.answer = idle  # type: ignore[method-assign]
-        self.loop.commands = self.loop.steering.taken = nothing
 
     def take(self, command: Any) -> None:
         """Keep what the log gets."""
         self.taken.append(command)
 
-    def _beat(self) -> None:
+    def beat(self) -> None:
+        """Count a cycle that the guardian saw."""
         self.beats += 1
+
+    def limit_cycle(self, limit_ns: int) -> None:
+        """Keep what the guardian gets."""
+        self.patience.append(limit_ns)
+
+    def set_period(self, period_ns: int) -> None:
+        """Keep what the clock gets."""
+        self.periods.append(period_ns)
+
+    def _after_each(self, name: str) -> None:
+        self.after_each(name)
 
     # What came of it
 

@@ -57,7 +57,7 @@ class Clients(QueueInbox):
     def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
         super().__init__()
         self.record, self.asked = robot.record, asked
-        robot.robot.loop.inbox = robot.robot.loop.steering.inbox = self
+        robot.robot.loop.steering.inbox = self
 
     def take(self) -> Sequence[Command]:
         self.waiting.extend(self.asked.get(self.record.cycle, ()))

@@ -6,17 +6,17 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
+from msgspec.structs import force_setattr
 from tests.kit.line_faults import truncate_next
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.events import EventRing
 from dxlrun.errors import StartUpError
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.run.virtual_run import VirtualRobot
@@ -260,7 +260,7 @@ def test_a_request_during_a_policy_is_refused_because_the_run_ends(built, acts):
 
 @pytest.mark.parametrize("seen", [False, True])
 def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_from_its_end(
-    built, acts, seen
+    built, acts, seen, monkeypatch
 ):
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
@@ -269,8 +269,9 @@ def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_
     cut, lose = lambda: servo.poke("torque_enable", 0), lambda: servo.cut_power(START_NS - 50_000_000)
     bus.at(START_NS - 100_000_000, lose if seen else cut)
     said: list[str] = []
-    events = SimpleNamespace(emit=lambda code, severity, source, text, data=b"": said.append(text))
-    robot.robot.loop.events = events  # type: ignore[assignment]
+    monkeypatch.setattr(
+        EventRing, "emit", lambda ring, code, severity, source, text, data=b"": said.append(text)
+    )
     robot.run()
     assert servo.position < (HOME[3] - 20) * TICK
     limp = "is limp: it was reset, its torque was cut, or it shut itself down"
@@ -302,8 +303,7 @@ def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_
 def test_steps_are_cut_short_when_the_time_for_them_is_over(built, acts):
     robot = built(on_exit="[{pose: home, speed: 30 deg/s}, hold]")
     stop_signal(robot, acts)
-    plan = robot.robot.loop.plan
-    robot.robot.loop.plan = replace(plan, policies=replace(plan.policies, limit_ns=200_000_000))
+    force_setattr(robot.plan.loop.policies, "limit_ns", 200_000_000)
     assert robot.run().last == "hold"
     assert goals(robot, 3)[-1][0] < START_NS + 400_000_000
     assert goals(robot, 3)[0][1] < goals(robot, 3)[-1][1] < HOME[3]

@@ -24,7 +24,7 @@ from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
 from dxlrun.compile.robot import compile_robot
 from dxlrun.compile.simulation import simulation_of
-from dxlrun.control.loop import StopFlag
+from dxlrun.control.context import StopFlag
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.process_table import read_stat
@@ -250,7 +250,7 @@ def no_events() -> EventRing:
 
 def test_only_a_set_up_is_given_up_and_only_once(page):
     stop = StopFlag(requested=True)
-    beat = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0)
+    beat = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0).beat
     for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
         page.enter(phase)
         beat()
@@ -287,7 +287,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
         nonlocal count
         count += 1
         stop.requested = count >= transactions
-        pulse()
+        pulse.beat()
 
     clock, ledger = VirtualClock(), Ledger()
     buses = [SimulatedBus(config, ledger, 0) for config in simulation_of(plan).buses]
@@ -581,7 +581,7 @@ def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):
     with Stopped() as supervisor, Stopped() as guardian:
         loop_watch = LoopWatch(page, supervisor, guardian, 20 * MS, 0)
         clock = VirtualClock(0)
-        beat = Pulse(page, stop, loop_watch, events, no_stalls(), clock.now_ns)
+        beat = Pulse(page, stop, loop_watch, events, no_stalls(), clock.now_ns).beat
         page.enter(Phase.RUNNING)
         while not stop.requested:
             clock.wait_until(clock.now_ns() + 20 * MS)

@@ -5,17 +5,16 @@ Decided by the record of the cycle, so that a replay decides the same.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import CycleRecord, Floats, Torque
-from dxlrun.contract.hardware import Hardware
+from dxlrun.channels.cycle import Floats, Torque
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import STILL_SPEEDS
-from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
@@ -29,17 +28,11 @@ _HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
 class Anchoring:
     """Sets goals to where joints are, and starts the controllers of these joints again."""
 
-    def __init__(
-        self,
-        joints: Sequence[JointPlan],
-        hardware: Hardware,
-        switching: Switching,
-        gate: Gate,
-        record: CycleRecord,
-    ) -> None:
+    def __init__(self, context: ControlContext, switching: Switching, gate: Gate) -> None:
+        joints, record = context.plan.joints, context.record
         self._names = tuple(joint.name for joint in joints)
         self._moved = np.array([MOVED_DISTANCES[joint.unit] for joint in joints])
-        self._hardware = hardware
+        self._hardware = context.hardware
         self._switching = switching
         self._gate = gate
         self._record = record

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
-from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord
+from dxlrun.channels.cycle import LIMP, OFFLINE
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
-from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
@@ -35,19 +35,16 @@ class Halt:
     """
 
     def __init__(
-        self,
-        joints: Sequence[JointPlan],
-        switching: Switching,
-        record: CycleRecord,
-        answer: Callable[[int, Answer], None],
+        self, context: ControlContext, switching: Switching, answer: Callable[[int, Answer], None]
     ) -> None:
         """`answer` sends a client an answer, by the number of its command."""
+        joints = context.plan.joints
         self._joints = tuple(joint.name for joint in joints)
         self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
         self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
         """As fast as that a joint stands still, rad/s or m/s."""
         self._switching = switching
-        self._record = record
+        self._record = context.record
         self._answer = answer
         self.waiting: list[int] = []
         """Commands that wait for the joints to stand still."""

@@ -12,11 +12,10 @@ from functools import partial
 import msgspec
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
-from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
+from dxlrun.channels.cycle import LIMP, OFFLINE, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
-from dxlrun.contract.hardware import Hardware
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
-from dxlrun.plan.loop_plan import JointPlan
 
 
 class _Pending(msgspec.Struct):
@@ -36,19 +35,14 @@ class JointRequests:
     """Decides on requests for joints, hands them to the hardware, and answers them."""
 
     def __init__(
-        self,
-        joints: Sequence[JointPlan],
-        hardware: Hardware,
-        switching: Switching,
-        record: CycleRecord,
-        answer: Callable[[int, Answer], None],
+        self, context: ControlContext, switching: Switching, answer: Callable[[int, Answer], None]
     ) -> None:
         """`answer` sends a client an answer, by the number of its command."""
-        self._rows = {joint.name: row for row, joint in enumerate(joints)}
-        self._joints = joints
-        self._hardware = hardware
+        self._joints = context.plan.joints
+        self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
+        self._hardware = context.hardware
+        self._record = context.record
         self._switching = switching
-        self._record = record
         self._answer = answer
         self._pending: dict[int, _Pending] = {}
 

@@ -2,47 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol, cast, get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.answers import Answer
-from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
+from dxlrun.channels.commands import LOOP, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.contract.hardware import Hardware
-from dxlrun.control.anchoring import Anchoring
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
-from dxlrun.control.halt import Halt
-from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.monitors import build_monitors
-from dxlrun.control.monitors.monitor import Monitor
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.schedule import Schedule, schedule_of
+from dxlrun.control.schedule import schedule_of
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, ServoLimit
+from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
 from dxlrun.plan.policy_plan import Last, PolicyName
-from dxlwire.clock import Clock
-
-
-class StopFlag(msgspec.Struct):
-    """The request to stop; set by a signal's handler, seen at the next cycle."""
-
-    requested: bool = False
-
-    def request(self) -> None:
-        """Ask the loop to end orderly."""
-        self.requested = True
 
 
 class Sensors(Protocol):
@@ -79,7 +62,6 @@ class LoopResult(msgspec.Struct, frozen=True):
     """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
 
 
-@dataclass(slots=True, kw_only=True)
 class Loop:
     """One robot's control loop; hardware is started before and stopped after it by what built it.
 
@@ -89,75 +71,55 @@ class Loop:
     Commands from the inbox are taken after the wake-up, a bounded number of them.
     """
 
-    clock: Clock
-    hardware: Hardware
-    manager: Manager
-    gate: Gate
-    record: CycleRecord
-    sink: CycleSink
-    events: EventSink
-    plan: LoopPlan
-    beat: Callable[[], None]
-    """Shows the guardian that the loop lives; called once a cycle."""
-    stop: StopFlag
-    inbox: Inbox = field(default_factory=NoInbox)
-    commands: CommandSink = field(default_factory=NoCommands)
-    """Takes what came through the inbox, for the log."""
-    cycle_limit: Callable[[int], None] = lambda _: None
-    """Sets how long the guardian lets a cycle take from now on, ns."""
-    pace: Callable[[int], None] = lambda _: None
-    """Gives the clock another period, ns, so that its polling stays a small share of it."""
-    overrun_hooks: tuple[OverrunHook, ...] = ()
-    """Plug-ins that decide what becomes of a late cycle."""
-    sensors: Sensors | None = None
-    """None: the robot has none, or a replay's record has them already."""
-    schedule: Schedule = field(init=False)
-    steering: Steering = field(init=False)
-    _anchoring: Anchoring = field(init=False)
-    _overruns: Overruns = field(init=False)
-    _paused_cycles: int = field(default=0, init=False)
-    _time_ns: int = field(default=0, init=False)
-    """The controllers' time in the last cycle."""
-    _woken_ns: int = field(default=0, init=False)
-    _cycles: int = field(default=0, init=False)
-    _invalid: NDArray[np.int64] = field(init=False)
-    """Cycles in which each joint's state was not valid, those of a requested reboot left out."""
-    _all_valid: bytes = field(init=False)
-    _skipped: int = field(default=0, init=False)
-    _late: bool = field(default=False, init=False)
-    _actions: PolicyActions = field(init=False)
-    _monitors: tuple[Monitor, ...] = field(init=False)
-    _motion: SafeMotion | None = field(default=None, init=False)
-    _servo_limits: Mapping[int, Sequence[ServoLimit]] = field(init=False)
-    """What the gate has of the hardware; compared by identity, as it changes when a servo returns."""
+    def __init__(
+        self,
+        context: ControlContext,
+        manager: Manager,
+        gate: Gate,
+        sink: CycleSink,
+        *,
+        overrun_hooks: tuple[OverrunHook, ...] = (),
+        sensors: Sensors | None = None,
+    ) -> None:
+        """Build everything of the control side but the controllers and the gate.
 
-    def __post_init__(self) -> None:
-        self.schedule = schedule_of(self.plan)
-        self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
-        self._invalid = np.zeros(len(self.plan.joints), np.int64)
-        self._all_valid = bytes([True]) * len(self.plan.joints)
-        self._actions = PolicyActions(self.plan.policies, self.hardware, self.manager, self.gate, self.events)
-        self._monitors = build_monitors(self.plan, self.record, self._actions)
-        joints, switching = self.plan.joints, self.manager.switching
-        self._anchoring = Anchoring(joints, self.hardware, switching, self.gate, self.record)
-        self.steering = Steering(
-            self.inbox,
-            self.plan,
-            self.manager,
-            JointRequests(joints, self.hardware, switching, self.record, self._answer),
-            Halt(joints, switching, self.record, self._answer),
-            self.gate,
-            self._anchoring,
-            self.schedule,
-            self.record,
-            self.events,
-            self.commands,
-            self.beat,
-            self.cycle_limit,
-            self.pace,
-            self.stop.request,
-            self._actions.end_run,
-        )
+        Args:
+            context: The run.
+            manager: Its controllers, whether they are configured by now or not.
+            gate: Limits of its goals.
+            sink: Takes its cycles.
+            overrun_hooks: Plug-ins that decide what becomes of a late cycle.
+            sensors: None: the robot has none, or a replay's record has them already.
+        """
+        self.context = context
+        self.manager = manager
+        self.gate = gate
+        self.sink = sink
+        self.sensors = sensors
+        # read in each cycle
+        self.plan, self.record = context.plan, context.record
+        self.clock, self.hardware = context.clock, context.hardware
+        self._stop, self._beat = context.supervision.stop, context.supervision.beat
+        self.schedule = schedule_of(context.plan)
+        self._overruns = Overruns(context.plan.overrun, overrun_hooks, context.events)
+        self._paused_cycles = 0
+        self._time_ns = 0
+        """The controllers' time in the last cycle."""
+        self._woken_ns = 0
+        self._cycles = 0
+        joints = len(context.plan.joints)
+        self._invalid: NDArray[np.int64] = np.zeros(joints, np.int64)
+        """Cycles in which each joint's state was not valid, those of a requested reboot left out."""
+        self._all_valid = bytes([True]) * joints
+        self._skipped = 0
+        self._late = False
+        self._actions = PolicyActions(context, manager, gate)
+        self._monitors = build_monitors(context.plan, context.record, self._actions)
+        self.steering = Steering(context, manager, gate, self.schedule, self._actions)
+        self._anchoring = self.steering.anchoring
+        self._motion: SafeMotion | None = None
+        self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
+        """What the gate has of the hardware; compared by identity, as it changes when a servo returns."""
 
     def run(self) -> LoopResult:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
@@ -193,7 +155,7 @@ class Loop:
         self.schedule.start(self._woken_ns)
         period_ms = self.plan.period_ns / 1e6
         text = f"loop started, period {period_ms:g} ms"
-        self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
+        self.context.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
         if self.sensors is not None:
             self.sensors.read()
         self._take_servo_limits()
@@ -206,9 +168,6 @@ class Loop:
         self._servo_limits = self.hardware.servo_limits
         self.gate.take_servo_limits(self._servo_limits)
 
-    def _answer(self, number: int, answer: Answer) -> None:
-        self.steering.inbox.answer(number, answer)
-
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
         end_ns, schedule = self.plan.end_ns, self.schedule
@@ -216,7 +175,7 @@ class Loop:
             # A motion that ends late must not cut the settling time of its goal.
             if end_ns is not None and schedule.grid_ns >= end_ns and not self.manager.settles:
                 return "ended", ""
-            if self.stop.requested:
+            if self._stop.requested:
                 return "stopped", ""
             if self._actions.ending:
                 return "fault", self._actions.ending[1]
@@ -270,7 +229,7 @@ class Loop:
         self._cycles += 1
         if not all_valid:
             self._invalid += ~valid & (record.states.torque != Torque.REBOOTING)
-        self.beat()
+        self._beat()
 
     def _update(self, cycle: int, time_ns: int) -> None:
         """Let the monitors look, take commands, and update the controllers unless the loop is paused."""
@@ -293,8 +252,7 @@ class Loop:
     def _wind_up(self, name: PolicyName) -> Last:
         """Go through the steps of a policy in more cycles; return how it leaves the robot."""
         policy = self.plan.policies.named(name)
-        limit_ns = self.plan.policies.limit_ns
-        motion = SafeMotion(policy, limit_ns, self.record, self.plan.joints, self.hardware)
+        motion = SafeMotion(policy, self.context)
         if not motion.over:
             self._log_policy(name, policy.text)
             if self.steering.paused_until_ns:
@@ -308,16 +266,16 @@ class Loop:
                 motion.give_up(str(error))
             if motion.unfinished:
                 text = f"{name}: {motion.unfinished}; now {policy.last}"
-                self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", text)
+                self.context.events.emit(EventCode.POLICY, Severity.WARNING, "loop", text)
         if policy.last == "hold":
-            self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
+            self.context.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
         return policy.last
 
     def _log_policy(self, name: PolicyName, text: str) -> None:
-        self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
+        self.context.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
         data = f'{{"policy":"{name}"}}'.encode()
         begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)
-        self.commands.take(begun)
+        self.context.command_log.take(begun)
 
     def _next(self) -> bool:
         """Go to the next cycle, past those that are declared skipped; return whether that ends the run."""
@@ -347,7 +305,7 @@ class Loop:
         late = bool(skipped) or (policy == "catch_up" and now_ns > next_ns)
         if late and not self._late:
             late_ms = (now_ns - due_ns) / 1e6
-            self.events.emit(
+            self.context.events.emit(
                 EventCode.OVERRUN,
                 Severity.WARNING,
                 "loop",
@@ -371,7 +329,8 @@ class Loop:
         cycles = counted(self._cycles, "cycle", "cycles")
         skipped = counted(self._skipped, "period", "periods")
         text = f"loop {reason} after {cycles}, {skipped} skipped"
-        self.events.emit(EventCode.LOOP_STOPPED, severity, "loop", f"{text}: {detail}" if detail else text)
+        text = f"{text}: {detail}" if detail else text
+        self.context.events.emit(EventCode.LOOP_STOPPED, severity, "loop", text)
 
 
 class Overruns:

@@ -370,7 +370,7 @@ class Pacing:
             beat()
         usual_ns = sorted(late)[int(_QUANTILE * _TRIES)]
         self.measured_ns = round(_RESERVE * usual_ns)
-        self(period_ns)
+        self.set_period(period_ns)
         margin_ns = self._clock.spin_ns
         return Grant(
             "polling",
@@ -380,7 +380,7 @@ class Pacing:
             + ("" if margin_ns >= usual_ns else ", so that some cycles begin late"),
         )
 
-    def __call__(self, period_ns: int) -> None:
+    def set_period(self, period_ns: int) -> None:
         """Keep the margin within its share of another period, ns."""
         most_ns = period_ns // AUTO_SHARE if self._most_ns is None else self._most_ns
         self._clock.spin_ns = min(self.measured_ns, most_ns, period_ns // MOST_SHARE)

@@ -23,11 +23,12 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink
 from dxlrun.contract.controller import Controller
+from dxlrun.control.context import ControlContext, StopFlag, Unsupervised
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, LoopResult, StopFlag
+from dxlrun.control.loop import Loop, LoopResult
 from dxlrun.errors import LogError, PortError
 from dxlrun.features import find_installed
 from dxlrun.log.reader import UNREADABLE, Log
@@ -339,23 +340,25 @@ class RecordedRun:
             if one.name not in {each.name for each in features}
         ]
         plan = replace(plan, features=features)
-        self._inputs, self._plan, self._row = inputs, plan, row
-        self._record, self._stop, self._events = CycleRecord(plan.layout), StopFlag(), _NoEvents()
-        self._clock = RecordedClock(inputs.start_ns - plan.period_ns)
-        self._hardware = RecordedHardware(inputs, row, self._record, self._clock, self._stop)
-        self._manager = Manager(
-            plan,
-            plugins,
-            self._record,
-            self._events,
-            self._clock,
-            commands=PlannedCommands(inputs.log.commands, str(inputs.log.path)),
-            topics=TopicLog(self._record, messages, inputs.log.header.epoch_offset_ns),
-            kept=inputs.kept,
-        )
+        self._row = row
+        record, stop = CycleRecord(plan.layout), StopFlag()
+        clock = RecordedClock(inputs.start_ns - plan.period_ns)
+        self._hardware = RecordedHardware(inputs, row, record, clock, stop)
         self._inbox = RecordedInbox(
-            inputs.steered, self._record, lambda taken: prepare(taken, self._manager.controller)
+            inputs.steered, record, lambda taken: prepare(taken, self._manager.controller)
         )
+        self._context = ControlContext(
+            plan=plan,
+            record=record,
+            clock=clock,
+            hardware=self._hardware,
+            events=_NoEvents(),
+            command_log=PlannedCommands(inputs.log.commands, str(inputs.log.path)),
+            inbox=self._inbox,
+            supervision=Unsupervised(stop),
+        )
+        topics = TopicLog(record, messages, inputs.log.header.epoch_offset_ns)
+        self._manager = Manager(self._context, plugins, topics=topics, kept=inputs.kept)
 
     @property
     def controllers(self) -> tuple[ControllerPlan, ...]:
@@ -375,19 +378,9 @@ class RecordedRun:
             LogError: The log is damaged.
             ControllerFault: A controller cannot be configured.
         """
-        loop = Loop(
-            clock=self._clock,
-            hardware=self._hardware,
-            manager=self._manager,
-            gate=Gate(self._plan, self._record, self._events),
-            record=self._record,
-            sink=_ComparingSink(self._hardware, compare),
-            events=self._events,
-            plan=self._plan,
-            beat=lambda: None,
-            stop=self._stop,
-            inbox=self._inbox,
-        )
+        context = self._context
+        gate = Gate(context.plan, context.record, context.events)
+        loop = Loop(context, self._manager, gate, _ComparingSink(self._hardware, compare))
         self._row(0)  # what is published before the first cycle finds its messages
         self._manager.configure()
         self._hardware.start()

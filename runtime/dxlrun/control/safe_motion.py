@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
-from dxlrun.contract.hardware import Hardware
+from dxlrun.control.context import ControlContext
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
@@ -40,10 +40,9 @@ class SafeMotion:
     """
 
     policy: Policy
-    limit_ns: int
-    record: CycleRecord
-    joints: tuple[JointPlan, ...]
-    hardware: Hardware
+    context: ControlContext
+    record: CycleRecord = field(init=False)
+    joints: tuple[JointPlan, ...] = field(init=False)
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
     """Which step ended before it was done, or is a pose that was not reached, and why; empty: none."""
@@ -66,13 +65,15 @@ class SafeMotion:
     """How near to its target each joint has arrived, rad or m."""
 
     def __post_init__(self) -> None:
+        self.record, self.joints = self.context.record, self.context.plan.joints
+        limit_ns = self.context.plan.policies.limit_ns
         now = self.record.states.mode.tolist()
         self._modes = np.array(
             [self._needed(row, Mode(mode)) for row, mode in enumerate(now)], dtype=np.uint8
         )
         stops_s = [0.0 if j.acceleration is None else j.highest_speed / j.acceleration for j in self.joints]
         holds = self.policy.last == "hold"
-        self._stand_ns = STAND_NS + round(min(max(stops_s) * 1e9, self.limit_ns) if holds else 0)
+        self._stand_ns = STAND_NS + round(min(max(stops_s) * 1e9, limit_ns) if holds else 0)
         standing_ns = self._stand_ns if holds and (Mode.VELOCITY in now or max(stops_s) > 0) else 0
         self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
         # one that brakes within its limit must know its target, not only the next step to it
@@ -86,7 +87,7 @@ class SafeMotion:
     def begin(self) -> None:
         """Begin a cycle, before its states are read: ask for the modes that joints need, once."""
         if self._began_ns < 0 and self._modes.any():
-            self.hardware.set_modes(self._modes)
+            self.context.hardware.set_modes(self._modes)
 
     def command(self) -> None:
         """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
@@ -95,7 +96,7 @@ class SafeMotion:
         record.commands.clear()
         if self._began_ns < 0:
             self._began_ns = self._step_ns = now_ns
-        if now_ns - self._began_ns >= self.limit_ns:
+        if now_ns - self._began_ns >= self.context.plan.policies.limit_ns:
             self.give_up("its time is over")
         if self._changing(now_ns):
             return
@@ -175,5 +176,5 @@ class SafeMotion:
         level = min(step.levels, 1 + passed_ns * step.levels // max(step.longest_ns, 1))
         if level != self._level:
             self._level = level
-            self.hardware.limit_torque(1.0 - (1.0 - step.fraction) * level / step.levels)
+            self.context.hardware.limit_torque(1.0 - (1.0 - step.fraction) * level / step.levels)
         return passed_ns >= step.longest_ns

@@ -6,15 +6,13 @@ does, with the rate of the loop and its pauses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
 from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
-from dxlrun.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
-from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.commands import LOOP, Command, TakenCommand
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.loop_requests import (
     Cancel,
     NewCommander,
@@ -28,14 +26,15 @@ from dxlrun.channels.loop_requests import (
     Unload,
 )
 from dxlrun.control.anchoring import Anchoring
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
+from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.schedule import Schedule
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
-from dxlrun.plan.policy_plan import PolicyName
+from dxlrun.plan.loop_plan import ControllerPlan
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""
@@ -77,7 +76,6 @@ FORMS: Mapping[str, type[msgspec.Struct] | None] = {
 """Commands for the loop, with the form of their data; None: they carry nothing."""
 
 
-@dataclass(slots=True)
 class Steering:
     """Executes the commands of an inbox, logs them, and answers them; the loop's rate, and its pauses.
 
@@ -86,30 +84,32 @@ class Steering:
     joints stand still. A register is answered when the servo has it.
     """
 
-    inbox: Inbox
-    plan: LoopPlan
-    manager: Manager
-    joints: JointRequests
-    halt: Halt
-    gate: Gate
-    anchoring: Anchoring
-    schedule: Schedule
-    record: CycleRecord
-    events: EventSink
-    taken: CommandSink
-    """Takes what came through the inbox, for the log."""
-    beat: Callable[[], None]
-    cycle_limit: Callable[[int], None]
-    pace: Callable[[int], None]
-    """These three as in Loop."""
-    finish: Callable[[], None]
-    """Ends the run in order after this cycle."""
-    give_up: Callable[[PolicyName, str], None]
-    """Ends the run after this cycle by a policy, and why."""
-    paused_until_ns: int = 0
-    """When a pause ends without its client; 0: no pause."""
-    stood: bool = False
-    """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
+    def __init__(
+        self,
+        context: ControlContext,
+        manager: Manager,
+        gate: Gate,
+        schedule: Schedule,
+        actions: PolicyActions,
+    ) -> None:
+        self.inbox = context.inbox
+        self.joints = JointRequests(context, manager.switching, self._answer)
+        self.halt = Halt(context, manager.switching, self._answer)
+        self.anchoring = Anchoring(context, manager.switching, gate)
+        self.paused_until_ns = 0
+        """When a pause ends without its client; 0: no pause."""
+        self.stood = False
+        """True in a cycle that is, or just was, in a pause: a controller may have been loaded."""
+        self._context = context
+        self._record = context.record
+        self._supervision = context.supervision
+        self._manager = manager
+        self._gate = gate
+        self._schedule = schedule
+        self._actions = actions
+
+    def _answer(self, number: int, answer: Answer) -> None:
+        self.inbox.answer(number, answer)
 
     def take(self, commands: Sequence[Command], time_ns: int) -> int:
         """Execute what has come, and end streams and pauses whose lease ran out; called where anything may.
@@ -117,13 +117,13 @@ class Steering:
         Returns the number of commands for controllers.
         """
         count = 0
-        record, manager = self.record, self.manager
+        record, manager = self._record, self._manager
         if self.halt.waiting:
             self.halt.watch()
         if self.paused:
             self.anchoring.watch_pause()
         for place, command in enumerate(commands, 1):
-            self.taken.take(
+            self._context.command_log.take(
                 TakenCommand(
                     t_ns=record.woken_ns,
                     cycle=record.cycle,
@@ -176,9 +176,9 @@ class Steering:
 
     def answer_late(self) -> None:
         """Answer the switches that waited for modes and have come to an end."""
-        ended = self.manager.switching.ended
+        ended = self._manager.switching.ended
         for number, refusal in ended:
-            self.inbox.answer(number, refusal or Done(self.record.cycle))
+            self.inbox.answer(number, refusal or Done(self._record.cycle))
         ended.clear()
 
     # Rate and pause
@@ -193,7 +193,7 @@ class Steering:
         if not LEAST_RATE <= rate <= MOST_RATE:
             bounds = {"rate": rate, "lowest": LEAST_RATE, "highest": MOST_RATE}
             return Refusal(Code.RATE_OUT_OF_RANGE, bounds)
-        plan, period_ns = self.plan, round(1e9 / rate)
+        plan, period_ns = self._context.plan, round(1e9 / rate)
         if period_ns < plan.least_period_ns:
             return Refusal(Code.RATE_OVER_BUSES, {"highest": 1e9 / plan.least_period_ns})
         if 0 < plan.slowest_period_ns < period_ns:
@@ -201,11 +201,11 @@ class Steering:
         ending_ns = plan.policies.slowest_period_ns(plan.period_ns)
         if ending_ns < period_ns:
             return Refusal(Code.RATE_UNDER_EXIT, {"lowest": 1e9 / ending_ns})
-        if refusal := self.manager.change_period(period_ns):
+        if refusal := self._manager.change_period(period_ns):
             return refusal
-        self.schedule.period_ns = period_ns
+        self._schedule.period_ns = period_ns
         self._set_cycle_limit()
-        self.pace(period_ns)
+        self._supervision.set_period(period_ns)
         return None
 
     def pause(self) -> Refusal | None:
@@ -215,7 +215,7 @@ class Steering:
             return Refusal(Code.PAUSED_ALREADY)
         self.stood = True
         self.anchoring.begin_pause()
-        self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
+        self.paused_until_ns = self._record.woken_ns + PAUSE_LEASE_NS
         self._set_cycle_limit()
         return None
 
@@ -225,22 +225,22 @@ class Steering:
             return Refusal(Code.NOT_PAUSED)
         self.paused_until_ns = 0
         self.anchoring.end_pause(time_ns)
-        self.gate.ease_in()
+        self._gate.ease_in()
         self._set_cycle_limit()
         return None
 
     def _set_cycle_limit(self) -> None:
         """Set how long a cycle may take; what this one took until now does not count."""
-        self.beat()
-        period_ns = self.schedule.period_ns
-        self.cycle_limit(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
+        self._supervision.beat()
+        period_ns = self._schedule.period_ns
+        self._supervision.limit_cycle(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
 
     def _stale(self, why: str) -> str:
         """End the run where the policy for a stale command ends it, and return that in words."""
-        policy = self.plan.policies.on_stale_command
+        policy = self._context.plan.policies.on_stale_command
         if policy.goes_on:
             return ""
-        self.give_up("on_stale_command", why)
+        self._actions.end_run("on_stale_command", why)
         return f"the run ends: {policy.text}"
 
     # Commands
@@ -262,13 +262,13 @@ class Steering:
             return Refusal(Code.INVALID, {"problem": f"the data of {kind} do not fit: {error}"})
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
             return self.joints.execute(command.number, request, time_ns)
-        return self._execute(command, request, numbers, time_ns) or Done(self.record.cycle)
+        return self._execute(command, request, numbers, time_ns) or Done(self._record.cycle)
 
     def _execute(
         self, command: Command, request: msgspec.Struct | None, numbers: bytes, time_ns: int
     ) -> Answer | None:
         """Execute a command for the loop; None: it is done, and there is nothing to say about it."""
-        manager = self.manager
+        manager = self._manager
         found: Answer | None = None
         match request:
             case Switch():
@@ -278,15 +278,15 @@ class Steering:
                 found = manager.cancel(request.goal, request.controller, time_ns)
             case Play():
                 goals = manager.play(request.parts, numbers, command.origin, time_ns)
-                found = goals if isinstance(goals, Refusal) else Done(self.record.cycle, goals=goals)
+                found = goals if isinstance(goals, Refusal) else Done(self._record.cycle, goals=goals)
             case Parameters():
                 found = manager.change_parameters(request.controller, request.values, time_ns)
             case Rate():
                 found = self.change_rate(request.rate)
             case ControllerPlan():
                 place = manager.load(request)
-                self.beat()  # the guardian waits for each of them
-                found = place if isinstance(place, Refusal) else Done(self.record.cycle, place)
+                self._supervision.beat()  # the guardian waits for each of them
+                found = place if isinstance(place, Refusal) else Done(self._record.cycle, place)
             case Unload():
                 found = manager.unload(request.controller)
             case NewCommander():
@@ -298,7 +298,7 @@ class Steering:
             case _ if command.kind == "resume":
                 found = self.resume(time_ns)
             case _:
-                self.finish()
+                self._supervision.stop.request()
         return found
 
     # Reports
@@ -316,7 +316,7 @@ class Steering:
                 shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
             text = f"{f'{command.kind} {shown}'.strip()} from {command.origin}"
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
-        self.events.emit(code, severity, source, text, data)
+        self._context.events.emit(code, severity, source, text, data)
 
     def _log_stale(self, source: str, text: str) -> None:
-        self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, source, text)
+        self._context.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, source, text)

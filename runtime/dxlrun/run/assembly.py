@@ -14,12 +14,13 @@ from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink
 from dxlrun.channels.ring import Appender, RecordKind
 from dxlrun.contract.hardware import Hardware
+from dxlrun.control.context import ControlContext, Supervision, Unsupervised
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, LoopResult, StopFlag
+from dxlrun.control.loop import Loop, LoopResult
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.hardware import DynamixelHardware
@@ -104,38 +105,49 @@ class AssembledRobot:
         return result
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopHost:
+    """A process as it hosts a loop: lines, time, log, clients, and the processes that watch the loop."""
+
+    ports: Ports
+    clock: Clock
+    sinks: Sinks
+    supervision: Supervision = field(default_factory=Unsupervised)
+    inbox: Inbox = field(default_factory=NoInbox)
+    activity: Activity = field(default_factory=Activity)
+    """Shows which controller's code runs."""
+    slots: Sequence[memoryview] = ()
+    """What the plan's sensors write into."""
+
+
 def assemble(
     plan: Plan,
     plugins: PlugIns,
+    host: LoopHost,
     *,
-    ports: Ports,
-    clock: Clock,
-    sinks: Sinks,
-    beat: Callable[[], None],
-    stop: StopFlag,
     take_over: bool = False,
-    inbox: Inbox | None = None,
-    cycle_limit: Callable[[int], None] = lambda _: None,
-    pace: Callable[[int], None] = lambda _: None,
-    activity: Activity | None = None,
     kept: KeptStates | None = None,
-    slots: Sequence[memoryview] = (),
 ) -> AssembledRobot:
     """Build everything between the ports and the log; configures the controllers, sends nothing.
 
-    `slots`: what the plan's sensors write into.
+    Args:
+        plan: The robot.
+        plugins: Types of its controllers, and what decides about late cycles.
+        host: The process.
+        take_over: The servos may have torque already.
+        kept: What controllers kept in earlier runs.
     """
-    record = CycleRecord(plan.loop.layout)
+    record, sinks = CycleRecord(plan.loop.layout), host.sinks
     layers = HardwareLayers(plan, record.states, record.goals, sinks.events)
     servos = DynamixelHardware(
         plan.buses,
-        ports,
-        clock,
+        host.ports,
+        host.clock,
         layers.states,
         layers.goals,
         sinks.packets,
         sinks.events,
-        beat,
+        host.supervision.beat,
         take_over=take_over,
         sources=record.sources,
         parts=FeatureParts(
@@ -143,38 +155,20 @@ def assemble(
         ),
         refusals=layers.refusals,
     )
-    hardware = layers.build(servos)
-    topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
-    manager = Manager(
-        plan.loop,
-        plugins,
-        record,
-        sinks.events,
-        clock,
-        commands=sinks.commands,
-        set_modes=hardware.set_modes,
-        activity=activity,
-        topics=topics,
-        kept=kept,
-    )
-    gate = Gate(plan.loop, record, sinks.events)
-    loop = Loop(
-        clock=clock,
-        hardware=hardware,
-        manager=manager,
-        gate=gate,
-        record=record,
-        sink=sinks,
-        events=sinks.events,
+    context = ControlContext(
         plan=plan.loop,
-        beat=beat,
-        stop=stop,
-        inbox=inbox or NoInbox(),
-        commands=sinks.commands,
-        cycle_limit=cycle_limit,
-        pace=pace,
-        overrun_hooks=plugins.overrun_hooks,
-        sensors=Readings(plan.loop, slots, record, clock.now_ns, sinks.events) if slots else None,
+        record=record,
+        clock=host.clock,
+        hardware=layers.build(servos),
+        events=sinks.events,
+        command_log=sinks.commands,
+        inbox=host.inbox,
+        supervision=host.supervision,
     )
+    topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
+    manager = Manager(context, plugins, activity=host.activity, topics=topics, kept=kept)
+    gate = Gate(plan.loop, record, sinks.events)
+    sensors = Readings(plan.loop, host.slots, record, host.clock.now_ns, sinks.events) if host.slots else None
+    loop = Loop(context, manager, gate, sinks, overrun_hooks=plugins.overrun_hooks, sensors=sensors)
     manager.configure()
-    return AssembledRobot(hardware, manager, loop, record)
+    return AssembledRobot(context.hardware, manager, loop, record)

@@ -32,9 +32,9 @@ from dxlrun.channels.process import LineReturned, MessageChannel
 from dxlrun.channels.ring import RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime
+from dxlrun.control.context import StopFlag
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop import StopFlag
 from dxlrun.control.realtime import Pacing
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.errors import DxlrunError, PlugInError, StartUpError, counted
@@ -42,7 +42,7 @@ from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun.plan.machine_load import SimulationWait
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
-from dxlrun.run.assembly import Sinks, assemble
+from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.guardian import LoopJob, make_ports
 from dxlrun.run.line_reopener import LineReopener
 from dxlrun.run.watch import Duty, LoopWatch
@@ -163,8 +163,11 @@ class StallReport:
 
 @dataclass(slots=True)
 class Pulse:
-    """Called while replies are awaited, and once a cycle: beats, looks at supervisor and guardian, reports
-    waits for simulated servos, and gives a set-up up that is to stop."""
+    """Supervision of a loop by its own process, see `control.context.Supervision`.
+
+    `beat` is called while replies are awaited, and once a cycle: it looks at supervisor and guardian, reports
+    waits for simulated servos, and gives a set-up up that is to stop.
+    """
 
     heartbeat: Heartbeat
     stop: StopFlag
@@ -172,8 +175,10 @@ class Pulse:
     events: EventSink
     stalls: StallReport
     now_ns: Callable[[], int]
+    pacing: Pacing | None = None
+    """None: the clock does not poll."""
 
-    def __call__(self) -> None:
+    def beat(self) -> None:
         """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
         self.heartbeat.beat()
         now_ns = self.now_ns()
@@ -184,6 +189,15 @@ class Pulse:
         if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             self.heartbeat.enter(Phase.STOPPING)
             raise AskedToStop
+
+    def limit_cycle(self, limit_ns: int) -> None:
+        """Let the guardian wait for so long for each cycle."""
+        self.heartbeat.may_take(limit_ns)
+
+    def set_period(self, period_ns: int) -> None:
+        """Keep the polling of the clock a small share of another period."""
+        if self.pacing is not None:
+            self.pacing.set_period(period_ns)
 
 
 def _reply_polling(longest_ns: int | None) -> ReplyPolling | None:
@@ -217,22 +231,17 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
     watch = LoopWatch(heartbeat, job.supervisor, job.guardian, plan.loop.period_ns, clock.now_ns())
     plugins = load_plugins(_looked_at(heartbeat), plan.included)
     plugins.import_all()
-    robot = assemble(
-        plan,
-        plugins,
+    host = LoopHost(
         ports=ports,
         clock=clock,
         sinks=sinks,
-        beat=Pulse(heartbeat, stop, watch, sinks.events, report, clock.now_ns),
-        stop=stop,
-        take_over=job.take_over,
+        supervision=Pulse(heartbeat, stop, watch, sinks.events, report, clock.now_ns, pacing),
         inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),
-        cycle_limit=heartbeat.may_take,
-        pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
-        kept=msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates),
         slots=[mapped(descriptor) for descriptor in job.memory.sensors],
     )
+    kept = msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates)
+    robot = assemble(plan, plugins, host, take_over=job.take_over, kept=kept)
     heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)  # what is taken over may have torque
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
     _prepare(plan, job, heartbeat, sinks.events, pacing)

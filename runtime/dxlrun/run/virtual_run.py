@@ -20,15 +20,16 @@ from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.contract.sensor import Sensor
+from dxlrun.control.context import StopFlag, Unsupervised
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
-from dxlrun.control.loop import LoopResult, StopFlag
+from dxlrun.control.loop import LoopResult
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import DxlrunError, InputError, PortError
 from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.assembly import Sinks, assemble
+from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
@@ -109,19 +110,15 @@ class VirtualRobot:
             CommandRing(to_log) if log else NoCommands(),
             messages=MessageRing(to_log) if log or kept else MessageSink(),
         )
-        self.robot = assemble(
-            plan,
-            plugins,
+        host = LoopHost(
             ports=VirtualPorts(self.clock, self.buses),
             clock=self.clock,
             sinks=self.sinks,
-            beat=lambda: None,
-            stop=self.stop,
-            take_over=take_over,
+            supervision=Unsupervised(self.stop),
             inbox=self.inbox,
-            kept=states,
             slots=slots,
         )
+        self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)
 
     def _start_sensors(self, plugins: PlugIns, mechanics: Mechanics) -> list[memoryview]:
         """Open the sensors and let the clock sample them; return their slots. Raises PortError."""

@@ -19,9 +19,8 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, packet_capacity, split_packets
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop import StopFlag
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.assembly import Sinks, assemble
+from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun_lab.late_servos import Sent
 from dxlwire.clock import MonotonicClock
 from dxlwire.packets import PacketKind, PacketLog
@@ -99,19 +98,15 @@ class Ours:
             packets = PacketBatch(RingWriter(self._ring))
             self._recorded = RingReader(self._ring)
         self._commit = packets.commit
-        robot = assemble(
-            plan,
-            load_plugins(),
+        host = LoopHost(
             # exchanges follow each other without a pause, so a share of the time would not be one of a period
             ports=SerialPorts(
                 [SerialPort(self._descriptor, path)], polling=ReplyPolling(share=1.0) if polled else None
             ),
             clock=MonotonicClock(),
             sinks=Sinks(Handover(lambda kind, payload: None), packets, _Events(), NoCommands()),
-            beat=lambda: None,
-            stop=StopFlag(),
-            take_over=True,
         )
+        robot = assemble(plan, load_plugins(), host, take_over=True)
         self._hardware = robot.hardware
         self._valid = robot.record.states.valid
         self._torque = robot.record.states.torque

@@ -13,6 +13,7 @@ else; what drives it is `switching.py`.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum, unique
 from functools import partial
 from types import MappingProxyType
@@ -22,10 +23,11 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import CycleRecord, Floats
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.cycle import Floats
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.goals import Commanded, RunningGoal
 from dxlrun.control.controllers.graph import Plans, rate_divider
@@ -84,30 +86,33 @@ class Request(NamedTuple):
     why: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllersContext:
+    """What the controllers of one run share, those that are loaded later too."""
+
+    run: ControlContext
+    plugins: PlugIns
+    activity: Activity
+    """Shows which controller's code runs."""
+    topics: TopicLog
+    """Takes what they publish."""
+    keeping: Keeping
+    requests: list[Request]
+    """What they request of the run in this cycle."""
+
+
 class Managed:
     """A controller with its rows of the robot's arrays: gathered before an update, checked and merged after.
 
     `place` is that of the controller: its bit in the record's masks.
     """
 
-    def __init__(
-        self,
-        plan: ControllerPlan,
-        place: int,
-        *,
-        joints: Sequence[JointPlan],
-        record: CycleRecord,
-        events: EventSink,
-        activity: Activity,
-        period_ns: int,
-        topics: TopicLog,
-        requests: list[Request],
-        urdf: str | None = None,
-    ) -> None:
-        """`joints` are all joints of the robot; `period_ns` is the loop's.
+    def __init__(self, plan: ControllerPlan, place: int, context: ControllersContext, period_ns: int) -> None:
+        """`period_ns` is the loop's.
 
         Raises ControllerFault for a reference, or something that it reads, which is not there.
         """
+        record, joints = context.run.record, context.run.plan.joints
         self.plan = plan
         self.place = place
         self.state = State.INACTIVE
@@ -133,21 +138,20 @@ class Managed:
         self.rows: NDArray[np.intp] = np.array([rows[joint] for joint in plan.joints], dtype=np.intp)
         """Rows of its joints in the robot's arrays."""
         self._record = record
-        self._activity = activity
-        self._call: Callable[..., None] = partial(activity.call, place)
+        self._shared = context
+        self._call: Callable[..., None] = partial(context.activity.call, place)
         self._inputs = Inputs(plan, record, self.rows)
         self._outputs = Outputs(plan, record, self.rows)
         self.provided = Provided(plan, record) if plan.provides else None
         """The states that it provides; None: it provides none."""
-        self._topics = topics.of_controller(plan.name, self._bit)
+        self._topics = context.topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
-        self._requests = requests
         self._last_ns = -1
-        self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
+        self._context = self._new_context([joints[row] for row in self.rows])
 
-    def _new_context(self, joints: Sequence[JointPlan], events: EventSink, urdf: str | None) -> Context:
-        plan = self.plan
+    def _new_context(self, joints: Sequence[JointPlan]) -> Context:
+        plan, run, requests = self.plan, self._shared.run, self._shared.requests
         return Context(
             name=plan.name,
             joints=plan.joints,
@@ -163,8 +167,8 @@ class Managed:
             goals=self._inputs.goals,
             commands=self._outputs.commands,
             # none of them knows this object: a circle would stay when the controller is unloaded
-            say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
-            warn=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
+            say=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
+            warn=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
             publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
@@ -174,31 +178,31 @@ class Managed:
             servos=tuple(joint.servo_model for joint in joints),
             wrap=tuple(joint.wrap for joint in joints),
             units=tuple(joint.unit for joint in joints),
-            urdf=urdf,
+            urdf=run.plan.urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             device_commands=self._outputs.source_commands,
-            take_over=partial(_take_over, self._requests, plan),
-            end_run=partial(_end_run, self._requests, plan),
+            take_over=partial(_take_over, requests, plan),
+            end_run=partial(_end_run, requests, plan),
         )
 
     # Life
 
-    def configure(self, plugins: PlugIns, keeping: Keeping, plans: Plans) -> None:
+    def configure(self, plans: Plans) -> None:
         """Build and configure the controller; allocates. Raises PlugInError and ControllerFault.
 
         `plans` has those below it.
         """
-        name = self.plan.name
-        self._activity.name_controller(self.place, name)
-        self._activity.show(self.place, ControllerMethod.INIT)
+        name, plugins, activity = self.plan.name, self._shared.plugins, self._shared.activity
+        activity.name_controller(self.place, name)
+        activity.show(self.place, ControllerMethod.INIT)
         try:
             self.controller = plugins.built(self.plan)
         finally:
-            self._activity.show(0, ControllerMethod.NONE)
+            activity.show(0, ControllerMethod.NONE)
         topics = self.controller.topics(self.controller.parameters)
         self._topics.open(topics, self.plan.distribution, self.plan.joints)
         if type(self.controller).keeps:
-            kept, keep = keeping.open(self.plan, plans)
+            kept, keep = self._shared.keeping.open(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
         self._call(ControllerMethod.ON_CONFIGURE, "", self.controller.on_configure, self._context)
         plugins.after_each(f"of controller {name}")

@@ -10,63 +10,70 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
-from dxlrun.channels.commands import Command, CommandSink, NoCommands, TakenCommand
-from dxlrun.channels.cycle import MOST_CONTROLLERS, CycleRecord
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.commands import Command, TakenCommand
+from dxlrun.channels.cycle import MOST_CONTROLLERS
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.controller import Controller, Outcome
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts, parted_couplings
 from dxlrun.control.controllers.goals import Commanded, Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import Plans, commander, rate_divider, rate_fits, update_order
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
-from dxlrun.control.controllers.managed import Managed, Request, State
+from dxlrun.control.controllers.managed import ControllersContext, Managed, Request, State
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.switching import SetModes, Switching, fault_of
+from dxlrun.control.controllers.switching import Switching, fault_of
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Provided
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
-from dxlwire.clock import Clock
+from dxlrun.plan.loop_plan import ControllerPlan, ScheduledCommand
 
 P = ParamSpec("P")
 
 
 class Manager:
-    """The controllers of a robot; `record` holds the arrays that all of them share."""
+    """The controllers of a robot; the cycle's record holds the arrays that all of them share."""
 
     def __init__(
         self,
-        plan: LoopPlan,
+        context: ControlContext,
         plugins: PlugIns,
-        record: CycleRecord,
-        events: EventSink,
-        clock: Clock,
         *,
-        commands: CommandSink | None = None,
-        set_modes: SetModes | None = None,
         activity: Activity | None = None,
         topics: TopicLog | None = None,
         kept: KeptStates | None = None,
     ) -> None:
-        """`set_modes` requests other modes of joints from the hardware; without it they stay as they are.
+        """Build the manager of a run; `configure` then builds the controllers.
 
-        `activity` shows which controller's code runs, `topics` takes what they publish, `kept` is what they
-        kept in earlier runs.
+        Args:
+            context: The run.
+            plugins: Types of controllers.
+            activity: Shows which controller's code runs.
+            topics: Takes what controllers publish.
+            kept: What controllers kept in earlier runs.
         """
-        self.switching = Switching(plan.joints, record, events, set_modes)
+        self.switching = Switching(context)
         """Which of them are active."""
-        self._plan = plan
-        self._plugins = plugins
-        self._record = record
-        self._events = events
-        self._clock = clock
-        self._taken = commands or NoCommands()
-        self._activity = activity or Activity()
-        self._topics = topics or TopicLog(record)
-        self._keeping = Keeping(kept or KeptStates(), self._topics, events)
-        self._period_ns = plan.period_ns
+        self._plan = context.plan
+        self._record = context.record
+        self._events = context.events
+        self._clock = context.clock
+        self._command_log = context.command_log
+        self._topics = topics or TopicLog(context.record)
+        self._keeping = Keeping(kept or KeptStates(), self._topics, context.events)
+        self._requests: list[Request] = []
+        """What controllers request of the run in this cycle."""
+        self._shared = ControllersContext(
+            run=context,
+            plugins=plugins,
+            activity=activity or Activity(),
+            topics=self._topics,
+            keeping=self._keeping,
+            requests=self._requests,
+        )
+        self._period_ns = context.plan.period_ns
         self._managed: tuple[Managed, ...] = ()
         """By their places; those that were unloaded keep theirs until another one gets it."""
         self._named = self.switching.named
@@ -76,11 +83,9 @@ class Manager:
         """By place: those whose commands run out; one whose stream has ended leaves with the next look."""
         self.providers: tuple[Provided, ...] = ()
         """What controllers provide; all of it is older in each cycle."""
-        self._requests: list[Request] = []
-        """What controllers request of the run in this cycle."""
         self._next = 0  # of the plan's commands
         self._lost: list[int] = []  # rows of the joints that are lost
-        self._goals = Goals(record, events, plan.joints, self._commanded)
+        self._goals = Goals(context.record, context.events, context.plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """What is played by commands, by controller."""
         self._pursued: dict[str, RunningGoal] = {}
@@ -248,7 +253,8 @@ class Manager:
         while self._next < len(commands) and commands[self._next].at_ns <= time_ns:
             place, command = self._next, commands[self._next]
             name, kind, origin = command.controller, command.kind, command.origin
-            self._taken.take(TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b""))
+            taken = TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b"")
+            self._command_log.take(taken)
             self._next += 1
             pursued = self._pursue(command)
             answer = self.hand(Command(place, name, kind, command.data, origin), time_ns, pursued)
@@ -522,20 +528,9 @@ class Manager:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
     def _configured(self, place: int, plan: ControllerPlan) -> Managed:
-        managed = Managed(
-            plan,
-            place,
-            joints=self._plan.joints,
-            record=self._record,
-            events=self._events,
-            activity=self._activity,
-            period_ns=self._period_ns,
-            topics=self._topics,
-            requests=self._requests,
-            urdf=self._plan.urdf,
-        )
+        managed = Managed(plan, place, self._shared, self._period_ns)
         plans = {one.name: one for one in self._plan.controllers} | dict(self.switching.standing.known)
-        managed.configure(self._plugins, self._keeping, plans)
+        managed.configure(plans)
         if managed.controller.Goals:
             self._goals.open(self._topics)
         return managed

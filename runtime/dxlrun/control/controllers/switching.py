@@ -8,21 +8,20 @@ holds still, and is brought from others into its rest mode.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting, list_names
-from dxlrun.channels.cycle import LIMP, CycleRecord
-from dxlrun.channels.events import RUN_ENDED, EventCode, EventSink, Severity
+from dxlrun.channels.cycle import LIMP
+from dxlrun.channels.events import RUN_ENDED, EventCode, Severity
+from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Event, Managed, Request, State
 from dxlrun.errors import ControllerFault
-from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.modes import Mode
 
 MODE_TIMEOUT_NS = 5_000_000_000
@@ -31,8 +30,6 @@ one second, a servo that came back from a reset some more. [i]"""
 _STILL = (Mode.POSITION, Mode.VELOCITY)
 """Modes in which a joint holds still by itself: it stays in them when no controller claims it."""
 
-SetModes = Callable[[NDArray[np.uint8]], None]
-"""Hardware.set_modes"""
 _Failed = tuple[tuple[Managed, ...], str]
 """A controller that broke its contract, those that left with it, and why; not the fault itself, which holds
 a frame: the collector is off, so such a circle would stay."""
@@ -53,14 +50,7 @@ class Group(msgspec.Struct, frozen=True):
 class Switching:
     """The states of a run's controllers, and what changes them; times are the controllers'."""
 
-    def __init__(
-        self,
-        joints: Sequence[JointPlan],
-        record: CycleRecord,
-        events: EventSink,
-        set_modes: SetModes | None = None,
-    ) -> None:
-        """`set_modes` requests other modes of joints from the hardware; without it they stay as they are."""
+    def __init__(self, context: ControlContext) -> None:
         self.fault: str | None = None
         """Why the run is to end: the sentence of the first controller that requested it, or that broke its
         contract and for which no other one took over."""
@@ -74,11 +64,11 @@ class Switching:
         """Rows of joints whose torque clients switched off; the states show it a cycle later."""
         self.modes_requested = True
         """False when claims have changed since modes were requested."""
-        self._joints = tuple(joints)
-        self._rows = {joint.name: row for row, joint in enumerate(joints)}
-        self._states = record.states
-        self._events = events
-        self._set_modes = set_modes
+        self._joints = context.plan.joints
+        self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
+        self._states = context.record.states
+        self._events = context.events
+        self._hardware = context.hardware
 
     @property
     def standing(self) -> Standing:
@@ -276,8 +266,8 @@ class Switching:
                 mode = Mode(now) if now in _STILL else joint.rest
             if mode != now:
                 modes[row] = mode
-        if self._set_modes is not None and modes.any():
-            self._set_modes(modes)
+        if modes.any():
+            self._hardware.set_modes(modes)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
         """Return the joints that are not in their modes, with the mode that they need and theirs."""

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.contract.hardware import Hardware
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
 
 if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
+    from dxlrun.control.context import ControlContext
     from dxlrun.control.controllers.manager import Manager
     from dxlrun.control.gate import Gate
 
 
-@dataclass(slots=True)
 class PolicyActions:
     """End the run, take torque from joints, hold controllers, report."""
 
-    policies: PolicyPlan
-    hardware: Hardware
-    manager: Manager
-    gate: Gate
-    events: EventSink
-    ending: tuple[PolicyName, str] | None = None
-    """The policy by which the run ends after this cycle, and a sentence; None: it goes on."""
+    def __init__(self, context: ControlContext, manager: Manager, gate: Gate) -> None:
+        self.policies: PolicyPlan = context.plan.policies
+        self.ending: tuple[PolicyName, str] | None = None
+        """The policy by which the run ends after this cycle, and a sentence; None: it goes on."""
+        self._context = context
+        self._manager = manager
+        self._gate = gate
 
     def end_run(self, policy: PolicyName, why: str) -> None:
         """End the run after this cycle, by another policy than on_exit; the first reason counts."""
@@ -35,17 +33,17 @@ class PolicyActions:
     def make_limp(self, rows: Iterable[int]) -> None:
         """Switch the torque of joints off until a client requests it."""
         for row in sorted(rows):
-            self.hardware.switch_torque(row, False, _ignore_answer)
+            self._context.hardware.switch_torque(row, False, _ignore_answer)
 
     def hold_controllers(self, lost: Collection[int]) -> None:
         """Hold the controllers of lost joints, and let those go on slowly whose joints are back."""
-        self.gate.ease_in(self.manager.hold_lost(lost))
+        self._gate.ease_in(self._manager.hold_lost(lost))
 
     def report(
         self, severity: Severity, text: str, *, source: str = "loop", code: EventCode = EventCode.POLICY
     ) -> None:
         """Report what a policy does, in an event."""
-        self.events.emit(code, severity, source, text)
+        self._context.events.emit(code, severity, source, text)
 
 
 def _ignore_answer(problem: str) -> None:
