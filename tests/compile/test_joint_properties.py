@@ -11,7 +11,6 @@ import pytest
 from dxlrun.cli import check
 from dxlrun.compile.robot import compile_files
 from dxlrun.output.table import Table
-from dxlrun.plan import loop_plan
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, JointProperty, JointValues
 from dxlrun.remote.requests.replies import RobotInfo
 
@@ -25,7 +24,6 @@ def _joint_table() -> tuple[list[dict[str, object]], Table]:
 
 def test_property_with_a_column_is_in_json_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = JointProperty("tolerance", lambda joint: joint.goal_tolerance, column="")
-    monkeypatch.setattr(loop_plan, "JOINT_PROPERTIES", (*JOINT_PROPERTIES, wide))
     monkeypatch.setattr("dxlrun.compile.report.JOINT_PROPERTIES", (*JOINT_PROPERTIES, wide))
     rows, table = _joint_table()
     assert all(row["tolerance"] for row in rows)
@@ -46,7 +44,7 @@ def test_running_robot_lists_the_same_properties() -> None:
     joints = compile_files(ROBOT, {}, []).plan.loop.joints
     values = JointValues.collect(joints, {})
     fields = {one.listed for one in JOINT_PROPERTIES if one.listed}
-    assert fields | {"effort_units"} == {one.name for one in dataclasses.fields(JointValues)}
+    assert fields | {"effort_units", "joint_keys"} == {one.name for one in dataclasses.fields(JointValues)}
     found = msgspec.to_builtins(values)
     assert found["units"].keys() == found["speeds"].keys() == {joint.name for joint in joints}
     assert [name for name, unit in found["units"].items() if unit == "m"] == ["gripper"]
@@ -55,5 +53,5 @@ def test_running_robot_lists_the_same_properties() -> None:
 
 def test_order_of_a_robots_description_is_that_of_its_documentation() -> None:
     names = ["robot", "rate", "paused", "began", "cycles", "skipped", "joints", "groups", "units"]
-    names += ["effort_units", "limits", "speeds", "controllers", "sources", "file", "log"]
+    names += ["effort_units", "limits", "speeds", "joint_keys", "controllers", "sources", "file", "log"]
     assert [one.name for one in dataclasses.fields(RobotInfo)] == names

@@ -544,6 +544,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "effort_units": {},
         "limits": {"pan": [-1.0, 1.0], "tilt": [-1.0, 1.0]},
         "speeds": {"pan": None, "tilt": None},
+        "joint_keys": {},
         "sources": [],
         "file": str(Path("pair.yaml").absolute()),
         "log": "/logs/pair.mcap",

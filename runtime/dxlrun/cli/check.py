@@ -195,7 +195,9 @@ _MOTIONS: Columns[Row] = [
 
 def _joints(joints: Sequence[Row]) -> Table:
     from dxlrun.compile.joints.limits import degrees
-    from dxlrun.plan.loop_plan import JOINT_PROPERTIES
+    from dxlrun.compile.report import shown_properties
+
+    properties = shown_properties()
 
     def interval(row: Row, lower: str, upper: str) -> str:
         unit = LINEAR if row["linear"] else ROTARY
@@ -209,6 +211,8 @@ def _joints(joints: Sequence[Row]) -> Table:
         value = row[one.name]
         if value is None:
             return "none"
+        if one.text is not None:
+            return one.text(value, LINEAR if row["linear"] else ROTARY)
         text = f"{value * 1e3:.6g} mm" if row["linear"] else degrees(value)
         return own(f"{text}{one.column}", row[f"{one.name}_source"] if one.limit else "none")
 
@@ -229,18 +233,12 @@ def _joints(joints: Sequence[Row]) -> Table:
             Column("reach", detail=True),
             lambda row: interval(row, "reach_lower", "reach_upper") if row["bounded"] else "continuous",
         ),
-        *[
-            (Column(one.name), partial(measure, one=one))
-            for one in JOINT_PROPERTIES
-            if one.column is not None
-        ],
+        *[(Column(one.name), partial(measure, one=one)) for one in properties],
         (Column("effort limit"), effort),
         (Column("motor file", "text", missing="none", detail=True), "motor"),
     ]
     unused = {
-        one.name: all(row[one.name] is None for row in joints)
-        for one in JOINT_PROPERTIES
-        if one.column is not None and not one.limit
+        one.name: all(row[one.name] is None for row in joints) for one in properties if not one.limit
     } | {
         "effort limit": all(row["effort_source"] != "file" for row in joints),
         "motor file": all(row["motor"] is None for row in joints),

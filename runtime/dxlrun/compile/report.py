@@ -17,14 +17,16 @@ from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.control.monitors import list_monitors
+from dxlrun.description.joints.joints import joint_keys, units_of_key
 from dxlrun.description.joints.mechanics import Limits
 from dxlrun.features import stages
+from dxlrun.features.feature import JointKey
 from dxlrun.output.table import Table
-from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, LoopPlan
+from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, JointProperty, LoopPlan
 from dxlrun.plan.policy_plan import POLICIES
 from dxlrun.plan.robot_plan import MotionPart, Plan
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.joint_unit import LINEAR
+from dxlwire.joint_unit import LINEAR, ROTARY
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
@@ -106,13 +108,28 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
 def _properties(plan: JointPlan, limits: Limits) -> Row:
     """Return the numbers of a joint that have a column, with the source of limits."""
     row: Row = {}
-    for one in JOINT_PROPERTIES:
-        if one.column is None:
-            continue
+    for one in shown_properties():
         row[one.name] = value = one.value(plan)
         if one.limit:
             row[f"{one.name}_source"] = _source(getattr(limits, one.name), value is not None)
     return row
+
+
+def shown_properties() -> list[JointProperty]:
+    """Return the properties of joints that have a column: the keys of features are the last."""
+    own = [one for one in JOINT_PROPERTIES if one.column is not None]
+    return own + [_property_of(key) for key in joint_keys()]
+
+
+def _property_of(key: JointKey[object]) -> JointProperty:
+    units = units_of_key(key)
+    _, of_positions, suffix = units.get(ROTARY, "").partition(ROTARY.si)
+    return JointProperty(
+        key.name,
+        lambda joint: joint.keys.get(key.name),
+        column=suffix,
+        text=None if of_positions else lambda value, unit: f"{value} {units.get(unit, '')}".rstrip(),
+    )
 
 
 def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:

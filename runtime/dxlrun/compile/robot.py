@@ -155,7 +155,7 @@ def compile_robot(
     check_twins(file, {name: joint.table for name, joint in joints.items()})
     body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
-    features = _used_features(file)
+    features = _used_features(file, joints)
     compilation = Compilation(file, plugins, joints, body)
     by_feature = {
         feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage, features)
@@ -244,14 +244,18 @@ def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
     return frozenset(servos | {device.model for bus in buses for device in bus.devices})
 
 
-def _used_features(file: RobotFile) -> tuple[Feature, ...]:
-    """Return our features, and those of plug-ins whose sections the file has."""
-    known = installed_features()
-    return tuple(each for each in known if not each.distribution or file.marks.has((each.name,)))
+def _used_features(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tuple[Feature, ...]:
+    """Return our features, and those of plug-ins whose sections or joint keys the file has."""
+    keys = {key for joint in joints.values() for key in joint.plan.keys}
+    return tuple(
+        each
+        for each in installed_features()
+        if not each.distribution or each.name in keys or file.marks.has((each.name,))
+    )
 
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:
-    """Return the packages of the plug-ins whose sections the robot file has, with their distributions."""
+    """Return the packages of the plug-ins whose features the robot file uses, with their distributions."""
     used = [each for each in features if each.distribution]
     if not used:
         return {}

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from types import EllipsisType
-from typing import Annotated, Self, TypeVar, cast
+from typing import Annotated, Any, Protocol, Self, TypeVar, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    create_model,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 T = TypeVar("T")
+F = TypeVar("F", bound=BaseModel)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
@@ -94,6 +103,48 @@ def key(
         min_length=min_length,
     )
     return field
+
+
+class FormKey(Protocol):
+    """Key that a feature adds to a form."""
+
+    @property
+    def name(self) -> str:
+        """The key."""
+
+    @property
+    def form(self) -> object:
+        """Type of its value."""
+
+    @property
+    def field(self) -> object:
+        """Its field, as `key` returns it."""
+
+    @property
+    def before(self) -> str:
+        """Key that follows it in lists of all keys; empty: it is the last."""
+
+
+def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> type[F]:
+    """Return a form with keys that features add.
+
+    Args:
+        form: The form without them.
+        keys: The keys.
+        replaced: Other types of keys that the form has.
+    """
+    added = [*keys]
+    definitions: dict[str, Any] = {name: (kind, form.model_fields[name]) for name, kind in replaced.items()}
+    definitions |= {each.name: (each.form, each.field) for each in added}
+    if not definitions:
+        return form
+    made = create_model(form.__name__, __base__=form, __doc__=form.__doc__, **definitions)
+    order = [*form.model_fields]
+    for each in added:
+        order.insert(order.index(each.before) if each.before else len(order), each.name)
+    # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
+    made.__pydantic_fields__ = {name: made.model_fields[name] for name in order}
+    return made
 
 
 class PlugInEntry(Form):

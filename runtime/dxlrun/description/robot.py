@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -13,13 +13,12 @@ from pydantic import (
     Field,
     Tag,
     WithJsonSchema,
-    create_model,
 )
 
 from dxlrun.description import units
 from dxlrun.description.bus import Bus
-from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse
-from dxlrun.description.joints.joints import JointEntry
+from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse, with_keys
+from dxlrun.description.joints.joints import JointEntry, joint_form
 from dxlrun.description.joints.mechanics import (
     Transmission,
 )
@@ -307,11 +306,4 @@ class Robot(Form):
 def robot_form() -> type[Robot]:
     """Return the form of a robot file with the sections of all features."""
     sections = [section for _, section in stages(Section, installed_features())]
-    definitions: dict[str, Any] = {each.name: (each.form, each.field) for each in sections}
-    form = create_model(Robot.__name__, __base__=Robot, __doc__=Robot.__doc__, **definitions)
-    order = [*Robot.model_fields]
-    for each in sections:
-        order.insert(order.index(each.before) if each.before else len(order), each.name)
-    # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
-    form.__pydantic_fields__ = {name: form.model_fields[name] for name in order}
-    return form
+    return with_keys(Robot, sections, joints=dict[Name, joint_form()])  # type: ignore[misc]  # made at run time

@@ -114,6 +114,8 @@ class LayerStage:
     FILE: ClassVar[str] = "layer"
 
     prepare: Callable[[Plan, States, Commands, EventSink], PreparedLayer | None]
+    to_servos: bool = False
+    """The arrays below have a row for each servo, those above for each joint: so it is the last."""
 
 
 class HardwareLayers:
@@ -123,7 +125,8 @@ class HardwareLayers:
         self.states = states
         self.goals = goals
         self._layers: list[PreparedLayer] = []
-        for _, stage in stages(LayerStage, plan.features):
+        found = (stage for _, stage in stages(LayerStage, plan.features))
+        for stage in sorted(found, key=lambda stage: stage.to_servos):
             layer = stage.prepare(plan, self.states, self.goals, events)
             if layer is not None:
                 self._layers.append(layer)

@@ -1,6 +1,6 @@
-"""Features: one folder for each section of the robot file, with all that belongs to it.
+"""Features: one folder for each section or key of the robot file, with all that belongs to it.
 
-A folder holds what one section needs in every stage, from its form to its part in the loop. What two features
+A folder holds what one feature needs in every stage, from its form to its part in the loop. What two features
 share belongs to the room of that stage. `feature.py` describes the files; `FEATURES` names the folders.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from dxlrun.features.feature import Feature, S, Section
+from dxlrun.features.feature import Feature, JointKey, S, Section
 
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
@@ -63,14 +63,14 @@ def _installed() -> tuple[tuple[Feature, ...], dict[str, str]]:
             features += _features_of(point)
         for feature in features:
             try:
-                section = feature.stage(Section)
+                keys = feature.stage(Section), feature.stage(JointKey)
             except (Exception, SystemExit) as error:
                 broken[feature.name] = (
                     f"the section {feature.name} of {feature.distribution} cannot be used "
                     f"({type(error).__name__}: {error}); report it to its author"
                 )
                 continue
-            if section is None or section.name != feature.name or feature.name in found:
+            if feature.name not in {key.name for key in keys if key} or feature.name in found:
                 broken[feature.name] = (
                     f"{feature.distribution} offers the section {feature.name}, which "
                     + ("is there already" if feature.name in found else "its form.py does not have")

@@ -1,17 +1,22 @@
-"""Feature: a section of the robot file with everything that belongs to it, in a folder of its own.
+"""Feature: a section or a key of the robot file with everything that belongs to it, in a folder of its own.
 
 A feature is a package whose files have fixed names, one for each stage in which it takes part: `form.py` has
-its section, `compile.py` its share of the plan, and so on. Such a file has one object `STAGE`. Its class
-belongs to the room that asks for it, and documents when that happens. A feature has as many of these files as
-it needs. The stage that asks for a file imports it, so `dxlrun check` imports nothing of the run.
+its section, `joint_key.py` its key of joints, `compile.py` its share of the plan, and so on. Such a file has
+one object `STAGE`. Its class belongs to the room that asks for it, and documents when that happens. A feature
+has as many of these files as it needs. The stage that asks for a file imports it, so `dxlrun check` imports
+nothing of the run.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import ClassVar, Generic, Protocol, TypeVar
+
+from dxlwire.joint_unit import JointUnit
 
 T = TypeVar("T")
 
@@ -50,12 +55,51 @@ class Section(Generic[T]):
         return section
 
 
+class KeyedJoint(Protocol):
+    """Joint of a plan, with the keys of features that the robot file gives it."""
+
+    @property
+    def keys(self) -> Mapping[str, object]:
+        """Values by key, as JSON has them."""
+
+
+@dataclass(frozen=True)
+class JointKey(Generic[T]):
+    """Key of a joint: `STAGE` of `joint_key.py`, asked for before a file is read.
+
+    Every joint may have it, and so may `groups` and `joint_defaults`. The plan of a joint has the value that
+    the robot file gives, numbers in SI units; `dxlrun check` and the clients of a run show it.
+    """
+
+    FILE: ClassVar[str] = "joint_key"
+
+    name: str
+    """The key, such as `tolerance`; that of the feature."""
+    form: object
+    """Type of the value in the file, for pydantic: `Position | None`."""
+    field: object
+    """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    value: type[T]
+    """Type of the value in the plan: `float`, or a struct of msgspec for a form."""
+    before: str = ""
+    """Key of a joint that follows it in lists of all keys; empty: it is the last."""
+    examples: Mapping[JointUnit, str] = dataclasses.field(default_factory=dict)
+    """How a value is written where the joint turns, and where it is linear; one of the other kind is refused.
+    Empty: its unit has nothing to do with that of the joint."""
+
+    def of(self, joint: KeyedJoint) -> T | None:
+        """Return the value of a joint in a plan; None: the robot file gives none."""
+        import msgspec  # not above: a file is checked without JSON
+
+        return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
+
+
 @dataclass(frozen=True)
 class Feature:
     """A feature by its name and the package that has its files."""
 
     name: str
-    """Key of its section in the robot file, such as `devices`."""
+    """Key of the robot file or of a joint, such as `devices`."""
     package: str
     """Package with its files, such as `dxlrun.features.devices`."""
     distribution: str = ""

@@ -108,6 +108,8 @@ class JointPlan(msgspec.Struct, frozen=True):
     wrap: bool = False  # A continuous joint to which a turn more is the same place
     servo_limits: tuple[ServoLimit, ...] = ()
     """Registers of its servos that limit goals; empty in the plan, as they are read at the start."""
+    keys: dict[str, object] = {}
+    """Keys of features that the file gives it, in SI units; `JointKey.of` returns one with its type."""
 
     @property
     def label(self) -> str:
@@ -213,6 +215,8 @@ class JointProperty(msgspec.Struct, frozen=True):
     limit: bool = False
     """A joint has it in its `limits` in the robot file; without it, the number is the servo's own."""
     listed: str = ""  # Field of `JointValues` that has it; empty: none
+    text: Callable[[object, JointUnit], str] | None = None
+    """Writes a value that is not in a unit of positions or speeds; None: it is."""
 
 
 JOINT_PROPERTIES: tuple[JointProperty, ...] = (
@@ -224,8 +228,7 @@ JOINT_PROPERTIES: tuple[JointProperty, ...] = (
     JointProperty("velocity", lambda joint: joint.velocity, column="/s", limit=True),
     JointProperty("acceleration", lambda joint: joint.acceleration, column="/s^2"),
 )
-"""In the order of the columns of `check`. A new key of joints is shown everywhere by its row here, and by its
-field of `JointValues`."""
+"""In the order of the columns of `check`, which shows the keys of features after them."""
 
 
 @dataclass(frozen=True)
@@ -239,6 +242,8 @@ class JointValues:
     """Lowest and highest position of the joints that have limits."""
     speeds: dict[str, float | None]
     """Highest one of each joint; null: without a limit."""
+    joint_keys: dict[str, dict[str, object]]
+    """Keys of features: the value of each joint that has the key in the robot file, by key and joint."""
 
     @classmethod
     def collect(cls, joints: Sequence[JointPlan], effort_units: dict[str, str]) -> JointValues:
@@ -248,7 +253,11 @@ class JointValues:
             for one in JOINT_PROPERTIES
             if one.listed
         }
-        return msgspec.convert(values | {"effort_units": effort_units}, cls)
+        keys = {
+            key: {joint.name: joint.keys[key] for joint in joints if key in joint.keys}
+            for key in dict.fromkeys(key for joint in joints for key in joint.keys)
+        }
+        return msgspec.convert(values | {"effort_units": effort_units, "joint_keys": keys}, cls)
 
 
 def _or_inf(limit: float | None) -> float:

@@ -1,9 +1,10 @@
-"""Features: the names for a section that a package adds to the robot file.
+"""Features: the names for a section or a key of joints that a package adds to the robot file.
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
-`Section` in `form.py`, `CompileStage` in `compile.py`, `LayerStage` in `layer.py`, `BusStage` in
-`runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. All but the first may be missing. Forms
-are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
+`Section` in `form.py`, `JointKey` in `joint_key.py`, `CompileStage` in `compile.py`, `LayerStage` in
+`layer.py`, `BusStage` in `runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. One of the first
+two is required. Forms are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers
+the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature
@@ -20,6 +21,9 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.channels.cycle import Commands as Commands
+    from dxlrun.channels.cycle import States as States
+    from dxlrun.channels.events import EventSink as EventSink
     from dxlrun.compile.contribution import BusDevice as BusDevice
     from dxlrun.compile.contribution import Compilation as Compilation
     from dxlrun.compile.contribution import CompileStage as CompileStage
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.compile.report import Row as Row
     from dxlrun.compile.report import TableStage as TableStage
+    from dxlrun.contract.hardware import Hardware as Hardware
     from dxlrun.dynamixel.bus_part import BusContext as BusContext
     from dxlrun.dynamixel.bus_part import BusPart as BusPart
     from dxlrun.dynamixel.bus_part import BusStage as BusStage
@@ -36,6 +41,7 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.hardware_layer import LayerStage as LayerStage
     from dxlrun.dynamixel.hardware_layer import PreparedLayer as PreparedLayer
     from dxlrun.features.feature import Feature as Feature
+    from dxlrun.features.feature import JointKey as JointKey
     from dxlrun.features.feature import Section as Section
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
     from dxlwire.exchange.bus import Lines as Lines

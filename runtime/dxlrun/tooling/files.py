@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from dxlrun.description.form import Name as Name
     from dxlrun.description.form import key as key
     from dxlrun.description.form import refuse as refuse
+    from dxlrun.description.units import Acceleration as Acceleration
+    from dxlrun.description.units import Position as Position
+    from dxlrun.description.units import Speed as Speed
     from dxlrun.description.yaml_file import read_yaml as read_yaml
     from dxlrun.errors import Mark as Mark
     from dxlrun.errors import Problem as Problem

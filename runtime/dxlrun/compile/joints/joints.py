@@ -22,7 +22,7 @@ from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.joints.joints import Joint, JointEntry
+from dxlrun.description.joints.joints import Joint, JointEntry, planned_keys
 from dxlrun.description.units import plain
 from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
@@ -195,6 +195,7 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         rest_speed=_limited(joint.tolerance.velocity),
         settle_ns=SETTLE_NS if joint.tolerance.time is None else joint.tolerance.time,
         wrap=joint.wrap,
+        keys=planned_keys(joint),
     )
 
 

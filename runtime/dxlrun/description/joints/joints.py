@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Self
+from typing import Annotated, Self, TypeAlias, get_args
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form import Form, ItemName, key, refuse
+from dxlrun.description.form import Form, ItemName, key, refuse, with_keys
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
@@ -39,6 +39,8 @@ from dxlrun.description.units import (
     speed,
     torque_or_force,
 )
+from dxlrun.features import installed_features, stages
+from dxlrun.features.feature import JointKey
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
@@ -177,6 +179,9 @@ class SharedJoint(ServoJoint):
     )
 
 
+JointEntry: TypeAlias = Joint | SharedJoint | BareJoint
+"""A joint as the robot file has it."""
+
 _OF_A_SERVO = frozenset(Joint.model_fields) - frozenset(BareJoint.model_fields)
 """Keys of a joint with a servo of its own; one without any is moved by a transmission."""
 
@@ -204,12 +209,38 @@ def kind_of_joint(joint: object) -> str:
     return "<one servo>" if isinstance(joint, Joint) or not isinstance(joint, BareJoint) else "<transmission>"
 
 
-JointEntry = Annotated[
-    Annotated[Joint, Tag("<one servo>")]
-    | Annotated[SharedJoint, Tag("<several servos>")]
-    | Annotated[BareJoint, Tag("<transmission>")],
-    Discriminator(kind_of_joint),
-]
+def joint_keys() -> list[JointKey[object]]:
+    """Return the keys that features add to joints."""
+    return [key for _, key in stages(JointKey, installed_features())]
+
+
+def joint_form() -> object:
+    """Return the type of a joint in the file: one of the forms, with the keys of features."""
+    own, shared, bare = (with_keys(form, joint_keys()) for form in (Joint, SharedJoint, BareJoint))
+    return Annotated[
+        Annotated[own, Tag("<one servo>")]
+        | Annotated[shared, Tag("<several servos>")]
+        | Annotated[bare, Tag("<transmission>")],
+        Discriminator(kind_of_joint),
+    ]
+
+
+def planned_keys(joint: BareJoint) -> dict[str, object]:
+    """Return the keys of features that the file gives a joint, as a plan has them."""
+    given = {key.name: getattr(joint, key.name) for key in joint_keys() if key.name in joint.model_fields_set}
+    return {name: _planned(value) for name, value in given.items() if value is not None}
+
+
+def _planned(value: object) -> object:
+    """Return a value as JSON has it; a quantity is a number in its SI unit."""
+    if isinstance(value, Form):
+        return {name: _planned(getattr(value, name)) for name in type(value).model_fields}
+    if isinstance(value, dict):
+        return {name: _planned(each) for name, each in value.items()}
+    if isinstance(value, tuple):
+        return [_planned(each) for each in value]
+    return float(value) if isinstance(value, float) else value
+
 
 _MEASURES: Mapping[KeyPath, tuple[Either, Mapping[JointUnit, str]]] = {
     ("limits", "position"): (position, {ROTARY: "[-90 deg, 90 deg]", LINEAR: "[0 mm, 40 mm]"}),
@@ -222,7 +253,10 @@ _MEASURES: Mapping[KeyPath, tuple[Either, Mapping[JointUnit, str]]] = {
     ("tolerance", "position"): (position, {ROTARY: "2 deg", LINEAR: "2 mm"}),
     ("tolerance", "velocity"): (speed, {ROTARY: "2 deg/s", LINEAR: "2 mm/s"}),
 }
-"""Keys whose unit goes with the joint: how they are written where it turns, and where it is linear."""
+"""Keys whose unit goes with the joint: how they are written where it turns, and where it is linear.
+
+Features have others, see `JointKey.examples`.
+"""
 _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
     LINEAR: {
@@ -239,17 +273,38 @@ def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
 
     `joints` as the file has them; what is wrong with their form is for the model.
     """
+    measures = {**_MEASURES}
+    measures |= {(key.name,): (kind, key.examples) for key in joint_keys() for kind in _kinds_of(key)}
     for name, entry in joints.items() if isinstance(joints, dict) else ():
         unit = LINEAR if isinstance(entry, dict) and "travel_per_turn" in entry else ROTARY
         is_so = f"{name} {unit.verb}"
         for path, fix in _OF_OTHER_JOINTS[unit].items():
             if _written(entry, path) is not None:
                 yield ("joints", name, *path), f"{is_so}, and has no {path[-1]}", fix
-        for path, (kind, examples) in _MEASURES.items():
+        for path, (kind, examples) in measures.items():
             for step, written in _units(kind, _written(entry, path)):
                 if JointUnit.find_by_quantity(written) is not unit:
                     what = f"{is_so}, and its {path[-1]} is in {written}"
                     yield ("joints", name, *path, *step), what, f"write it as {examples[unit]}"
+
+
+def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
+    """Return the SI unit of a key's values for each kind of joint; empty where it does not depend on that."""
+    return {unit: kind(example).unit for kind in _kinds_of(key) for unit, example in key.examples.items()}
+
+
+def _kinds_of(key: JointKey[object]) -> list[Either]:
+    """Return the quantity of a key whose unit goes with the joint, else nothing."""
+    return [*_quantities(key.form)] if key.examples else []
+
+
+def _quantities(form: object) -> Iterator[Either]:
+    """Yield the quantities in a type such as `Position | None`."""
+    for part in get_args(form):
+        if isinstance(part, Either):
+            yield part
+        else:
+            yield from _quantities(part)
 
 
 def _written(entry: object, path: KeyPath) -> object:

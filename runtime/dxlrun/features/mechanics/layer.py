@@ -24,4 +24,4 @@ def prepare_mechanics(plan: Plan, states: States, goals: Commands, events: Event
     )
 
 
-STAGE = LayerStage(prepare_mechanics)
+STAGE = LayerStage(prepare_mechanics, to_servos=True)

@@ -1,0 +1,182 @@
+"""A key of joints of a foreign package: that of the page add-a-section.md, checked, executed and shown."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.kit.rigs import Events
+
+from dxlrun import InputError
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.cli import check
+from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.description.json_schema import robot_schema
+from dxlrun.description.robot import robot_form
+from dxlrun.dynamixel.hardware_layer import HardwareLayers
+from dxlrun.features import forget_installed
+from dxlrun.plan.loop_plan import JointValues
+from dxlrun.plan.robot_plan import from_json, to_json
+from dxlrun.testing import installed, simulated_robot
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-a-section.md"
+ROBOTS = Path(__file__).parents[2] / "robots"
+HEAD = """name: knees
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 500 us}
+loop: {rate: 50}
+"""
+KNEE = "{bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, backlash: 4 deg}"
+ANKLE = "{bus: main, id: 2, model: AX-12A, reference: 150 deg, direction: 1}"
+SLIDE = "{bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, travel_per_turn: 94 mm%s}"
+ROBOT = f"{HEAD}joints:\n  knee: {KNEE}\n  ankle: {ANKLE}\n"
+RAD_PER_TICK = np.radians(300) / 1023
+
+
+@pytest.fixture(autouse=True)
+def with_backlash(tmp_path: Path) -> Iterator[None]:
+    """Install the package whose files are on the page."""
+    section = PAGE.read_text().partition("## A key of joints")[2]
+    files = dict(
+        zip(
+            ("joint_key", "compile", "layer"), re.findall(r"```python\n(.*?)```", section, re.S), strict=False
+        )
+    )
+    files |= {
+        "__init__": "",
+        "plugin": "from dxlrun.tooling.features import Feature\n\n\n"
+        "def dxlrun_features():\n    return [Feature('backlash', 'dxlrun_backlash')]\n",
+    }
+    package = tmp_path / "project" / "src" / "dxlrun_backlash"
+    package.mkdir(parents=True)
+    for name, text in files.items():
+        (package / f"{name}.py").write_text(text)
+    (tmp_path / "project" / "pyproject.toml").write_text(
+        '[project]\nname = "dxlrun-backlash"\nversion = "1.0"\n'
+        '[project.entry-points.dxlrun]\nbacklash = "dxlrun_backlash.plugin"\n'
+    )
+    with installed(tmp_path / "project"):
+        yield
+    forget_installed()
+    robot_form.cache_clear()
+
+
+def compiled(tmp_path: Path, text: str) -> Compiled:
+    """Compile the text of a robot file."""
+    (tmp_path / "robot.yaml").write_text(text)
+    return compile_files(tmp_path / "robot.yaml", {}, [])
+
+
+def mechanics_with_backlash() -> str:
+    """Return a robot with a coupled joint that has the key."""
+    text = (ROBOTS / "mechanics.yaml").read_text().replace("model: {urdf: urdf/mechanics.urdf}\n", "")
+    return re.sub(r"(wrist_roll: *\{)", r"\1backlash: 1 deg, ", text)
+
+
+def problems(tmp_path: Path, text: str) -> str:
+    """Return what is wrong with the text of a robot file."""
+    with pytest.raises(InputError) as error:
+        compiled(tmp_path, text)
+    return str(error.value)
+
+
+def test_value_is_in_the_plan_of_its_joint_only(tmp_path: Path) -> None:
+    plan = compiled(tmp_path, ROBOT).plan
+    assert [dict(joint.keys) for joint in plan.loop.joints] == [{"backlash": np.radians(4)}, {}]
+    assert from_json(to_json(plan)) == plan
+    assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
+
+
+def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
+    defaults = f"{ROBOT}joint_defaults: {{backlash: 1 deg}}\n"
+    assert [joint.keys["backlash"] for joint in compiled(tmp_path, defaults).plan.loop.joints] == [
+        pytest.approx(np.radians(4)),
+        pytest.approx(np.radians(1)),
+    ]
+    groups = f"{ROBOT}groups: {{leg: {{joints: [ankle], backlash: 2 deg}}}}\n"
+    assert compiled(tmp_path, groups).plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))
+
+
+def test_joint_of_a_transmission_may_have_the_key(tmp_path: Path) -> None:
+    joints = compiled(tmp_path, mechanics_with_backlash()).plan.loop.joints
+    assert [joint.name for joint in joints if joint.keys] == ["wrist_roll"]
+
+
+def test_layer_of_a_joint_key_is_above_the_servos_of_couplings(tmp_path: Path) -> None:
+    plan = compiled(tmp_path, mechanics_with_backlash()).plan
+    joints, servos = len(plan.loop.joints), len(plan.mechanics.servos)
+    layers = HardwareLayers(plan, States.empty(joints), Commands.empty(joints), Events())
+    assert [len(layer.goals.position) for layer in layers._layers] == [joints, servos]
+
+
+def test_check_of_the_feature_names_the_place(tmp_path: Path) -> None:
+    found = problems(tmp_path, ROBOT.replace("4 deg", "400 deg"))
+    assert found.endswith("robot.yaml:6:87: the backlash of knee is outside its range; write less")
+
+
+def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path: Path) -> None:
+    slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 1 deg'}\n"
+    assert "slide is linear, and its backlash is in rad; write it as 0.2 mm" in problems(tmp_path, slide)
+    assert "and its backlash is in m; write it as 0.5 deg" in problems(
+        tmp_path, ROBOT.replace("4 deg", "4 mm")
+    )
+
+
+def test_unknown_word_is_compared_with_the_key(tmp_path: Path) -> None:
+    assert "did you mean backlash?" in problems(tmp_path, ROBOT.replace("backlash", "baklash"))
+
+
+def test_check_shows_the_key_as_a_column(tmp_path: Path) -> None:
+    slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 0.1 mm'}\n"
+    found = compiled(tmp_path, slide)
+    assert [row["backlash"] for row in found.report["joints"]] == [np.radians(4), None, 1e-4]
+    table = next(iter(check._tables(found)))
+    column = [one.name for one in table.columns].index("backlash")
+    assert [row[column].text for row in table.rows] == ["4", "none", "0.1 mm"]
+
+
+def test_no_column_while_no_joint_has_the_key(tmp_path: Path) -> None:
+    table = next(iter(check._tables(compiled(tmp_path, ROBOT.replace(", backlash: 4 deg", "")))))
+    assert "backlash" not in [one.name for one in table.columns]
+
+
+def test_clients_of_a_run_get_the_key(tmp_path: Path) -> None:
+    values = JointValues.collect(compiled(tmp_path, ROBOT).plan.loop.joints, {})
+    assert values.joint_keys == {"backlash": {"knee": np.radians(4)}}
+
+
+def test_key_is_in_the_schema() -> None:
+    schema = robot_schema({}, {})
+    names = [*schema["$defs"]["Joint"]["properties"]]
+    assert names[names.index("simulation") - 1] == "backlash"
+    assert "backlash" in schema["properties"]["joint_defaults"]["properties"]
+    assert "Play of the gear" in schema["$defs"]["BareJoint"]["properties"]["backlash"]["description"]
+
+
+def test_goals_go_on_by_half_of_the_play(tmp_path: Path) -> None:
+    text = f"{ROBOT}controllers:\n  legs: {{type: joint_group_position_controller, joints: [knee, ankle]}}\n"
+    (tmp_path / "robot.yaml").write_text(text)
+    motion = tmp_path / "motion.yaml"
+    motion.write_text(
+        "name: steps\nmotions:\n  - controller: legs\n    start: 0 s\n    points:\n"
+        "      - {time: 0.1 s, joints: {knee: {position: 10 deg}, ankle: {position: 10 deg}}}\n"
+        "      - {time: 1.0 s, joints: {knee: {position: 5 deg}, ankle: {position: 5 deg}}}\n"
+    )
+    robot = simulated_robot(tmp_path / "robot.yaml", play=[motion], duration_s=2.0)
+    goals: list[list[float]] = []
+    for at_s in (0.9, 1.9):
+        robot.buses[0].at(
+            round(at_s * 1e9),
+            lambda: goals.append(
+                [
+                    robot.buses[0].servo(each).registers["goal_position"] * RAD_PER_TICK - np.radians(150)
+                    for each in (1, 2)
+                ]
+            ),
+        )
+    robot.run()
+    expected = [[np.radians(12), np.radians(10)], [np.radians(3), np.radians(5)]]
+    np.testing.assert_allclose(goals, expected, atol=RAD_PER_TICK)
