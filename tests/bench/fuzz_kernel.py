@@ -42,7 +42,7 @@ from tests.kit.decoded import decode_packets
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import BusPlan, DevicePlan
@@ -50,7 +50,7 @@ from dxlwire.clock import VirtualClock
 from dxlwire.control_table import control_table
 from dxlwire.control_table.device_table import read_device_table
 from dxlwire.exchange import kernel
-from dxlwire.exchange.bus import NEVER
+from dxlwire.exchange.bus import NEVER, Lines
 from dxlwire.modes import Mode
 from dxlwire.plan.devices import device_blocks
 from dxlwire.plan.line import Line as LineTimes
@@ -148,7 +148,7 @@ class Line(OwnProcessors):
         return bool(self.arriving) and self.arriving[0][0] <= self.clock.now_ns()
 
 
-class Lines:
+class LinePorts:
     """Some lines, waited for together."""
 
     polling = descriptors = None
@@ -191,7 +191,7 @@ class Side:
     """A robot that is read by the kernel, or by the parser alone."""
 
     def __init__(self, plans, desk=None, by_parser=False):
-        self.lines = Lines(plans)
+        self.lines = LinePorts(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
             Handover(lambda _, payload: self.log.extend(decode_packets(payload))),
@@ -202,17 +202,9 @@ class Side:
         devices = [device for plan in plans for device in plan.devices]
         states = [field for device in devices for block in device.blocks for field in block.fields]
         self.sources = SourceStates.empty(len(devices), len(states))
-        self.hardware = Hardware(
-            plans,
-            self.lines,
-            self.lines.clock,
-            self.states,
-            self.goals,
-            self.packets,
-            self.events,
-            lambda: None,
-            sources=self.sources,
-        )
+        lines = Lines(plans, self.lines, self.lines.clock, self.packets)
+        arrays = ServoArrays(self.states, self.goals, self.sources)
+        self.hardware = Hardware(lines, self.packets, arrays, self.events)
         self.hardware.parsed = self._parsed
         if by_parser:
             self.hardware._kernel.plan = lambda *_: False  # as where it has no room for what is to be read

@@ -19,12 +19,12 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlwire.clock import MonotonicClock
 from dxlwire.compiled import parse_structs
 from dxlwire.errors import NotCompiled
 from dxlwire.exchange import bus, kernel
-from dxlwire.exchange.bus import FREE_NS
+from dxlwire.exchange.bus import FREE_NS, Lines
 from dxlwire.exchange.cyclic_reads import CALM_CYCLES
 from dxlwire.packets import RECORD_HEADER, PacketKind
 from dxlwire.port import ports
@@ -372,16 +372,8 @@ class TestOnDescriptors:
         rig = make_rig(plan)
         states, goals = States.empty(2), Commands.empty(2)
         ports = SerialPorts([SerialPort(theirs, "pty")])
-        hardware = DynamixelHardware(
-            [plan],
-            ports,
-            MonotonicClock(),
-            states,
-            goals,
-            rig.packets,
-            rig.events,
-            lambda: rig.beats.append(0),
-        )
+        lines = Lines([plan], ports, MonotonicClock(), rig.packets, lambda: rig.beats.append(0))
+        hardware = DynamixelHardware(lines, rig.packets, ServoArrays(states, goals), rig.events)
         (servos,) = hardware._servos
         while servos.reads.plan().program is None:  # as after some cycles in which every servo answered
             servos.reads.end()

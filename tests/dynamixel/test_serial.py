@@ -18,13 +18,14 @@ import dxlrun
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.process import memory_file
 from dxlrun.compile.robot import compile_files
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.clock import MonotonicClock
+from dxlwire.exchange.bus import Lines
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.port.reopening import KeptLines, Wanted
 from dxlwire.port.serial_open import let_go, open_serial, rate_remark
@@ -291,9 +292,8 @@ def test_the_same_code_drives_the_simulated_process(simulated_line):
     states, goals, clock = States.empty(8), Commands.empty(8), MonotonicClock(0)
     with open_serial(path, 1_000_000) as line:
         ports = SerialPorts([SerialPort(line.fileno(), path)])
-        hardware = DynamixelHardware(
-            [make_plan()], ports, clock, states, goals, rig.packets, rig.events, lambda: None
-        )
+        lines = Lines([make_plan()], ports, clock, rig.packets)
+        hardware = DynamixelHardware(lines, rig.packets, ServoArrays(states, goals), rig.events)
         hardware.start()
         assert states.valid.all()
         for _ in range(5):

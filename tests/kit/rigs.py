@@ -33,7 +33,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.features import FEATURES
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
@@ -302,17 +302,12 @@ def make_rig(
     commands = np.full(sum(len(device.commands) for device in devices), np.nan)
     beats: list[int] = []
     hardware = DynamixelHardware(
-        plans,
-        ports,
-        clock,
-        states,
-        goals,
+        Lines(plans, ports, clock, packets, lambda: beats.append(clock.now_ns())),
         packets,
+        ServoArrays(states, goals, sources),
         events,
-        lambda: beats.append(clock.now_ns()),
-        take_over=take_over,
-        sources=sources,
         parts=FeatureParts(FEATURES, (), commands, {}),
+        take_over=take_over,
     )
     rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
     rig.sources, rig.device_commands = sources, commands

@@ -26,7 +26,7 @@ from dxlrun.compile.robot import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.context import StopFlag
 from dxlrun.description.reading import read_robot
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.process_table import read_stat
 from dxlrun.run import supervisor, watch
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
@@ -49,6 +49,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
 from dxlwire.exchange import bus
+from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketLog
 from dxlwire.port.ports import StallCounter
 from dxlwire.port.reopening import KeptLines
@@ -292,16 +293,9 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     clock, ledger = VirtualClock(), Ledger()
     buses = [SimulatedBus(config, ledger, 0) for config in simulation_of(plan).buses]
     events = EventRing(Handover(lambda kind, payload: None), clock)
-    hardware = DynamixelHardware(
-        plan.buses,
-        VirtualPorts(clock, buses),
-        clock,
-        States.empty(2),
-        Commands.empty(2),
-        PacketLog(),
-        events,
-        beat,
-    )
+    packets = PacketLog()
+    lines = Lines(plan.buses, VirtualPorts(clock, buses), clock, packets, beat)
+    hardware = DynamixelHardware(lines, packets, ServoArrays(States.empty(2), Commands.empty(2)), events)
     page.enter(Phase.SETUP)
     try:
         hardware.start(lambda: page.enter(Phase.ENGAGING))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,6 @@ from dxlrun.dynamixel.wire_reports import WireReports
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.features import FEATURES
 from dxlrun.plan.loop_plan import ServoLimit
-from dxlwire.bus_plan import BusPlan
-from dxlwire.clock import Clock
 from dxlwire.exchange.bus import LATE_NS, NEVER, Bus, Lines
 from dxlwire.exchange.cyclic_reads import MOST_BROKEN
 from dxlwire.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
@@ -34,7 +33,6 @@ from dxlwire.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
 from dxlwire.exchange.samples import Samples
 from dxlwire.packets import PacketLog
 from dxlwire.plan.retry import limit_patience, pause
-from dxlwire.port.ports import Ports
 
 STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
 LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then
@@ -48,6 +46,16 @@ IDLE_MARGIN_NS = 150_000
 """The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
 
 
+@dataclass(frozen=True, slots=True)
+class ServoArrays:
+    """Arrays of a robot as its servos have them: those of the cycle's record, or those below a layer."""
+
+    states: States
+    goals: Commands
+    sources: SourceStates = field(default_factory=SourceStates.empty)
+    """Of devices."""
+
+
 class DynamixelHardware:
     """Reads all servos, writes all goals, once a cycle; `control.loop.Hardware` has the contract.
 
@@ -56,33 +64,37 @@ class DynamixelHardware:
     no goal until it was, because writing a goal switches torque on (protocol.md).
     """
 
-    def __init__(  # noqa: PLR0917  the order is the contract of the composition roots
+    def __init__(
         self,
-        plans: Sequence[BusPlan],
-        ports: Ports,
-        clock: Clock,
-        states: States,
-        goals: Commands,
+        lines: Lines,
         packets: PacketLog,
+        arrays: ServoArrays,
         events: EventSink,
-        beat: Callable[[], None],
-        take_over: bool = False,
-        sources: SourceStates | None = None,
+        *,
         parts: FeatureParts | None = None,
         refusals: Callable[[], Sequence[str]] | None = None,
+        take_over: bool = False,
     ) -> None:
-        """`refusals` looks at where the servos stand, which the states then have, before any gets torque, and
-        returns why the robot must not start, one sentence each.
+        """Plan the exchange; nothing is sent yet.
 
-        `sources`: of the cycle's record. `parts`: the features of the robot; None: ours, without commands.
+        Args:
+            lines: The robot's lines.
+            packets: Takes every packet, also those of `lines`.
+            arrays: Where states go, and where goals are.
+            events: Events for the log.
+            parts: Features of the robot; None: ours, without commands.
+            refusals: Called when the states have the positions of the servos, before any gets torque. Returns
+                why the robot must not start, one sentence each.
+            take_over: The servos may have torque already.
 
-        Raises NotCompiled where the exchange kernel was not compiled.
+        Raises:
+            NotCompiled: The exchange kernel was not compiled.
         """
-        self._lines = Lines(plans, ports, clock, packets, beat)
-        self._plans, self._buses = self._lines.plans, self._lines.buses
-        self._ports = ports
-        self._clock = clock
-        self._now_ns = clock.now_ns
+        states, goals = arrays.states, arrays.goals
+        self._lines = lines
+        self._plans, self._buses = lines.plans, lines.buses
+        self._clock = lines.clock
+        self._now_ns = lines.clock.now_ns
         self._states = states
         self._goals = goals
         self._events = events
@@ -99,12 +111,12 @@ class DynamixelHardware:
         """or where it is so long, ns, on a line, whose words these are."""
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
-        self._samples = Samples(self._plans, states, sources or SourceStates.empty(), reports)
+        self._samples = Samples(self._plans, states, arrays.sources, reports)
         parts = parts or FeatureParts(FEATURES, (), np.empty(0), {})
         self._safe_end = SafeEnd.of(parts.features, parts.plans)
         self._servos = tuple(
-            Servos(idle, states, arrays, parts, events)
-            for idle, arrays in zip(self._idle, self._samples.buses, strict=True)
+            Servos(idle, states, samples, parts, events)
+            for idle, samples in zip(self._idle, self._samples.buses, strict=True)
         )
         self._pairs = tuple(zip(self._buses, self._servos, strict=True))
         self._places = {
@@ -410,8 +422,8 @@ class DynamixelHardware:
     def _reopen_lines(self) -> None:
         """Open lines again that were lost, and continue on those that are back."""
         for index, (bus, servos) in enumerate(self._pairs):
-            if bus.failure is not None and self._ports.reopen(index):
-                bus.renew(self._ports.ports[index])
+            if bus.failure is not None and self._lines.ports.reopen(index):
+                bus.renew(self._lines.ports.ports[index])
                 servos.goals.renew()
                 servos.found()
                 servos.reads.plan()  # without its servos: none is read before it was found in order
@@ -435,8 +447,8 @@ class DynamixelHardware:
             self._clock.wait_until(now_ns + LINE_STEP_NS)
             self._lines.beat()
             for index in gone:
-                if self._ports.reopen(index):
-                    self._buses[index].renew(self._ports.ports[index])
+                if self._lines.ports.reopen(index):
+                    self._buses[index].renew(self._lines.ports.ports[index])
                     return True
         return False
 

@@ -23,11 +23,12 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.dynamixel.bus_part import FeatureParts
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
 from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.clock import Clock
+from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketLog
 from dxlwire.port.ports import Ports
 
@@ -140,20 +141,15 @@ def assemble(
     record, sinks = CycleRecord(plan.loop.layout), host.sinks
     layers = HardwareLayers(plan, record.states, record.goals, sinks.events)
     servos = DynamixelHardware(
-        plan.buses,
-        host.ports,
-        host.clock,
-        layers.states,
-        layers.goals,
+        Lines(plan.buses, host.ports, host.clock, sinks.packets, host.supervision.beat),
         sinks.packets,
+        ServoArrays(layers.states, layers.goals, record.sources),
         sinks.events,
-        host.supervision.beat,
-        take_over=take_over,
-        sources=record.sources,
         parts=FeatureParts(
             plan.features, plan.loop.source_commands, record.source_commands, plan.feature_plans
         ),
         refusals=layers.refusals,
+        take_over=take_over,
     )
     context = ControlContext(
         plan=plan.loop,
