@@ -16,8 +16,6 @@ from dxlrun.description.joints.mechanics import (
     Limits,
     OneOfServos,
     SharedTolerance,
-    Transmission,
-    TransmissionServo,
 )
 from dxlrun.description.joints.motor_file import MotorForm, read_motor
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
@@ -36,6 +34,7 @@ from dxlrun.description.robot import (
     robot_form,
 )
 from dxlrun.features.devices.form import Device, DeviceSimulation
+from dxlrun.features.mechanics.form import Transmission, TransmissionServo
 from dxlrun.features.sensors.form import SensorEntry
 
 PAGE = page_text("robot-file.md")

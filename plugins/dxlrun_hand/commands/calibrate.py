@@ -100,7 +100,7 @@ def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[
 
     every = {one.plan.name: one for one in result.joints}
     names = chosen_names(words, tuple(every), result.plan.groups)
-    left = {name: every[name] for name in names if every[name].coupling is None}
+    left = {name: every[name] for name in names if every[name].drive.own}
     if others := ", ".join(name for name in names if name not in left):
         dialogue.say(f"Left out, as several servos move them, is what is yours to measure: {others}")
     if not left:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from functools import reduce
 
 from msgspec.structs import replace
 
 from dxlrun.compile.contribution import Contribution
-from dxlrun.compile.joints.couplings import Coupling, servo_ranges
-from dxlrun.compile.joints.described_servos import described_servos, first_joint
+from dxlrun.compile.joints.described_servos import described_servos, first_joints
 from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
 from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.registers import check_position_limits
@@ -120,10 +120,7 @@ def _wiring(
     servo: CompiledServo, row: int, joints: Mapping[str, CompiledJoint], modes: Mapping[str, Mode]
 ) -> Wiring:
     described = servo.described
-    moved = [joints[name] for name in described.joints]
-    limits = [limits_of(joint.plan) for joint in moved]
-    coupling = moved[0].coupling
-    (within,) = limits if coupling is None else (_within(coupling, servo, limits),)
+    within = _servo_range(servo, [joints[name] for name in described.joints])
     return Wiring(
         joint=described.title,
         row=row,
@@ -138,20 +135,26 @@ def _wiring(
         start_mode=modes[described.joints[0]],
         ratio=described.ratio,
         unit=described.unit,
-        name="" if coupling is None else described.name,
+        name="" if described.name in described.joints else described.name,
     )
 
 
-def _within(coupling: Coupling, servo: CompiledServo, limits: Sequence[Interval]) -> Interval:
-    """Return how far one of several servos goes while its joints are within their limits."""
-    return servo_ranges(coupling, limits)[coupling.servos.index(servo)]
+def _servo_range(servo: CompiledServo, joints: Sequence[CompiledJoint]) -> Interval:
+    """Return how far a servo goes while the joints that it moves are within their limits."""
+    ranges = [
+        limits_of(joint.plan).scaled(joint.drive.levers[joint.servos.index(servo)], joint.plan.unit)
+        for joint in joints
+    ]
+    first, *others = ranges
+    return reduce(Interval.plus, others, first)
 
 
 def _check_ticks(file: RobotFile, plan: BusPlan) -> None:
+    joints = first_joints(file.description)
     for servo in plan.servos:
         if servo.lower_tick > servo.upper_tick:
             file.error(
-                file.at("joints", first_joint(file.description, servo), "limits", "position"),
+                file.at("joints", joints[servo.own_name], "limits", "position"),
                 f"no position of an {servo.model} lies within the limits of {servo.joint}",
                 f"make them wider than one tick ({servo.position_text(servo.position_per_tick)})",
             )
@@ -215,7 +218,7 @@ def _floor(rate: float) -> str:
 
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
     """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
-    bus = file.robot.buses[plan.name]
+    bus, joints = file.robot.buses[plan.name], first_joints(file.description)
     items = bus.slow_registers.items
     return replace(
         plan,
@@ -225,9 +228,8 @@ def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
             replace(
                 servo,
                 slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
-                torque_on_return=_on_returned_servo(file.description, first_joint(file.description, servo))
-                == "hold",
-                torque_at_start=file.robot.joints[first_joint(file.description, servo)].torque,
+                torque_on_return=_on_returned_servo(file.description, joints[servo.own_name]) == "hold",
+                torque_at_start=file.robot.joints[joints[servo.own_name]].torque,
             )
             for servo in plan.servos
         ),

@@ -13,6 +13,7 @@ from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, SensorPlan, SourcePlan
+from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlsim.simulation_plan import Shown
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import DeviceTable
@@ -60,6 +61,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Whatever its part in the run needs beside that, encoded; `BusContext.plan` has it."""
     sensors: tuple[SensorPlan, ...] = ()
     """Processes that sample its sources."""
+    mechanics: MechanicsPlan | None = None
+    """Which servos move which joints, of the feature that knows."""
 
 
 @dataclass(frozen=True)

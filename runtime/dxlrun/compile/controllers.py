@@ -358,12 +358,7 @@ def _check(
         if mode not in able[joint]:
             *others, last = (_INTERFACE[each] for each in able[joint])
             known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
-            coupling = joints[joint].coupling
-            lacks = (
-                f"the servos of transmission {coupling.name} are not moved together by it"
-                if coupling is not None and coupling.transmission and mode is Mode.PWM
-                else f"{model} of {joint} {LACKS[mode]}"
-            )
+            lacks = joints[joint].drive.excluded.get(mode, f"{model} of {joint} {LACKS[mode]}")
             within_a_turn = model_modes(joints[joint].table, continuous=False)
             if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
                 lacks = f"{joint} is continuous, for which it is not offered"

@@ -26,7 +26,6 @@ from dxlrun.compile.joints.joints import (
     check_tolerances,
     check_twins,
     compile_joints,
-    compile_mechanics,
 )
 from dxlrun.compile.joints.motors import read_motors
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
@@ -45,6 +44,7 @@ from dxlrun.errors import InputError, Problem
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Feature
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
+from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 from dxlwire.bus_plan import BusPlan
 
@@ -233,7 +233,7 @@ def compile_robot(
         packages=plugins.packages_of(loop.controllers, sensors, _models(buses))
         | _physics(simulation, buses)
         | _packages(features),
-        mechanics=compile_mechanics(joints),
+        mechanics=next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan()),
     )
     return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 

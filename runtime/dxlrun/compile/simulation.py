@@ -100,7 +100,7 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
     friction = float(keys.friction or 0.0)
     if joint.plan.unit is LINEAR:
         return Load(keys.mass or 0.0, friction, steady=float(keys.gravity or 0.0))
-    known = MotorLoad() if motor is None or joint.coupling is not None else motor.motor.load
+    known = MotorLoad() if motor is None or not joint.drive.own else motor.motor.load
     ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
     inertia = known.inertia / ratio**2 if keys.inertia is None else keys.inertia
     gravity = known.gravity / ratio if keys.gravity is None else float(keys.gravity)
@@ -149,11 +149,7 @@ def _stall(joint: CompiledJoint) -> float:
     torques = [servo.table.stall_torque / servo.described.ratio for servo in joint.servos]
     if not all(torques):
         return 0.0
-    if joint.coupling is None:
-        return torques[0]
-    row = joint.coupling.joints.index(joint.plan.name)
-    shares = [abs(of_servo[row]) for of_servo in joint.coupling.inverse]
-    return sum(share * torque for share, torque in zip(shares, torques, strict=True))
+    return sum(abs(lever) * torque for lever, torque in zip(joint.drive.levers, torques, strict=True))
 
 
 def _check_buses(file: RobotFile) -> None:

@@ -19,9 +19,6 @@ from dxlrun.description import units
 from dxlrun.description.bus import Bus
 from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse, with_keys
 from dxlrun.description.joints.joints import JointEntry, joint_form
-from dxlrun.description.joints.mechanics import (
-    Transmission,
-)
 from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,
@@ -280,11 +277,6 @@ class Robot(Form):
     groups: dict[Name, Group] = key(
         "Joints under one name, with keys that each of them gets.",
         "{left_arm: {bus: main, joints: [left_shoulder, left_elbow]}}",
-        {},
-    )
-    transmissions: dict[Name, Transmission] = key(
-        "Several servos that move several joints together, by name.",
-        "{wrist: {type: differential, joints: [roll, pitch], ...}}",
         {},
     )
     controllers: dict[Name, ControllerEntry] = key(

@@ -17,7 +17,7 @@ from dxlrun.features.feature import Feature, JointKey, S, Section
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
     Feature("sensors", "dxlrun.features.sensors"),
-    Feature("mechanics", "dxlrun.features.mechanics"),
+    Feature("transmissions", "dxlrun.features.mechanics"),
 )
 """In the order in which every stage asks them; their states are in the cycle's record in this order.
 

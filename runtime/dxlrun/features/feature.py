@@ -10,7 +10,7 @@ nothing of the run.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -48,6 +48,9 @@ class Section(Generic[T]):
     """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
     """Key that follows it in lists of all keys; empty: it is the last."""
+    moved_joints: Callable[[object], Iterable[str]] = lambda section: ()
+    """Yields the joints whose servos are in this section, which may have mistakes. Groups and defaults give
+    such joints no keys of servos."""
 
     def of(self, robot: object) -> T:
         """Return the section of a robot file that was read."""

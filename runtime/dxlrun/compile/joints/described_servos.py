@@ -1,8 +1,10 @@
-"""Servos as the robot file has them: those of joints and of transmissions, with what a joint has for all."""
+"""Servos as the robot file has them: those of joints, with what a joint has for all, and of features."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 import msgspec
 
@@ -11,8 +13,8 @@ from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import Register
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
-from dxlwire.bus_plan import ServoPlan
-from dxlwire.joint_unit import ROTARY, JointUnit
+from dxlrun.features import installed_features, stages
+from dxlwire.joint_unit import JointUnit
 
 AUTO = "auto"  # In place of a model: it is read from the servo
 
@@ -30,7 +32,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
     model: str
     reference: float  # rad from the servo's raw 0
     direction: int
-    ratio: float  # What its joint, or its transmission's input, moves while it turns by 1 rad: rad or m
+    ratio: float  # What it moves while it turns by 1 rad: rad or m
     unit: JointUnit  # Of the positions of what it moves
     continuous: bool
     torque: bool
@@ -50,37 +52,23 @@ class DescribedServo(msgspec.Struct, frozen=True):
         )
 
 
+@dataclass(frozen=True)
+class ServoStage:
+    """`STAGE` of `servos.py`: called for the servos that a feature's section has, before models are known."""
+
+    FILE: ClassVar[str] = "servos"
+
+    describe: Callable[[Description], Iterable[DescribedServo]]
+
+
 def described_servos(description: Description) -> list[DescribedServo]:
-    """Return all servos of a file: those of the joints in their order, then those of the transmissions."""
-    robot = description.robot
+    """Return all servos of a file: those of the joints in their order, then those of features."""
     found: list[DescribedServo] = []
-    for name, joint in robot.joints.items():
+    for name, joint in description.robot.joints.items():
         if isinstance(joint, ServoJoint):
             found += _of_joint(name, joint)
-    for name, transmission in robot.transmissions.items():
-        moved = [robot.joints[joint] for joint in transmission.joints if joint in robot.joints]
-        for key, servo in transmission.servos.items():
-            place = ("transmissions", name, "servos", key)
-            found.append(
-                DescribedServo(
-                    title=f"{name}/{key}",
-                    name=f"{name}/{key}",
-                    joints=transmission.joints,
-                    place=place,
-                    defaults=place,
-                    bus=servo.bus,
-                    id=servo.id,
-                    model=servo.model,
-                    reference=servo.reference,
-                    direction=servo.direction,
-                    ratio=1.0 / servo.gear_ratio,
-                    unit=ROTARY,
-                    continuous=any(joint.continuous for joint in moved),
-                    torque=all(joint.torque for joint in moved),
-                    registers=servo.registers,
-                    motor=servo.motor,
-                )
-            )
+    for _, stage in stages(ServoStage, installed_features()):
+        found += stage.describe(description)
     return found
 
 
@@ -89,10 +77,9 @@ def find_unknown_servos(description: Description) -> frozenset[str]:
     return frozenset(servo.name for servo in described_servos(description) if servo.model == AUTO)
 
 
-def first_joint(description: Description, servo: ServoPlan) -> str:
-    """Return the joint that a servo moves, or the first one of its transmission."""
-    transmission = description.robot.transmissions.get(servo.own_name.partition("/")[0])
-    return servo.joint if transmission is None else transmission.joints[0]
+def first_joints(description: Description) -> dict[str, str]:
+    """Return the joint that each servo moves, or the first one, by the name of the servo."""
+    return {servo.name: servo.joints[0] for servo in described_servos(description)}
 
 
 def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:

@@ -8,29 +8,19 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.compile.joints.couplings import (
-    Coupling,
-    box,
-    check_together,
-    compile_couplings,
-    joint_reaches,
-    shared_reach,
-    top_efforts,
-    top_speeds,
-)
+from dxlrun.compile.joints.drives import DriveStage, JointDrive
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.joints import Joint, JointEntry, planned_keys
 from dxlrun.description.units import plain
+from dxlrun.features import installed_features, stages
 from dxlrun.plan.loop_plan import SETTLE_NS, UNLIMITED, ControllerPlan, JointPlan
-from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import ControlTable
 from dxlwire.joint_unit import LINEAR
 from dxlwire.modes import Mode
-from dxlwire.plan.mode_plan import model_modes
 
 _UNITS: Mapping[str, str] = {
     "Nm": "Nm",
@@ -59,10 +49,12 @@ class CompiledJoint(msgspec.Struct, frozen=True):
 
     plan: JointPlan
     described: JointEntry
-    servos: tuple[CompiledServo, ...]
-    reach: Interval
-    """rad or m, in the joint's coordinate; of a joint of a transmission with the others where it is widest"""
-    coupling: Coupling | None = None  # How several servos move it; None: it has one of its own
+    drive: JointDrive
+
+    @property
+    def servos(self) -> tuple[CompiledServo, ...]:
+        """The servos that move it."""
+        return self.drive.servos
 
     @property
     def table(self) -> ControlTable:
@@ -70,11 +62,14 @@ class CompiledJoint(msgspec.Struct, frozen=True):
         return self.servos[0].table
 
     @property
+    def reach(self) -> Interval:
+        """Positions that its servos reach, rad or m."""
+        return self.drive.reach
+
+    @property
     def modes(self) -> tuple[Mode, ...]:
         """The modes in which it can be."""
-        if self.coupling is not None:
-            return self.coupling.modes
-        return model_modes(self.table, self.plan.continuous)
+        return self.drive.modes
 
 
 def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledJoint]:
@@ -83,40 +78,21 @@ def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -
     `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
     servos = compile_servos(file, models, motors)
-    couplings = compile_couplings(file, servos)
-    boxes: dict[str, Interval | None] = {}
-    for each in dict.fromkeys(couplings.values()):
-        boxes |= _coupled_limits(file, each)
+    drives: dict[str, JointDrive] = {}
+    for _, stage in stages(DriveStage, installed_features()):
+        drives |= stage.compile(file, servos)
     compiled: dict[str, CompiledJoint] = {}
     for name, joint in file.robot.joints.items():
-        coupling: Coupling | None = couplings.get(name)
-        moving = coupling.servos if coupling is not None else tuple(filter(None, [servos.get(name)]))
-        if not moving or (coupling is None and not isinstance(joint, Joint)):
+        drive = drives.get(name)
+        if drive is None:
             continue
-        certain = all(servo.certain for servo in moving)
-        effort = _effort(file if certain else RobotFile(file.description), name, joint, moving[0])
-        if coupling is None:
-            reach = moving[0].reach
-            allowed = _allowed(file, name, joint, reach, moving[0].table.model)
-        else:
-            reach = _reach(coupling, name) or Interval(0.0, 0.0)
-            allowed = boxes[name]
-        if allowed is None or not all(servo.known_bus for servo in moving):
+        certain = all(servo.certain for servo in drive.servos)
+        effort = _effort(file if certain else RobotFile(file.description), name, joint, drive.servos[0])
+        if drive.allowed is None or not all(servo.known_bus for servo in drive.servos):
             continue
-        plan = _joint_plan(name, joint, moving, coupling, allowed, effort)
+        plan = _joint_plan(name, joint, drive, drive.allowed, effort)
         _check_acceleration(file, plan)
-        compiled[name] = CompiledJoint(plan, joint, moving, reach, coupling)
-    for each in dict.fromkeys(couplings.values()):
-        whole = [compiled[name] for name in each.joints if name in compiled]
-        if len(whole) < len(each.joints):  # its servos cannot be moved without the joint that is wrong
-            for one in whole:
-                del compiled[one.plan.name]
-            continue
-        limits = [one.described.limits for one in whole]
-        velocities = [one.plan.velocity for one in whole if one.described.limits.velocity is not None]
-        efforts = [one.plan.effort for one in whole]
-        some = velocities if len(velocities) == len(limits) else [None] * len(limits)
-        check_together(file, each, some, efforts)
+        compiled[name] = CompiledJoint(plan, joint, drive)
     return compiled
 
 
@@ -125,52 +101,10 @@ def moving_servos(joints: Iterable[CompiledJoint]) -> tuple[CompiledServo, ...]:
     return tuple({servo.described.name: servo for joint in joints for servo in joint.servos}.values())
 
 
-def compile_mechanics(joints: Mapping[str, CompiledJoint]) -> MechanicsPlan:
-    """Return which servos move which joints; an empty plan where each joint has one of its own."""
-    couplings = dict.fromkeys(joint.coupling for joint in joints.values() if joint.coupling is not None)
-    if not couplings:
-        return MechanicsPlan()
-    rows = {name: row for row, name in enumerate(joints)}
-    names = [servo.described.name for servo in moving_servos(joints.values())]
-    return MechanicsPlan(
-        couplings=tuple(
-            CouplingPlan(
-                name=coupling.name,
-                joints=tuple(rows[joint] for joint in coupling.joints),
-                servos=tuple(names.index(servo.described.name) for servo in coupling.servos),
-                matrix=coupling.matrix,
-                inverse=coupling.inverse,
-                tolerance=coupling.tolerance,
-            )
-            for coupling in couplings
-        ),
-        direct=tuple(
-            (rows[name], names.index(joint.servos[0].described.name))
-            for name, joint in joints.items()
-            if joint.coupling is None
-        ),
-        servos=tuple(names),
-    )
-
-
-def _joint_plan(  # noqa: PLR0917  all that is known of one joint
-    name: str,
-    joint: JointEntry,
-    servos: Sequence[CompiledServo],
-    coupling: Coupling | None,
-    allowed: Interval,
-    effort: float | None,
+def _joint_plan(
+    name: str, joint: JointEntry, drive: JointDrive, allowed: Interval, effort: float | None
 ) -> JointPlan:
-    first = servos[0]
-    if coupling is None:
-        levers: tuple[float, ...] = (1.0,)
-        alone = together = first.top_speed or None
-        top_effort = first.top_effort
-    else:
-        row = coupling.joints.index(name)
-        levers = tuple(servo[row] for servo in coupling.inverse)
-        alone, together = top_speeds(coupling)[row]
-        top_effort = top_efforts(coupling)[row]
+    servos, first = drive.servos, drive.servos[0]
     same = all(
         servo.motor == first.motor and servo.described.ratio == first.described.ratio for servo in servos
     )
@@ -179,18 +113,18 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         allowed.lower,
         allowed.upper,
         # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
-        plain(joint.limits.velocity) or together,
+        plain(joint.limits.velocity) or drive.shared_speed,
         effort,
         joint.continuous,
         bounded=not joint.continuous or joint.limits.position is not None,
-        top_speed=alone,
-        top_effort=top_effort,
+        top_speed=drive.top_speed,
+        top_effort=drive.top_effort,
         acceleration=plain(joint.limits.acceleration),
         servo=_servo_label(servos),
-        motor=_at_joint(first, levers) if same else None,
-        servo_model=first.servo_model if coupling is None else None,
+        motor=_at_joint(first, drive.levers) if same else None,
+        servo_model=first.servo_model if drive.own else None,
         unit=first.described.unit,
-        coupled=() if coupling is None or len(coupling.joints) < 2 else coupling.joints,
+        coupled=drive.together if len(drive.together) > 1 else (),
         tolerance=_limited(joint.tolerance.position),
         rest_speed=_limited(joint.tolerance.velocity),
         settle_ns=SETTLE_NS if joint.tolerance.time is None else joint.tolerance.time,
@@ -238,36 +172,6 @@ def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | Non
         # efforts of coupled servos are added up with their levers; those in A or % do not grow by the gear
         torque_per_effort=effort if effort is None or servo.table.effort_unit == "Nm" else effort / ratio,
     )
-
-
-def _coupled_limits(file: RobotFile, coupling: Coupling) -> dict[str, Interval | None]:
-    """Return the limits of the joints of a coupling, which all its servos reach."""
-    joints = file.robot.joints
-    if not coupling.transmission:
-        (name,) = coupling.joints
-        reach = shared_reach(coupling)
-        if reach is None:
-            file.error(
-                file.at("joints", name, "servos"),
-                f"the servos of {name} have no angle of the joint in common: one reaches "
-                f"{coupling.servos[0].reach}, another {coupling.servos[-1].reach}",
-                "check the reference and direction of each",
-            )
-            return {name: None}
-        model = coupling.servos[0].table.model
-        return {name: _allowed(file, name, joints[name], reach, model)}
-    written = [
-        None if limits is None else Interval(float(limits[0]), float(limits[1]))
-        for limits in (joints[name].limits.position for name in coupling.joints)
-    ]
-    found = box(file, coupling, written)
-    return dict(zip(coupling.joints, found or [None] * len(written), strict=True))
-
-
-def _reach(coupling: Coupling, joint: str) -> Interval | None:
-    if not coupling.transmission:
-        return shared_reach(coupling)
-    return joint_reaches(coupling)[coupling.joints.index(joint)]
 
 
 def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) -> None:
@@ -370,29 +274,6 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
             f"{speed:.3g} {unit}, within one cycle of {1e3 / rate:.3g} ms",
             f"write less than {speed * rate:.3g} {unit}^2, or take it out",
         )
-
-
-def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
-    """Return the limits that the gate keeps: the file's, cut to the reach."""
-    limits = joint.limits.position
-    if limits is None:
-        return reach
-    mark = file.at("joints", name, "limits", "position")
-    written = Interval(float(limits[0]), float(limits[1]), reach.unit)
-    allowed = written.meet(reach)
-    if allowed is None:
-        file.error(
-            mark,
-            f"limits {written} of {name} have nothing in common with the reach of its {model}, {reach}",
-            "check limits, reference and direction",
-        )
-    elif not reach.contains(written):
-        file.warning(
-            mark,
-            f"limits {written} of {name} go beyond the reach of its {model}, {reach}",
-            f"the joint will keep {allowed}; write that, or check reference and direction",
-        )
-    return allowed
 
 
 def check_twins(file: RobotFile, tables: dict[str, ControlTable]) -> None:

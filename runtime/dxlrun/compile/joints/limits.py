@@ -44,8 +44,13 @@ class Interval(msgspec.Struct, frozen=True):
         return Interval(lower, upper, self.unit) if lower < upper else None
 
     def scaled(self, ratio: float, unit: JointUnit) -> Interval:
-        """Return the interval of what moves by `ratio`, above 0, while this moves by 1."""
-        return Interval(self.lower * ratio, self.upper * ratio, unit)
+        """Return the interval of what moves by `ratio` while this moves by 1."""
+        lower, upper = sorted((self.lower * ratio, self.upper * ratio))
+        return Interval(lower, upper, unit)
+
+    def plus(self, other: Interval) -> Interval:
+        """Return the interval of the sums of positions in both."""
+        return Interval(self.lower + other.lower, self.upper + other.upper, self.unit)
 
     def __str__(self) -> str:
         lower, upper = (self.unit.number(end, signed=True) for end in (self.lower, self.upper))

@@ -17,6 +17,8 @@ from dxlrun.description.including import merged
 from dxlrun.description.joints.joints import KEYS_OF_SERVOS
 from dxlrun.description.problems import path_text, shown
 from dxlrun.errors import Problem, suggestion
+from dxlrun.features import installed_features, stages
+from dxlrun.features.feature import Section
 
 DEFAULTS, GROUPS, ALL = "joint_defaults", "groups", "all"
 NAMING = ("joints", "pose", "torque")
@@ -183,11 +185,11 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
     for step in source:
         at = _mapping(at).get(str(step))
     given = {key: value for key, value in _mapping(at).items() if key != "joints"}
-    every = [_mapping(one).get("joints") for one in _mapping(grown.data.get("transmissions")).values()]
-    named = [one for names in every if isinstance(names, list) for one in names]
-    transmitted = {joint for one in named for joint in groups.get(str(one), (one,))}
+    sections = (section for _, section in stages(Section, installed_features()))
+    named = (one for each in sections for one in each.moved_joints(grown.data.get(each.name)))
+    without_servo = {joint for one in named for joint in groups.get(one, (one,))}
     keys = {
-        joint: [key for key in given if joint not in transmitted or key not in KEYS_OF_SERVOS]
+        joint: [key for key in given if joint not in without_servo or key not in KEYS_OF_SERVOS]
         for joint in joints
     }
     moves: Moves = {

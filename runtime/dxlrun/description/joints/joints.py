@@ -96,7 +96,7 @@ class JointSimulation(Form):
 
 
 class BareJoint(Form):
-    """What every joint has; a joint with nothing else is moved by a transmission."""
+    """What every joint has; the servos of a joint with nothing else are in another section."""
 
     continuous: bool = key("A wheel, or a joint of many turns; it needs no position limits.", "true", False)
     torque: OnOff = key("off: it is limp from the start, until `dxlrun torque on`.", "off", True)
@@ -183,10 +183,10 @@ JointEntry: TypeAlias = Joint | SharedJoint | BareJoint
 """A joint as the robot file has it."""
 
 _OF_A_SERVO = frozenset(Joint.model_fields) - frozenset(BareJoint.model_fields)
-"""Keys of a joint with a servo of its own; one without any is moved by a transmission."""
+"""Keys of a joint with a servo of its own; one without any has its servos in another section."""
 
 KEYS_OF_SERVOS = _OF_A_SERVO | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
-"""Keys that a joint of a transmission does not have."""
+"""Keys that a joint without a servo of its own does not have."""
 
 JOINT_FORMS = (
     ("SharedJoint", {"required": ["servos"]}),
@@ -203,10 +203,10 @@ def kind_of_joint(joint: object) -> str:
         surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in BareJoint.model_fields}
         if surplus and (surplus & _OF_A_SERVO or surplus & words_for("BareJoint", _OF_A_SERVO)):
             return "<one servo>"
-        return "<transmission>"
+        return "<no servo>"
     if isinstance(joint, SharedJoint):
         return "<several servos>"
-    return "<one servo>" if isinstance(joint, Joint) or not isinstance(joint, BareJoint) else "<transmission>"
+    return "<one servo>" if isinstance(joint, Joint) or not isinstance(joint, BareJoint) else "<no servo>"
 
 
 def joint_keys() -> list[JointKey[object]]:
@@ -220,7 +220,7 @@ def joint_form() -> object:
     return Annotated[
         Annotated[own, Tag("<one servo>")]
         | Annotated[shared, Tag("<several servos>")]
-        | Annotated[bare, Tag("<transmission>")],
+        | Annotated[bare, Tag("<no servo>")],
         Discriminator(kind_of_joint),
     ]
 

@@ -1,7 +1,7 @@
-"""Mechanics: how servos move joints in a robot file: one or several on a joint, linear, in transmissions.
+"""Mechanics: limits and tolerances of a joint, and the keys of its servos.
 
 A servo's shaft turns by theta; s = direction * (theta - reference) * ratio is what it does at the joint. A
-joint of one servo is q = s, of several servos the mean of theirs, and a transmission's joints are q = M s.
+joint of one servo is q = s, of several servos the mean of theirs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pydantic import (
 from pydantic_core import CoreSchema
 
 from dxlrun.description import units
-from dxlrun.description.form import Form, ItemName, Name, key, refuse
+from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.units import (
     Acceleration,
     Angle,
@@ -151,7 +151,11 @@ class Limits(Form):
     )
 
 
-class OneOfServos(Form):
+class ServoEntry(Form):
+    """A servo that does not have a joint of its own; it has some of the keys of a joint."""
+
+
+class OneOfServos(ServoEntry):
     """One of several servos on a joint; what it does not have is the joint's."""
 
     id: ServoId = key("ID of the servo.", "2")
@@ -167,52 +171,3 @@ class OneOfServos(Form):
         "What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None
     )
     motor: MotorFile | None = key("Its motor file; none: the joint's.", "hip.motor.yaml", None)
-
-
-class TransmissionServo(Form):
-    """One servo of a transmission."""
-
-    bus: str = key("Name of its bus.", "main")
-    id: ServoId = key("ID of the servo.", "1")
-    model: str = key("Its model, or auto: it is asked.", "XL430-W250", min_length=1)
-    reference: Angle = key(
-        "Its angle, from its zero, where the transmission's joints are at zero.", "180 deg"
-    )
-    direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
-    gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
-    registers: dict[ItemName, Register] = key(
-        "What its control table shall hold: written at the start where it differs.",
-        "{position_p_gain: 800}",
-        {},
-    )
-    motor: MotorFile | None = key(
-        "Its motor file, from the folder of the file that says it.", "wrist.motor.yaml", None
-    )
-
-
-class Transmission(Form):
-    """Several servos that move several joints together: q = M s."""
-
-    type: Literal["differential", "matrix"] = key(
-        "differential: half of the sum and half of the difference; matrix: as `matrix` says.", "differential"
-    )
-    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
-        "The joints that it moves, each in one transmission at most.", "[roll, pitch]"
-    )
-    servos: dict[Name, TransmissionServo] = key(
-        "Its servos by name.", "{left: {bus: main, id: 1, ...}}", min_length=1
-    )
-    matrix: (
-        Annotated[
-            tuple[Annotated[tuple[float, ...], Field(strict=False, min_length=1)], ...],
-            Field(strict=False, min_length=1),
-        ]
-        | None
-    ) = key(
-        "Rows: joints, columns: servos, both in the order of the file; rad per rad.",
-        "[[0.5, 0.5], [0.5, -0.5]]",
-        None,
-    )
-    tolerance: Tolerance | None = key(
-        "By how much a servo may be off where there are more servos than joints.", "3 deg", None
-    )

@@ -34,7 +34,7 @@ _LONGEST = 80  # Characters of a value that is repeated
 _TURN = 6.3  # rad; a larger number of a limit is in deg
 _LARGEST_ANGLE = 720  # deg; a larger number counts ticks of a servo
 _PARTS_OF_JOINT = {"Limits": "limits", "GoalTolerance": "tolerance", "SharedTolerance": "tolerance"}
-_SERVO_FORMS = ("OneOfServos", "TransmissionServo")  # They have keys of a joint
+_SERVO_FORM = "ServoEntry"  # Base of the forms of servos that have keys of a joint
 
 
 _NEEDLESS = {
@@ -113,8 +113,9 @@ class Context:
         The words of a joint are those of its parts, too: `lower` means the same in a joint as in its limits.
         """
         word, name = folded(key), self.form.__name__
-        for base in self.form.__mro__:
-            meaning = _table().get(base.__name__, {}).get(word)
+        bases = [base.__name__ for base in self.form.__mro__]
+        for base in bases:
+            meaning = _table().get(base, {}).get(word)
             if meaning is not None and meaning.place[0] in self.known:
                 return meaning
         meaning = _table()["BareJoint"].get(word)
@@ -122,7 +123,7 @@ class Context:
             return None
         if meaning.place[0] == _PARTS_OF_JOINT.get(name, ""):
             return _Meaning(meaning.place[1:], meaning.kind)
-        return meaning if name in _SERVO_FORMS and meaning.place[0] in self.known else None
+        return meaning if _SERVO_FORM in bases and meaning.place[0] in self.known else None
 
     def _limits(self, limits: Mapping[str, str], unknown: Mapping[str, object]) -> str:
         """Return how a lower and an upper limit are written, either of which may be missing."""

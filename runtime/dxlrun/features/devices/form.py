@@ -133,5 +133,5 @@ STAGE: Section[dict[str, Device]] = Section(
     "devices",
     dict[Name, Device],
     key("What is on a bus and is no servo, by name.", "{imu: {bus: main, id: 241, model: ...}}", {}),
-    before="transmissions",
+    before="controllers",
 )

@@ -1,4 +1,7 @@
-"""Couplings: the servos of one joint, and transmissions, checked; limits of joints against servos' ranges."""
+"""Couplings: the servos of one joint, and transmissions, checked; limits of joints against servos' ranges.
+
+A joint with one servo is a coupling, too, with the matrix 1.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,12 @@ from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description.document import KeyPath
-from dxlrun.description.joints.joints import ServoJoint, SharedJoint
-from dxlrun.description.joints.mechanics import (
-    LEAST_RATIO,
-    MOST_RATIO,
-    SERVO_TOLERANCES,
-    Transmission,
-)
+from dxlrun.description.joints.joints import JointEntry, ServoJoint, SharedJoint
+from dxlrun.description.joints.mechanics import LEAST_RATIO, MOST_RATIO, SERVO_TOLERANCES
+from dxlrun.description.units import plain
 from dxlrun.errors import Mark, suggestion
+from dxlrun.features.mechanics import form
+from dxlrun.features.mechanics.form import Transmission
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes
@@ -46,6 +47,11 @@ class Coupling(msgspec.Struct, frozen=True, eq=False):
     transmission: bool
 
     @property
+    def direct(self) -> bool:
+        """True when one servo moves one joint whose keys describe it."""
+        return not self.transmission and len(self.servos) == 1
+
+    @property
     def modes(self) -> tuple[Mode, ...]:
         """The modes that all its servos have, without those in which they do not move the joints together."""
         each = [model_modes(one.table, one.described.continuous) for one in self.servos]
@@ -54,34 +60,37 @@ class Coupling(msgspec.Struct, frozen=True, eq=False):
         return tuple(mode for mode in each[0] if mode not in left_out and all(mode in one for one in each))
 
 
-def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict[str, Coupling]:
-    """Return the couplings by each joint that they move; what is wrong with one leaves it out."""
-    found: dict[str, Coupling] = {}
+def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> list[Coupling]:
+    """Return the couplings of all joints; one with a mistake is omitted."""
+    found: list[Coupling] = []
     for name, joint in file.robot.joints.items():
+        if not isinstance(joint, ServoJoint):
+            continue
+        names, tolerance = [name], 0.0
         if isinstance(joint, SharedJoint):
-            own = [servos.get(f"{name}/{index + 1}") for index in range(len(joint.servos))]
-            known = tuple(one for one in own if one is not None)
-            if len(known) == len(own):
-                count = len(known)
-                coupling = Coupling(
-                    name,
-                    ("joints", name),
-                    (name,),
-                    known,
-                    matrix=((1.0 / count,) * count,),
-                    inverse=((1.0,),) * count,
-                    tolerance=float(joint.tolerance.servos or SERVO_TOLERANCES[joint.unit]),
-                    transmission=False,
-                )
-                if _agree(file, coupling):
-                    found[name] = coupling
+            names = [f"{name}/{index + 1}" for index in range(len(joint.servos))]
+            tolerance = float(joint.tolerance.servos or SERVO_TOLERANCES[joint.unit])
+        known = tuple(servos[each] for each in names if each in servos)
+        if len(known) == len(names):
+            count = len(known)
+            coupling = Coupling(
+                name,
+                ("joints", name),
+                (name,),
+                known,
+                matrix=((1.0 / count,) * count,),
+                inverse=((1.0,),) * count,
+                tolerance=tolerance,
+                transmission=False,
+            )
+            if _agree(file, coupling):
+                found.append(coupling)
     owners: dict[str, str] = {}
-    for name, transmission in file.robot.transmissions.items():
+    for name, transmission in form.STAGE.of(file.robot).items():
         good = _check_joints(file, name, transmission, owners)
         matrix = _matrix(file, name, transmission)
-        own = [servos.get(f"{name}/{key}") for key in transmission.servos]
-        known = tuple(one for one in own if one is not None)
-        if not good or matrix is None or len(known) < len(own):
+        known = tuple(servos[each] for key in transmission.servos if (each := f"{name}/{key}") in servos)
+        if not good or matrix is None or len(known) < len(transmission.servos):
             continue
         coupling = Coupling(
             name,
@@ -96,7 +105,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
             transmission=True,
         )
         if _agree(file, coupling):
-            found |= dict.fromkeys(transmission.joints, coupling)
+            found.append(coupling)
     _check_moved(file, owners)
     return found
 
@@ -282,6 +291,51 @@ def _moved(coupling: Coupling) -> str:
     return " and ".join(coupling.joints)
 
 
+def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None, ...]:
+    """Return the limits that the gate keeps of each joint, all of which its servos reach; None: a mistake."""
+    joints = file.robot.joints
+    if not coupling.transmission:
+        (name,) = coupling.joints
+        reach = shared_reach(coupling)
+        if reach is None:
+            file.error(
+                file.at("joints", name, "servos"),
+                f"the servos of {name} have no angle of the joint in common: one reaches "
+                f"{coupling.servos[0].reach}, another {coupling.servos[-1].reach}",
+                "check the reference and direction of each",
+            )
+            return (None,)
+        return (_allowed(file, name, joints[name], reach, coupling.servos[0].table.model),)
+    written = [
+        None if limits is None else Interval(float(limits[0]), float(limits[1]))
+        for limits in (joints[name].limits.position for name in coupling.joints)
+    ]
+    return box(file, coupling, written) or (None,) * len(written)
+
+
+def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
+    """Return the limits that the gate keeps: the file's, cut to the reach."""
+    limits = joint.limits.position
+    if limits is None:
+        return reach
+    mark = file.at("joints", name, "limits", "position")
+    written = Interval(float(limits[0]), float(limits[1]), reach.unit)
+    allowed = written.meet(reach)
+    if allowed is None:
+        file.error(
+            mark,
+            f"limits {written} of {name} have nothing in common with the reach of its {model}, {reach}",
+            "check limits, reference and direction",
+        )
+    elif not reach.contains(written):
+        file.warning(
+            mark,
+            f"limits {written} of {name} go beyond the reach of its {model}, {reach}",
+            f"the joint will keep {allowed}; write that, or check reference and direction",
+        )
+    return allowed
+
+
 def shared_reach(coupling: Coupling) -> Interval | None:
     """Return where all servos of one joint reach; None: nowhere."""
     reach: Interval | None = coupling.servos[0].reach
@@ -292,6 +346,8 @@ def shared_reach(coupling: Coupling) -> Interval | None:
 
 def joint_reaches(coupling: Coupling) -> tuple[Interval, ...]:
     """Return how far each joint goes, with the others where it goes farthest: the image of the ranges."""
+    if not coupling.transmission:
+        return (shared_reach(coupling) or Interval(0.0, 0.0),)
     return tuple(_image(row, [one.reach for one in coupling.servos]) for row in coupling.matrix)
 
 
@@ -430,21 +486,20 @@ def _least(values: Sequence[float | None]) -> float | None:
     return min(known) if known and len(known) == len(values) else None
 
 
-def check_together(
-    file: RobotFile, coupling: Coupling, velocities: Sequence[float | None], efforts: Sequence[float | None]
-) -> None:
+def check_together(file: RobotFile, coupling: Coupling) -> None:
     """Warn of written limits of several joints that are more than a servo has when all are asked for."""
+    written = [file.robot.joints[name].limits for name in coupling.joints]
     for which, limits, rows, most, unit in (
         (
             "velocity",
-            velocities,
+            [plain(one.velocity) for one in written],
             coupling.inverse,
             [one.top_speed or None for one in coupling.servos],
             "rad/s",
         ),
         (
             "effort",
-            efforts,
+            [None if one.effort is None else float(one.effort) for one in written],
             tuple(zip(*coupling.matrix, strict=True)),
             [one.top_effort for one in coupling.servos],
             coupling.servos[0].table.effort_unit.replace("1", ""),

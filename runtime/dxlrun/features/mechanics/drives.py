@@ -1,0 +1,58 @@
+"""Drives of joints: what each coupling does at its joints, and that its limits can be kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dxlrun.compile.joints.drives import DriveStage, JointDrive
+from dxlrun.compile.joints.servos import CompiledServo
+from dxlrun.compile.problems import RobotFile
+from dxlrun.features.mechanics.couplings import (
+    Coupling,
+    allowed_limits,
+    check_together,
+    compile_couplings,
+    joint_reaches,
+    top_efforts,
+    top_speeds,
+)
+from dxlwire.modes import Mode
+
+
+class CoupledDrive(JointDrive, frozen=True, kw_only=True):
+    """Drive of a joint, with the coupling that moves it."""
+
+    coupling: Coupling
+
+
+def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict[str, JointDrive]:
+    """Return the drive of each joint; one whose servos have a mistake is missing."""
+    drives: dict[str, JointDrive] = {}
+    for coupling in compile_couplings(file, servos):
+        reaches, limits = joint_reaches(coupling), allowed_limits(file, coupling)
+        speeds, efforts = top_speeds(coupling), top_efforts(coupling)
+        for column, joint in enumerate(coupling.joints):
+            drives[joint] = CoupledDrive(
+                servos=coupling.servos,
+                together=coupling.joints,
+                levers=tuple(row[column] for row in coupling.inverse),
+                reach=reaches[column],
+                allowed=limits[column],
+                modes=coupling.modes,
+                top_speed=speeds[column][0],
+                shared_speed=speeds[column][1],
+                top_effort=efforts[column],
+                excluded=_excluded(coupling),
+                coupling=coupling,
+            )
+        if not coupling.direct and None not in limits and all(one.known_bus for one in coupling.servos):
+            check_together(file, coupling)
+    return drives
+
+
+def _excluded(coupling: Coupling) -> dict[Mode, str]:
+    reason = f"the servos of transmission {coupling.name} are not moved together by it"
+    return {Mode.PWM: reason} if coupling.transmission else {}
+
+
+STAGE = DriveStage(compile_drives)

@@ -1,0 +1,90 @@
+"""Form of the section `transmissions`: several servos that move several joints together, q = M s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dxlrun.description.form import Form, ItemName, Name, key
+from dxlrun.description.joints.mechanics import (
+    Direction,
+    GearRatio,
+    MotorFile,
+    Register,
+    ServoEntry,
+    ServoId,
+    Tolerance,
+)
+from dxlrun.description.units import Angle
+from dxlrun.features.feature import Section
+
+
+class TransmissionServo(ServoEntry):
+    """One servo of a transmission."""
+
+    bus: str = key("Name of its bus.", "main")
+    id: ServoId = key("ID of the servo.", "1")
+    model: str = key("Its model, or auto: it is asked.", "XL430-W250", min_length=1)
+    reference: Angle = key(
+        "Its angle, from its zero, where the transmission's joints are at zero.", "180 deg"
+    )
+    direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
+    gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
+    registers: dict[ItemName, Register] = key(
+        "What its control table shall hold: written at the start where it differs.",
+        "{position_p_gain: 800}",
+        {},
+    )
+    motor: MotorFile | None = key(
+        "Its motor file, from the folder of the file that says it.", "wrist.motor.yaml", None
+    )
+
+
+class Transmission(Form):
+    """Several servos that move several joints together: q = M s."""
+
+    type: Literal["differential", "matrix"] = key(
+        "differential: half of the sum and half of the difference; matrix: as `matrix` says.", "differential"
+    )
+    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
+        "The joints that it moves, each in one transmission at most.", "[roll, pitch]"
+    )
+    servos: dict[Name, TransmissionServo] = key(
+        "Its servos by name.", "{left: {bus: main, id: 1, ...}}", min_length=1
+    )
+    matrix: (
+        Annotated[
+            tuple[Annotated[tuple[float, ...], Field(strict=False, min_length=1)], ...],
+            Field(strict=False, min_length=1),
+        ]
+        | None
+    ) = key(
+        "Rows: joints, columns: servos, both in the order of the file; rad per rad.",
+        "[[0.5, 0.5], [0.5, -0.5]]",
+        None,
+    )
+    tolerance: Tolerance | None = key(
+        "By how much a servo may be off where there are more servos than joints.", "3 deg", None
+    )
+
+
+def _moved_joints(section: object) -> Iterator[str]:
+    """Yield the names under `joints` in a section that was not validated yet."""
+    for entry in section.values() if isinstance(section, dict) else ():
+        names = entry.get("joints") if isinstance(entry, dict) else None
+        yield from map(str, names if isinstance(names, list) else ())
+
+
+STAGE: Section[dict[str, Transmission]] = Section(
+    "transmissions",
+    dict[Name, Transmission],
+    key(
+        "Several servos that move several joints together, by name.",
+        "{wrist: {type: differential, joints: [roll, pitch], ...}}",
+        {},
+    ),
+    before="controllers",
+    moved_joints=_moved_joints,
+)

@@ -1,0 +1,40 @@
+"""Servos of transmissions, as the robot file has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from dxlrun.compile.joints.described_servos import DescribedServo, ServoStage
+from dxlrun.description.reading import Description
+from dxlrun.features.mechanics import form
+from dxlwire.joint_unit import ROTARY
+
+
+def describe_servos(description: Description) -> Iterator[DescribedServo]:
+    """Yield the servos of all transmissions."""
+    robot = description.robot
+    for name, transmission in form.STAGE.of(robot).items():
+        moved = [robot.joints[joint] for joint in transmission.joints if joint in robot.joints]
+        for key, servo in transmission.servos.items():
+            place = ("transmissions", name, "servos", key)
+            yield DescribedServo(
+                title=f"{name}/{key}",
+                name=f"{name}/{key}",
+                joints=transmission.joints,
+                place=place,
+                defaults=place,
+                bus=servo.bus,
+                id=servo.id,
+                model=servo.model,
+                reference=servo.reference,
+                direction=servo.direction,
+                ratio=1.0 / servo.gear_ratio,
+                unit=ROTARY,
+                continuous=any(joint.continuous for joint in moved),
+                torque=all(joint.torque for joint in moved),
+                registers=servo.registers,
+                motor=servo.motor,
+            )
+
+
+STAGE = ServoStage(describe_servos)
