@@ -29,6 +29,7 @@ from dxlrun.tooling.plans import ScheduleName
 from dxlrun.tooling.records import EventCode, EventGroup, Severity
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.causes.tables import causes_table
+from dxlrun_analysis.conduct.source_values import SourceHistory, SourceValues, sources_table
 from dxlrun_analysis.conduct.steering import Act, Pause
 from dxlrun_analysis.cycles.latency import (
     Duration,
@@ -90,6 +91,7 @@ class Report(msgspec.Struct, frozen=True):
     complete: bool
     damage: tuple[str, ...]
     being_written: bool = False  # By a run that goes on: the report is about the run so far
+    sources: tuple[SourceValues, ...] = ()  # States of devices, sensors and controllers
 
 
 def analyze_log(path: str | Path) -> Report:
@@ -107,11 +109,12 @@ def analyze(
     Each of `watching` gets the slices too, and `exchanges` those of their packets: a log is decompressed
     once, and each packet is paired once.
     """
-    tally, durations, topics = Tally(exchanges), Durations(), _Topics()
+    tally, durations, topics, sources = Tally(exchanges), Durations(), _Topics(), SourceHistory()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)
         topics.take(part)
+        sources.count_cycles(part)
         for take in watching:
             take(part)
     about = reader.about
@@ -138,6 +141,7 @@ def analyze(
         complete=about.complete,
         damage=about.damage,
         being_written=about.being_written,
+        sources=sources.finish(),
     )
 
 
@@ -205,6 +209,7 @@ def tables(report: Report) -> dict[str, Table]:
         "servos": Table.listing("Servos", _SERVO, report.servos),
         "buses": Table.listing("Buses", _BUS, report.buses),
         "joints": Table.listing(errors, _JOINT, report.joints),
+        "sources": sources_table(report.sources),
         "topics": Table.listing("Topics", _TOPIC, report.topics),
         "steering": Table.listing(f"Steered{more}", _ACT, acts[:_MOST_ACTS]),
         "events": Table.listing("Events", _EVENT, report.events),

@@ -74,7 +74,12 @@ class Robot:
             record.sources.valid[:], record.sources.age_ns[:] = (False, True), (1_250_000_000, 2_000_000)
         record.controller_ns[1] = 25_000
         plan: Any = SimpleNamespace(
-            loop=SimpleNamespace(joints=[SimpleNamespace(unit=ROTARY)] * rows), servos_by_joint={}
+            loop=SimpleNamespace(
+                joints=[SimpleNamespace(unit=ROTARY)] * rows,
+                source_units={"foot/force.x": "N", "imu/voltage": "V"},
+                command_units={},
+            ),
+            servos_by_joint={},
         )
         found = states_of(plan, record, {name: place for place, name in enumerate(layout.controllers)})
         return replace(found, effort_units=("A",) * rows)
@@ -115,8 +120,8 @@ def test_devices_and_sensors_are_shown_with_their_age(shown: Any) -> None:
     code, printed = shown(Robot(sources=True), once=True)
     assert code == 0
     lines = [" ".join(line.split()) for line in printed.splitlines()]
-    assert "foot 1250 ms force.x 12.5, force.y -" in lines
-    assert "imu 2 ms voltage 11.9" in lines
+    assert "foot 1250 ms force.x 12.5 N, force.y -" in lines
+    assert "imu 2 ms voltage 11.9 V" in lines
     assert len(frame(80, 24, sources=True)) <= 24
     assert any("voltage 11.9" in line for line in frame(80, 40, sources=True))
 

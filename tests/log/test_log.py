@@ -198,6 +198,13 @@ def test_metadata_of_format_8_are_read(header: LogHeader) -> None:
     assert from_metadata(text | {"format": "8"}) == from_metadata(text)
 
 
+def test_metadata_without_units_of_sources_are_read(header: LogHeader) -> None:
+    text = to_metadata(structs.replace(header, source_units={"imu/voltage": "V"}))
+    assert from_metadata(text).source_units == {"imu/voltage": "V"}
+    del text["source_units"]
+    assert from_metadata(text) == structs.replace(header, attachments={}, metadata={}, robot_description=None)
+
+
 OTHER_FORMAT = "and this version reads formats 8 and 9 only; use the version of dxlrun that recorded it"
 
 

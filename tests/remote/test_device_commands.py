@@ -106,6 +106,7 @@ def test_what_is_commanded_of_a_device_is_asked_for_by_name(board):
 
 def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     shown = {"valid": True, "age": 0.003, "states": {"force.x": 12.5}, "commands": {}}
+    shown |= {"units": {}, "command_units": {}}
     status, content = board.ask("GET", "/joints/foot/force.x")
     assert (status, content) == (200, {"source": "foot/force.x", "cycle": 1, **shown})
     assert board.ask("GET", "/joints/board")[1] == {

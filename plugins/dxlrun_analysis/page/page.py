@@ -151,7 +151,7 @@ def _sections(run: _Run, report: Report) -> list[Element]:
         return [table_element(found[name]) for name in names if name in found]
 
     return [
-        section("joints", "Joints", [*shown("joints"), *_joints(run, report)]),
+        section("joints", "Joints", [*shown("joints", "sources"), *_joints(run, report)]),
         section("steering", "Steered from outside", [*shown("steering"), *_marks(canvas)]),
         section("events", "Events", _events(run, report, shown("events"))),
         section(

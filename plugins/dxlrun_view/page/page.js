@@ -62,6 +62,7 @@ function scaleOf(name) {
   const [owner, column] = [name.slice(0, name.lastIndexOf("/")), name.slice(name.lastIndexOf("/") + 1)];
   const joint = page.joints.get(owner);
   if (name === "loop/late") return [1e3, "ms"];
+  if (name in (page.shown?.units ?? {})) return [1, page.shown.units[name].replace("degC", "°C")];
   if (!joint && !(isAngle(name) && page.shown?.columns.includes(name))) return [1, ""];
   const linear = joint?.unit === "m";
   if (/position$/.test(column)) return linear ? [1e3, "mm"] : [deg, "deg"];

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import ClassVar, Generic, TypeVar
 
 import msgspec
@@ -17,6 +18,22 @@ P = TypeVar("P", bound=ParametersModel)
 
 INERTIAL = ("angular_velocity", "linear_acceleration")
 """Quantities of an IMU. Their noise is about one unit of the last digit or more: of an MPU-6050 4 and 8."""
+
+
+UNITS: Mapping[str, str] = MappingProxyType(
+    {
+        "angular_velocity": "rad/s",
+        "current": "A",
+        "force": "N",
+        "linear_acceleration": "m/s^2",
+        "magnetic_field": "T",
+        "temperature": "degC",
+        "torque": "Nm",
+        "voltage": "V",
+    }
+)
+"""Units of quantities in messages of ROS 2 (sensor_msgs: Imu, MagneticField, Temperature, BatteryState;
+geometry_msgs: Wrench)."""
 
 
 class SensorContext(msgspec.Struct, frozen=True):
@@ -65,6 +82,16 @@ class Sensor(ABC, Generic[P]):
     @abstractmethod
     def states(cls, parameters: P) -> tuple[str, ...]:
         """Return the names of its states, in the order of a sample: `angular_velocity.x`; SI units."""
+
+    @classmethod
+    def units(cls, parameters: P) -> Mapping[str, str]:
+        """Return the units of states that have one, by state: `{"illuminance": "lx"}`.
+
+        Unless overridden: those of the quantities in messages of ROS 2, such as rad/s of
+        `angular_velocity.x`.
+        """
+        known = {state: UNITS.get(state.partition(".")[0], "") for state in cls.states(parameters)}
+        return {state: unit for state, unit in known.items() if unit}
 
     @classmethod
     def links(cls, parameters: P) -> tuple[str, ...]:

@@ -287,6 +287,8 @@ class LogHeader(msgspec.Struct, frozen=True):
     """Devices, sensors and controllers that provide states, each with the names of its states."""
     device_commands: tuple[str, ...] = ()
     """Names of the cycles' commands of devices: `light/led`."""
+    source_units: dict[str, str] = {}
+    """SI units of the states of sources, by `imu/angular_velocity.x`; logs of earlier versions have none."""
     attachments: dict[str, bytes] = {}
     """Robot file, plan: by name."""
     metadata: dict[str, dict[str, str]] = {}
@@ -313,6 +315,7 @@ class LogHeader(msgspec.Struct, frozen=True):
             references=loop.references,
             sources=loop.source_states,
             device_commands=loop.source_commands,
+            source_units=loop.source_units,
             robot_description=plan.urdf,
             frames=plan.frames,
         )
@@ -407,6 +410,8 @@ _TEXTS = {
     if one.name not in {"attachments", "metadata", "robot_description", "frames"}
 }
 """What the metadata have of the header, and its types: JSON, but texts as they are."""
+_ADDED = frozenset({"source_units"})
+"""Names that logs of the same format did not always have."""
 
 
 def to_metadata(header: LogHeader) -> dict[str, str]:
@@ -429,6 +434,7 @@ def from_metadata(text: dict[str, str]) -> LogHeader:
         values = {
             name: text[name] if kind is str else msgspec.json.decode(text[name])
             for name, kind in _TEXTS.items()
+            if name in text or name not in _ADDED
         }
         return msgspec.convert(values, LogHeader)
     except (KeyError, ValueError, msgspec.MsgspecError) as error:

@@ -274,6 +274,10 @@ class SourcePlan(msgspec.Struct, frozen=True):
     ranges: tuple[tuple[float, float], ...] = ()  # Lowest and highest value of each command, SI units
     label: str = ""  # As sentences name it: `imu (ID 241 on bus main)`
     commandable: bool = False  # Its entry in the file may name commands
+    units: dict[str, str] = {}
+    """SI unit of each state that has one, by its name; logs of earlier versions have none."""
+    command_units: dict[str, str] = {}
+    """SI unit of each command that has one, by its name."""
 
 
 class SensorPlan(msgspec.Struct, frozen=True):
@@ -293,6 +297,8 @@ class SensorPlan(msgspec.Struct, frozen=True):
     simulated: bool = False  # It can be stepped on virtual time
     noisy: tuple[str, ...] = ()
     """States that never stay the same together: as long as they do, the sensor is stuck."""
+    units: dict[str, str] = {}
+    """SI unit of each state that has one, by its name."""
 
 
 class ControllerPlan(msgspec.Struct, frozen=True):
@@ -407,6 +413,20 @@ class LoopPlan(msgspec.Struct, frozen=True):
         """States of devices, sensors and controllers, by name, in the order of the cycle's record."""
         return {one.name: one.states for one in self.sources} | {
             one.name: one.provides for one in self.controllers if one.provides
+        }
+
+    @property
+    def source_units(self) -> dict[str, str]:
+        """SI units of the states that have one: `imu/angular_velocity.x` -> `rad/s`."""
+        return {f"{one.name}/{state}": unit for one in self.sources for state, unit in one.units.items()}
+
+    @property
+    def command_units(self) -> dict[str, str]:
+        """SI units of the commands of sources that have one, by `light/brightness`."""
+        return {
+            f"{one.name}/{command}": unit
+            for one in self.sources
+            for command, unit in one.command_units.items()
         }
 
     @property

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.remedies import late_replies as late_replies
     from dxlrun.errors import counted as counted
     from dxlrun.output.live_view import show_live as show_live
+    from dxlrun.output.quantity import quantity_text as quantity_text
     from dxlrun.output.table import Cell as Cell
     from dxlrun.output.table import Column as Column
     from dxlrun.output.table import Columns as Columns

@@ -5,8 +5,9 @@ A data file of ours or of a plug-in describes one model, in the form of servo mo
 added to what the ticks mean, `state` is the name of the state that the item makes (that of the item without
 it), `bit` is the bit of the place that the item is (a button; other items have the others), and `safe` is the
 integer that is written to the item at the end of a run. `cyclic` lists the items that are read each cycle
-where a robot file names none. Model number, firmware version and ID stand where servos have them, unless the
-file says otherwise. Without a `model_number` the device's own is not checked.
+where a robot file names none, and `units` the units of the file that are not in the list of all tables. Model
+number, firmware version and ID stand where servos have them, unless the file says otherwise. Without a
+`model_number` the device's own is not checked.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import re
 import struct
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -130,8 +131,9 @@ def build_device_table(data: Entry) -> DeviceTable:
     written = section(data["items"])
     protocol, firmware = protocol_in(data["protocol"]), data.get("fast_sync_read_firmware")
     entries = _with_identity(written, protocol)
+    units = words(data.get("units", []))
     items = sorted(
-        (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
+        (_item(name, section(entry), units) for name, entry in entries.items()), key=lambda one: one.address
     )
     _check_places(items)
     by_name = {item.name: item for item in items}
@@ -190,13 +192,13 @@ def _place(item: DeviceItem) -> tuple[int, int]:
     return item.address, item.size
 
 
-def _item(name: str, entry: Entry) -> DeviceItem:
+def _item(name: str, entry: Entry, units: Collection[str]) -> DeviceItem:
     if wrong := entry.keys() - _KEYS:
         raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
-    unit, offset = measure(name, entry, "offset") if "offset" in entry else ("", 0.0)
+    unit, offset = measure(name, entry, "offset", units) if "offset" in entry else ("", 0.0)
     defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
     ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
-    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, DeviceItem)
+    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, DeviceItem, units)
     if item.size not in _SIZES or (item.encoding == "float32" and item.size != 4):
         raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {item.size}")
     if item.encoding == "float32" and entry.keys() & {"minimum", "maximum"}:

@@ -6,7 +6,7 @@ import functools
 import math
 import tomllib
 from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias, get_args, get_type_hints
@@ -236,16 +236,16 @@ def words(value: object) -> list[str]:
     return value
 
 
-def quantity(text: str) -> tuple[str, float]:
+def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
     """Return SI unit and value of `59 rpm` or `300/1023 deg`: the manual's ratio, rounded only once.
 
-    Raises ValueError when it is no quantity.
+    A unit of `own` stays as it is. Raises ValueError when it is no quantity.
     """
     number, _, unit = text.partition(" ")
-    if unit not in _SI:
-        raise ValueError(f"{text!r}: the unit is none of {', '.join(_SI)}")
+    if unit not in _SI and unit not in own:
+        raise ValueError(f"{text!r}: the unit is none of {', '.join((*_SI, *own))}")
     numerator, _, denominator = number.partition("/")
-    si, factor = _SI[unit]
+    si, factor = _SI.get(unit, (unit, 1.0))
     if not float(denominator or "1"):
         raise ValueError(f"{text!r} divides by 0")
     value = float(numerator) * factor / float(denominator or "1")
@@ -254,10 +254,10 @@ def quantity(text: str) -> tuple[str, float]:
     return si, value
 
 
-def measure(name: str, entry: Entry, key: str) -> tuple[str, float]:
+def measure(name: str, entry: Entry, key: str, own: Collection[str] = ()) -> tuple[str, float]:
     """Return SI unit and value of a quantity in an item's entry; raises ValueError when it is none."""
     try:
-        return quantity(str(entry[key]))
+        return quantity(str(entry[key]), own)
     except ValueError as error:
         raise ValueError(f"{name}: {key}: {error}") from None
 
@@ -279,9 +279,9 @@ def _items(entries: Entry) -> Iterator[ControlItem]:
             yield read_item(f"{stem}_{int(first) + step}", one, ControlItem)
 
 
-def read_item(name: str, entry: Entry, kind: type[Item]) -> Item:
+def read_item(name: str, entry: Entry, kind: type[Item], own: Collection[str] = ()) -> Item:
     """Return an item by its entry, where a tick is a quantity; raises ValueError when something is wrong."""
-    unit, scale = measure(name, entry, "tick") if "tick" in entry else ("", 1.0)
+    unit, scale = measure(name, entry, "tick", own) if "tick" in entry else ("", 1.0)
     try:
         return msgspec.convert({"initial": None, **entry, "name": name, "unit": unit, "scale": scale}, kind)
     except msgspec.ValidationError as error:

@@ -48,6 +48,7 @@ class LiveRobot:
         self._info = RobotInfo(name)
         self._urdf, self._imu, self._imu_link = "", "", ""
         self._motions: tuple[str, ...] = ()
+        self._units: Mapping[str, str] = {}
         self._history = History((), 1)
         self._cycle = -1
         self._run = 0
@@ -79,6 +80,7 @@ class LiveRobot:
             span=self._history.span,
             run=self._run,
             problem=self._problem,
+            units=self._units,
             fields=tuple(name for names in self._fields.values() for name in names),
             motions=self._motions,
             imu=self._imu,
@@ -181,6 +183,7 @@ class LiveRobot:
             elif time_s - newest_s > GAP_S:
                 self._history.append(newest_s, np.full(len(columns), np.nan))
             self._history.append(time_s, row)
+        self._units = states.source_units
         self._run += self._cycle < 0
         self._cycle = states.cycle
 

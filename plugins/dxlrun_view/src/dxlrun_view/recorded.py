@@ -91,6 +91,7 @@ class RecordedRobot:
             columns=self._history.columns,
             span=self._history.span,
             every=self._every,
+            units=self._header.source_units,
             fields=self._fields,
             marks=self._marks,
             imu=frames.imu if frames is not None else "",

@@ -84,6 +84,8 @@ class Shown(msgspec.Struct, frozen=True, kw_only=True):
     """Why there is nothing new: the robot does not run, or has ended."""
     every: int = 1
     """Of a long log every so manieth cycle is shown."""
+    units: Mapping[str, str] = {}
+    """SI units of the states of sources that have one, by column."""
     fields: tuple[str, ...] = ()
     """Numbers in messages of topics, which can be drawn: `/arm/state:error[0]`."""
     marks: tuple[Mark, ...] = ()

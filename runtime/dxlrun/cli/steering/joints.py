@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import Flag, pose_text
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot, report_done
 from dxlrun.errors import InputError
+from dxlrun.output.quantity import quantity_text
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show, show_json
 from dxlwire.joint_unit import JointUnit
@@ -160,12 +161,14 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
         )
 
 
-def source_facts(found: Mapping[str, object]) -> list[tuple[str, str]]:
+def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the states of a device or a sensor, how old they are, and what is commanded of it."""
     states, commands = (
-        [(name, "-" if value is None else f"{value:.6g}") for name, value in values.items()]
-        for values in (found["states"], found["commands"])
-        if isinstance(values, dict)
+        [(name, quantity_text(value, units.get(name, ""))) for name, value in values.items()]
+        for values, units in (
+            (found["states"], found.get("units", {})),
+            (found["commands"], found.get("command_units", {})),
+        )
     )
     age = written(found["age"], "ms") or "none came yet"
     of_states = [*states, ("age", age if found["valid"] else f"{age}, not valid")] if states else []

@@ -15,6 +15,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
+from dxlrun.output.quantity import names_with_units, quantity_text
 from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import print_error, show, show_json
 
@@ -356,8 +357,8 @@ def sources(info: Row) -> Table:
     columns: Columns[Row] = [
         (Column("source", "name"), "name"),
         (Column("kind", "name"), "kind"),
-        (Column("takes", "text"), lambda one: ", ".join(map(_ranged, one["commands"], one["ranges"]))),
-        (Column("states", "text"), lambda one: ", ".join(one["states"])),
+        (Column("takes", "text"), _source_commands),
+        (Column("states", "text"), lambda one: names_with_units(one["states"], one.get("units", {}))),
     ]
     return Table.listing("", columns, info.get("sources", ()))
 
@@ -368,8 +369,13 @@ def groups(info: Row) -> Table:
     return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
 
 
-def _ranged(name: str, ends: Sequence[float]) -> str:
-    return f"{name}={ends[0]:g}..{ends[1]:g}"
+def _source_commands(source: Row) -> str:
+    units = source.get("command_units", {})
+    ranges = zip(source["commands"], source["ranges"], strict=True)
+    return ", ".join(
+        f"{name}={lowest:g}..{quantity_text(highest, units.get(name, ''))}"
+        for name, (lowest, highest) in ranges
+    )
 
 
 def drawing(info: Row) -> Graph:

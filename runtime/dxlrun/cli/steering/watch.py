@@ -14,6 +14,7 @@ from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, connect_robot, stat
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
 from dxlrun.output.live_view import compact, keys_pressed
+from dxlrun.output.quantity import quantity_text
 from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json
 from dxlwire.joint_unit import JointUnit
@@ -213,8 +214,12 @@ def sources(watched: Watched) -> Table:
     columns = [Column("source", "name"), Column("age"), Column("states", "text")]
     rows = []
     for name in watched.states.sources:
-        row = cast("Row", watched.states.source(name) or {"valid": False, "age": None, "states": {}})
-        said = (f"{key} {'-' if one is None else format(one, '.4g')}" for key, one in row["states"].items())
+        empty: Row = {"valid": False, "age": None, "states": {}, "units": {}}
+        row = cast("Row", watched.states.source(name) or empty)
+        said = (
+            f"{key} {quantity_text(one, row['units'].get(key, ''), digits=4)}"
+            for key, one in row["states"].items()
+        )
         rows.append((name, _age(row), ", ".join(said)))
     return Table.of("", columns, rows)
 

@@ -14,7 +14,7 @@ from dxlrun.description.form import ParametersModel
 Breach = tuple[str, str]
 """What is wrong, and how to fix it."""
 
-_METHODS = ("__init__", "states", "links", "noisy", "open", "read", "close")
+_METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")
 """Called by dxlrun, all by position."""
 
 

@@ -74,6 +74,8 @@ def compile_devices(compilation: Compilation) -> Contribution:
                 ranges=tuple((command.lowest, command.highest) for command in plan.commands),
                 label=f"{name} (ID {device.id} on bus {device.bus})",
                 commandable=True,
+                units=_units(read),
+                command_units=_units(written),
             )
         )
         links = None if body is None else body.urdf.links
@@ -153,6 +155,10 @@ def _read(path: Path) -> DeviceTable:
         return replace(read_device_table(text), text=text)
     except KeyError as error:
         raise ValueError(f"the entry {error} is missing") from None
+
+
+def _units(items: Mapping[str, DeviceItem]) -> dict[str, str]:
+    return {name: item.unit for name, item in items.items() if item.unit}
 
 
 def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, DeviceItem]:

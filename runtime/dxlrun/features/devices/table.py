@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from dxlrun.compile.report import Row, TableStage
+from dxlrun.output.quantity import names_with_units
 from dxlrun.output.table import Column, Columns, Table
+from dxlrun.plan.loop_plan import SourcePlan
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.bus_plan import BusPlan, DevicePlan
 
@@ -14,17 +16,18 @@ _COLUMNS: Columns[Row] = [
     (Column("bus", "name"), "bus"),
     (Column("model", "name"), "model"),
     (Column("ID"), "id"),
-    (Column("states", "text"), lambda row: ", ".join(row["states"])),
-    (Column("commands", "text"), lambda row: ", ".join(row["commands"])),
+    (Column("states", "text"), lambda row: names_with_units(row["states"], row["units"])),
+    (Column("commands", "text"), lambda row: names_with_units(row["commands"], row["command_units"])),
     (Column("addresses read", "text"), lambda row: ", ".join(row["reads"])),
 ]
 
 
 def device_rows(plan: Plan) -> Iterator[Row]:
     """Yield a row for each device, in the order of the buses."""
+    sources = {source.name: source for source in plan.loop.sources}
     for bus in plan.buses:
         for device in bus.devices:
-            yield _device(bus, device)
+            yield _device(bus, device, sources[device.name])
 
 
 def device_table(rows: Sequence[Row]) -> Table:
@@ -35,19 +38,15 @@ def device_table(rows: Sequence[Row]) -> Table:
 STAGE = TableStage(rows=device_rows, table=device_table)
 
 
-def _state_names(device: DevicePlan) -> tuple[str, ...]:
-    """Return the names of a device's states, in the order of the cycle's record."""
-    fields = [field for block in device.blocks for field in block.fields]
-    return tuple(field.state for field in sorted(fields, key=lambda field: field.column))
-
-
-def _device(bus: BusPlan, device: DevicePlan) -> Row:
+def _device(bus: BusPlan, device: DevicePlan, source: SourcePlan) -> Row:
     return {
         "name": device.name,
         "bus": bus.name,
         "id": device.servo_id,
         "model": device.model,
-        "states": _state_names(device),
-        "commands": [command.name for command in device.commands],
+        "states": source.states,
+        "commands": list(source.commands),
         "reads": [f"{block.address}..{block.address + block.length - 1}" for block in device.blocks],
+        "units": source.units,
+        "command_units": source.command_units,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
 from dxlrun.compile.controller_entry import PlugInCode, where_to_get
@@ -31,7 +31,8 @@ def compile_sensors(compilation: Compilation) -> Contribution:
     return Contribution(
         names=tuple(described),
         sources=tuple(
-            SourcePlan(plan.name, "sensor", plan.states, label=f"sensor {plan.name}") for plan in sensors
+            SourcePlan(plan.name, "sensor", plan.states, label=f"sensor {plan.name}", units=dict(plan.units))
+            for plan in sensors
         ),
         links={plan.name: plan.links[0] for plan in sensors if len(plan.links) == 1},
         sensors=sensors,
@@ -58,7 +59,7 @@ def _compiled(
     )
     if names is None:
         return None
-    states, links, noisy = names
+    states, links, noisy, units = names
     _check_links(file, name, entry, links, known)
     rate = entry.rate or file.robot.loop.rate
     period_ns = round(1e9 / rate)
@@ -81,13 +82,14 @@ def _compiled(
         links=links,
         simulated=offer.sensor.simulated,
         noisy=noisy,
+        units=units,
     )
 
 
 def _names(
     name: str, entry: SensorEntry, offer: SensorOffer
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the states of a sensor, its links, and the states with noise.
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], dict[str, str]]:
+    """Return the states of a sensor, its links, the states with noise, and the units of states.
 
     Raises ValidationError (parameters), and WrongEntry.
     """
@@ -97,11 +99,23 @@ def _names(
         states, links = sensor.states(parameters), sensor.links(parameters)
         breach = names_breach(states, links)
         noisy = () if breach else sensor.noisy(parameters)
+        units = {} if breach else sensor.units(parameters)
     if not breach and not (isinstance(noisy, tuple) and set(noisy) <= set(states)):
         breach = f"returns {noisy!r} from noisy", "return a tuple of its states"
+    if not breach and not is_units(units, states):
+        breach = f"returns {units!r} from units", "return a mapping from its states to texts"
     if breach:
         raise code.broken(breach)
-    return states, links, noisy
+    return states, links, noisy, dict(units)
+
+
+def is_units(found: object, states: Collection[str]) -> bool:
+    """Check whether something has the unit of each of some states."""
+    return (
+        isinstance(found, Mapping)
+        and set(found) <= set(states)
+        and all(isinstance(unit, str) for unit in found.values())
+    )
 
 
 def _check_links(

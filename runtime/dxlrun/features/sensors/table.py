@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from dxlrun.compile.report import Row, TableStage
+from dxlrun.output.quantity import names_with_units
 from dxlrun.output.table import Column, Table, Value
 from dxlrun.plan.loop_plan import SensorPlan
 from dxlrun.plan.robot_plan import Plan
@@ -27,7 +28,7 @@ def sensor_table(sensors: Sequence[Row]) -> Table:
             Column("when lost", "text"),
             lambda row: "the run ends" if row["on_lost"] == "stop" else "the run goes on",
         ),
-        (Column("states", "text"), lambda row: ", ".join(row["states"])),
+        (Column("states", "text"), lambda row: names_with_units(row["states"], row["units"])),
         *[(Column("senses link", "text"), lambda row: ", ".join(row["links"]))]
         * any(row["links"] for row in sensors),
     ]
@@ -46,5 +47,6 @@ def _sensor(sensor: SensorPlan) -> Row:
         "timeout": sensor.timeout_ns * 1e-9,
         "on_lost": sensor.on_lost,
         "states": sensor.states,
+        "units": sensor.units,
         "links": sensor.links,
     }

@@ -69,6 +69,10 @@ class RobotStates(msgspec.Struct, frozen=True):
     controllers: tuple[str, ...]
     controller_ns: Integers
     """How long each controller's update took in this cycle; 0: it had none."""
+    source_units: dict[str, str] = {}
+    """SI units of the states of sources that have one, by `imu/angular_velocity.x`."""
+    command_units: dict[str, str] = {}
+    """SI units of the commands of sources that have one, by `board/fan`."""
 
     def joint(self, name: str) -> dict[str, object]:
         """Return the row of a joint by names of fields, `age` in s; None: not known. Raises ValueError."""
@@ -77,7 +81,7 @@ class RobotStates(msgspec.Struct, frozen=True):
         return {**found, "age": int(self.age_ns[row]) * 1e-9}
 
     def source(self, name: str) -> dict[str, object] | None:
-        """Return states, commands, `valid` and `age`, s, of a device, a sensor or a controller.
+        """Return states, commands, their units, `valid` and `age`, s, of a source of states.
 
         Args:
             name: Its own name, or that of one state or command, `imu/orientation.x`.
@@ -86,15 +90,17 @@ class RobotStates(msgspec.Struct, frozen=True):
             None where there is no such source. A command is null where no controller commands it.
         """
         owner = name.partition("/")[0]
-        states, commands = (
+        states, commands, units, command_units = (
             {
-                full.partition("/")[2]: _plain(value)
-                for full, value in zip(names, values.tolist(), strict=True)
+                full.partition("/")[2]: value
+                for full, value in values
                 if name in (full, full.partition("/")[0])
             }
-            for names, values in (
-                (self.source_states, self.source_state),
-                (self.device_commands, self.device_command),
+            for values in (
+                [*zip(self.source_states, map(_plain, self.source_state), strict=True)],
+                [*zip(self.device_commands, map(_plain, self.device_command), strict=True)],
+                self.source_units.items(),
+                self.command_units.items(),
             )
         )
         if not states and not commands:
@@ -107,6 +113,8 @@ class RobotStates(msgspec.Struct, frozen=True):
             "age": age,
             "states": states,
             "commands": commands,
+            "units": units,
+            "command_units": command_units,
         }
 
 

@@ -54,6 +54,8 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         sources=layout.sources,
         device_commands=layout.source_commands,
         controllers=tuple(timed),
+        source_units=plan.loop.source_units,
+        command_units=plan.loop.command_units,
     )
 
 

@@ -1,0 +1,83 @@
+"""Values of sources over a run: least, mean and greatest of each state of a device, sensor or controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun import Floats, Log
+from dxlrun.tooling.output import Column, Columns, Table, quantity_text
+
+_DIGITS = 4
+
+
+class SourceValues(msgspec.Struct, frozen=True):
+    """One state of a source over a run, SI units; None: it was never valid."""
+
+    name: str  # `imu/angular_velocity.x`
+    unit: str  # Empty: it has none, or the log does not know it
+    cycles: int  # In which it was valid
+    least: float | None
+    mean: float | None
+    greatest: float | None
+
+
+class SourceHistory:
+    """Counts the states of sources, slice by slice."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._units: dict[str, str] = {}
+        self._counts: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._sums: Floats = np.zeros(0)
+        self._least: Floats = np.zeros(0)
+        self._greatest: Floats = np.zeros(0)
+
+    def count_cycles(self, log: Log) -> None:
+        """Count the cycles of the next slice."""
+        layout = log.header.layout
+        if not len(log.cycles) or not layout.source_states:
+            return
+        if not self._names:
+            self._names, self._units = layout.source_states, log.header.source_units
+            count = len(self._names)
+            self._counts, self._sums = np.zeros(count, np.int64), np.zeros(count)
+            self._least, self._greatest = np.full(count, np.inf), np.full(count, -np.inf)
+        values = log.cycles["source_state"]
+        known = np.isfinite(values)
+        for row, source in enumerate(layout.sources):
+            known[:, layout.source_slice(source)] &= log.cycles["source_valid"][:, row, np.newaxis]
+        self._counts += known.sum(axis=0)
+        self._sums += np.sum(values, axis=0, where=known)
+        self._least = np.fmin(self._least, np.min(values, axis=0, where=known, initial=np.inf))
+        self._greatest = np.fmax(self._greatest, np.max(values, axis=0, where=known, initial=-np.inf))
+
+    def finish(self) -> tuple[SourceValues, ...]:
+        """Return the states in the order of the cycle's record."""
+        rows = zip(self._names, self._counts.tolist(), self._sums, self._least, self._greatest, strict=True)
+        return tuple(
+            SourceValues(
+                name,
+                self._units.get(name, ""),
+                count,
+                *((float(low), float(total) / count, float(high)) if count else (None, None, None)),
+            )
+            for name, count, total, low, high in rows
+        )
+
+
+def sources_table(values: Sequence[SourceValues]) -> Table:
+    """Return the table of these states."""
+    return Table.listing("Devices, sensors and states of controllers", _COLUMNS, values)
+
+
+_COLUMNS: Columns[SourceValues] = (
+    (Column("state", "name"), "name"),
+    (Column("valid cycles"), "cycles"),
+    (Column("least"), lambda one: quantity_text(one.least, one.unit, digits=_DIGITS)),
+    (Column("mean"), lambda one: quantity_text(one.mean, one.unit, digits=_DIGITS)),
+    (Column("greatest"), lambda one: quantity_text(one.greatest, one.unit, digits=_DIGITS)),
+)
