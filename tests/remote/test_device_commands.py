@@ -116,6 +116,8 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
         "age": None,
         "states": {"led": 1.0, "register_2": None},
         "commands": {"led": None, "register_7": None, "register_8": None},
+        "units": {},
+        "command_units": {},
     }
     assert board.ask("GET", "/joints/neck")[1]["joint"] == "neck"
     status, content = board.ask("GET", "/joints/foot/force.y")
