@@ -47,6 +47,11 @@ class LoggedServo(msgspec.Struct):
         """A name that no other servo has."""
         return self.name or self.joint
 
+    @property
+    def declared(self) -> dict[str, int]:
+        """The integer on the wire that the robot file gives an item, by item."""
+        return {register.name: register.value for register in self.registers}
+
 
 class LoggedDevice(msgspec.Struct):
     """One device of the plan: on a bus, and no servo."""

@@ -192,6 +192,11 @@ class ServoPlan(msgspec.Struct, frozen=True):
         return self.name or self.joint
 
     @property
+    def declared(self) -> dict[str, int]:
+        """The integer on the wire that the robot file gives an item, by item, in the order of the writes."""
+        return {register.name: register.value for register in self.registers}
+
+    @property
     def position_per_tick(self) -> float:
         """What the joint moves in a tick of the position, rad or m."""
         return self.rad_per_tick * self.ratio

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
 from dxlrun import LINEAR, Log
@@ -84,7 +84,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
                 sum(one.share for one in mine) if joint.unit is LINEAR else 1.0,
                 max(_softness(one) for one in mine),
-                ", ".join(sorted(f"{one.servo.model} {one.servo.registers}" for one in mine)),
+                ", ".join(sorted(f"{one.servo.model} {one.servo.declared}" for one in mine)),
                 joint.continuous and any(_counts_one_turn(one) for one in mine),
                 joint,
                 tuple({one.servo.model: table.errors for one in mine if (table := _table(one))}.values()),
@@ -108,7 +108,12 @@ def _table(one: Mover) -> ControlTable | None:
 
 def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: bool = False) -> float:
     """Return the first register that the robot file declares, or `shipped` the model, in its unit."""
-    declared = {each.name: each.value for each in one.servo.registers}
+    return _first_value(one, names, one.servo.declared, otherwise, shipped=shipped)
+
+
+def _first_value(
+    one: Mover, names: tuple[str, ...], declared: Mapping[str, int], otherwise: float, *, shipped: bool
+) -> float:
     table = _table(one)
     if table is None:
         return otherwise
@@ -121,6 +126,5 @@ def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: 
 
 
 def _softness(one: Mover) -> float:
-    as_shipped = one._replace(servo=msgspec.structs.replace(one.servo, registers=[]))
-    softness = _register(as_shipped, _GAINS, math.nan, shipped=True) / _register(one, _GAINS, math.nan)
+    softness = _first_value(one, _GAINS, {}, math.nan, shipped=True) / _register(one, _GAINS, math.nan)
     return min(max(1.0, softness), _SOFTEST)  # 1.0 where either is not known

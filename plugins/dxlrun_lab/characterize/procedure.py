@@ -227,7 +227,7 @@ class Characterize:
         speed = joint.plan.highest_speed
         hold = 2 * (high - low) / speed + 0.8
         # the profile of an X series needs a speed to be one (e-Manual, Profile Velocity (112): 0 is a step)
-        profiled = any(one.name == "profile_acceleration" and one.value for one in joint.servo.registers)
+        profiled = bool(joint.servo.declared.get("profile_acceleration"))
         interface: Literal["position", "posvel"] = "posvel" if profiled else "position"
         moves: list[response.Step] = []
         count, sixth = 2, (high - low) / 6
@@ -370,4 +370,4 @@ def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
     table = find_table(joint.servo.model, protocol)
     shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}
-    return shipped | {one.name: one.value for one in joint.servo.registers if one.name in shipped}
+    return {name: joint.servo.declared.get(name, value) for name, value in shipped.items()}

@@ -276,7 +276,7 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
 ) -> list[str]:
     servo = run.servo
     notes = []
-    if servo.p_gain_item is not None and servo.p_gain_item not in servo.registers:
+    if servo.p_gain_item is not None and servo.p_gain_item not in servo.declared:
         notes.append(
             f"{servo.p_gain_item} is taken as shipped, {servo.p_gain}: the robot file does not declare it"
         )

@@ -25,7 +25,7 @@ class Servo(msgspec.Struct, frozen=True):
     reference: float
     """rad of the servo where the joint is at 0"""
     direction: int
-    registers: Mapping[str, int] = msgspec.field(default_factory=dict)
+    declared: Mapping[str, int] = msgspec.field(default_factory=dict)
     """What the robot file declares"""
 
     @property
@@ -62,8 +62,8 @@ class Servo(msgspec.Struct, frozen=True):
 
     def register(self, name: str, otherwise: int = 0) -> int:
         """Return what the robot file declares, else the value as shipped."""
-        if name in self.registers:
-            return self.registers[name]
+        if name in self.declared:
+            return self.declared[name]
         item = self.table.items.get(name)
         return otherwise if item is None or item.initial is None else item.initial
 
@@ -132,9 +132,8 @@ class Servo(msgspec.Struct, frozen=True):
 def servo_of(plan: Plan, joint: str) -> Servo:
     """Return what a plan knows of a joint's servo; raises LookupError for an unknown model."""
     bus, servo = plan.servos_by_joint[joint][0]
-    registers = {register.name: register.value for register in servo.registers}
     table = find_table(servo.model, bus.protocol)
-    return Servo(joint, table, servo.reference, servo.direction, registers)
+    return Servo(joint, table, servo.reference, servo.direction, servo.declared)
 
 
 def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:

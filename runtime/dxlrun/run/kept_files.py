@@ -91,7 +91,7 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
     }
     if servo.ratio != 1.0:
         facts["ratio"] = repr(servo.ratio)
-    facts |= {register.name: str(register.value) for register in servo.registers}
+    facts |= {item: str(value) for item, value in servo.declared.items()}
     facts["motor file"] = _short(joint.motor)
     if bus.port == "sim":  # of those on a pseudo-terminal, another process knows what they are
         simulation = plan.simulation

@@ -200,8 +200,9 @@ def check_tolerances(
     plans = [plan for plan in controllers if plan.commands_servos]
     by_error = {name for plan in plans if plan.command in _BY_ERROR for name in plan.joints}
     for name, joint in joints.items():
-        plan, described = joint.plan, joint.described
-        if name not in by_error or plan.unit is LINEAR or _I_GAIN in getattr(described, "registers", {}):
+        plan = joint.plan
+        integrates = any(_I_GAIN in servo.declared for servo in joint.servos)
+        if name not in by_error or plan.unit is LINEAR or integrates:
             continue
         error = _static_error(joint)
         if error is not None and error > plan.goal_tolerance:

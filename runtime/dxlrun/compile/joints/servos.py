@@ -41,6 +41,11 @@ class CompiledServo(msgspec.Struct, frozen=True):
     certain: bool  # False while its model is still to be read, so that what does not fit it is no error yet
 
     @property
+    def declared(self) -> dict[str, int]:
+        """The integer on the wire that the robot file gives an item, by item."""
+        return {register.name: register.value for register in self.registers}
+
+    @property
     def reach(self) -> Interval:
         """Where its goal positions bring its joint, or its transmission's input, rad or m."""
         described = self.described
@@ -68,8 +73,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
         """What the manual says of it, as its joint counts."""
         table, ratio = self.table, self.described.ratio
         limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
-        declared = {each.name: each.value for each in self.registers}
-        raw = None if limit is None else declared.get(limit.name, limit.initial)
+        raw = None if limit is None else self.declared.get(limit.name, limit.initial)
         return ServoModel(
             model=table.model,
             label=self.described.servo,

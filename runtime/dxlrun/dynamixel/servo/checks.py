@@ -94,7 +94,7 @@ def _limits(low: str, high: str, names: str) -> Check:
 
 
 def _newer(found: Inspected, firmware: int) -> list[ControlItem]:
-    declared = (found.items[one.name] for one in found.servo.registers)
+    declared = (found.items[name] for name in found.servo.declared)
     return [item for item in declared if item.firmware > firmware]
 
 
@@ -236,7 +236,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
         title = next(one.items[name].title for name in wanted if name not in read)
         found.problems.append(f"{one} {_unreadable(one, title, reply)}")
         return None
-    declared = {each.name: each.value for each in servo.registers}
+    declared = servo.declared
     values = {name: declared.get(name, raw) for name, raw in read.items()}
     if plan.protocol == 1.0:
         values[STATUS_ERROR] = reply.error

@@ -282,7 +282,7 @@ def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled
     now = yield from one.read(kept)
     if now is None:
         return "did not answer when its gains were read after its mode was changed"
-    declared = {register.name for register in one.servo.registers}
+    declared = one.servo.declared
     for name, value in kept.items():
         # what had its initial value begins with the one of the new mode, which may be another
         if now[name] == value or (value == one.items[name].initial and name not in declared):
@@ -301,7 +301,7 @@ def _forgotten(one: Access, desired: ModePlan, found: Mapping[str, int]) -> tupl
     if "operating_mode" not in items:
         return ()
     names = [name for name in _RESET if name in items]
-    names += [register.name for register in one.servo.registers if not register.eeprom]
+    names += [name for name in one.servo.declared if items[name].area == "RAM"]
     if Mode.PWM not in {desired.mode, mode_in(one.servo, found)} and "goal_pwm" in items:
         names.append("goal_pwm")  # it limits every other mode, for a policy too
     return tuple(dict.fromkeys(names))
