@@ -146,7 +146,7 @@ def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path):
 @pytest.mark.parametrize(("priority", "fix"), [(0, "; loop.scheduler.policy round_robin lets it"), (32, "")])
 def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(watcher, processor, priority, fix):
     made, _, page = watcher
-    made._job = replace(made._job, priority=priority)
+    made._job = replace(made._job, plan=replace(made._job.plan, priority=priority))
     page.enter(Phase.RUNNING)
     page.cycle(1, 0)
     page.beat()
@@ -370,7 +370,7 @@ def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(watcher, phase, co
 
 
 def test_the_guardian_runs_one_priority_above_the_loop(watcher):
-    assert watcher[0]._job.priority == 32  # the loop of `pair` has 31
+    assert watcher[0]._job.plan.priority == 32  # the loop of `pair` has 31
 
 
 def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(watcher):

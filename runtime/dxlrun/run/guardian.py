@@ -16,7 +16,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -35,7 +35,6 @@ from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
-from dxlrun.features import FEATURES
 from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
@@ -57,13 +56,14 @@ Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
 """done: by itself, torque off; unused: before a byte was sent; the others leave torque off to us."""
 
 
-@dataclass(frozen=True, slots=True)
-class GuardianJob:
-    """What the guardian works on: buses, timeouts, and the descriptors that it and the loop inherit."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardianPlan:
+    """The guardian's share of the robot's plan: enough to watch a loop, and to leave the robot safe."""
 
     buses: tuple[BusPlan, ...]
-    ports: tuple[str, ...]
-    """Device paths, in the order of `buses`; a simulated bus has its pseudo-terminal here."""
+    features: tuple[Feature, ...]
+    feature_plans: Mapping[str, bytes]
+    """`Contribution.plan` by feature."""
     period_ns: int
     exit_timeout_ns: int
     """How long the loop may take to stop when it is asked to."""
@@ -72,16 +72,22 @@ class GuardianJob:
     lock_memory: bool
     last: Last
     """How the robot is left when the loop is gone in the middle of a run."""
-    take_over: bool
-    """The loop accepts servos that are already torqued."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardianJob:
+    """What the guardian works on: the plan, and the ports and descriptors that it and the loop inherit."""
+
+    plan: GuardianPlan
+    ports: tuple[str, ...]
+    """Device paths, in the order of `plan.buses`; a simulated bus has its pseudo-terminal here."""
     memory: RunMemory
     supervisor: int
     """Process ID."""
+    take_over: bool = False
+    """The loop accepts servos that are already torqued."""
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this."""
-    features: tuple[Feature, ...] = FEATURES
-    feature_plans: Mapping[str, bytes] = field(default_factory=dict)
-    """`Contribution.plan` by feature."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,14 +166,14 @@ class SafeStop:
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
-        self._safe_end = SafeEnd.of(job.features, job.feature_plans)
+        self._safe_end = SafeEnd.of(job.plan.features, job.plan.feature_plans)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
 
         A robot holds only when it ran: in a set-up some servos have torque and others have not.
         """
-        if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
+        if self._job.plan.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
             return self.limp(descriptors, how, severity)
         standing = self.stand(descriptors)
         self.report("; ".join([how, TORQUE_STAYS, *standing]), severity)
@@ -199,9 +205,9 @@ class SafeStop:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
         job, memory = self._job, self._job.memory
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
-        ports = SerialPorts(make_ports(job.buses, job.ports, descriptors, memory, StallCounter()))
+        ports = SerialPorts(make_ports(job.plan.buses, job.ports, descriptors, memory, StallCounter()))
         packets = PacketBatch(self._ring, cycle=cycle)
-        return Lines(job.buses, ports, self._clock, packets, self._heartbeat.look), packets
+        return Lines(job.plan.buses, ports, self._clock, packets, self._heartbeat.look), packets
 
     def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""
@@ -238,12 +244,12 @@ class Guardian:
         lines = KeptLines(
             [
                 Wanted(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
-                for path, bus in zip(self._job.ports, self._job.buses, strict=True)
+                for path, bus in zip(self._job.ports, self._job.plan.buses, strict=True)
             ],
             describe_holder=describe_run,
         )
         # before the loop is executed, which inherits none of it
-        grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
+        grants = realtime.apply_to_guardian(self._job.plan.priority, self._job.plan.lock_memory)
         self._safe_stop.report_grants(grants)
         for sentence in lines.done:
             self._safe_stop.report(sentence, Severity.INFO)
@@ -294,7 +300,7 @@ class Guardian:
         watched = os.pidfd_open(loop.pid)
         processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
         self._loop_signs = SignsOfLife(loop.pid, LONGEST_LOOK_NS, self._clock.now_ns())
-        nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
+        nap = min(max(self._job.plan.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
             # a terminal that is gone would wake it for ever, a loop that is gone asks for nothing
             channels = [one for one in (self._control, channel) if not one.closed]
@@ -312,7 +318,9 @@ class Guardian:
             if duty is Duty.STOP_LOOP and not self._unsupervised:
                 self._report_unsupervised()
             if request == "stop" or (duty is Duty.STOP_LOOP and self._stop_by_ns == _NEVER):
-                self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
+                self._stop_by_ns = min(
+                    self._stop_by_ns, self._clock.now_ns() + self._job.plan.exit_timeout_ns
+                )
                 loop.send_signal(signal.SIGTERM)
             reason = "cut" if request == "cut" else self._reason_to_kill(duty)
             if reason and not self._killed:
@@ -371,7 +379,7 @@ class Guardian:
         return "late" if self._clock.now_ns() > self._stop_by_ns else None
 
     def _timeout_ns(self) -> float:
-        return loop_timeout_ns(self._heartbeat, self._job.period_ns)
+        return loop_timeout_ns(self._heartbeat, self._job.plan.period_ns)
 
     def _note_standstill(self, reason: str, processor: ProcessorTime) -> None:
         """Note why a loop stands still, before it is killed for that."""
@@ -410,7 +418,7 @@ class Guardian:
             still = _duration(self._timeout_ns())
             return f"the loop stood still for more than {still}{where} and was killed{self._starved()}"
         if self._killed == "late":
-            limit = _duration(self._job.exit_timeout_ns)
+            limit = _duration(self._job.plan.exit_timeout_ns)
             return f"the loop did not stop within {limit}{where} and was killed"
         return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
 
@@ -420,7 +428,7 @@ class Guardian:
             return ""
         got = f"; it was ready to run, but got a processor for only {self._starved_ns / 1e6:.1f} ms of that"
         fix = "; loop.scheduler.policy round_robin lets it run before other programs"
-        return got if self._job.priority else got + fix
+        return got if self._job.plan.priority else got + fix
 
 
 def _duration(time_ns: float) -> str:

@@ -25,7 +25,7 @@ from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.guardian import GuardianJob, GuardianMessage
+from dxlrun.run.guardian import GuardianJob, GuardianMessage, GuardianPlan
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob
 from dxlrun.run.simulation_front import first_message, start_simulation
@@ -194,21 +194,18 @@ def guardian_job(
 ) -> GuardianJob:
     """Return the job of the guardian, and through it of the loop."""
     scheduler = plan.loop.scheduler
-    return GuardianJob(
+    share = GuardianPlan(
         buses=plan.buses,
-        ports=tuple(ports.get(bus.name, bus.port) for bus in plan.buses),
+        features=plan.features,
+        feature_plans=plan.feature_plans,
         period_ns=plan.loop.period_ns,
         exit_timeout_ns=plan.exit_timeout_ns,
         priority=guardian_priority(scheduler),
         lock_memory=scheduler.lock_memory,
         last=plan.loop.policies.on_fault.last,
-        take_over=take_over,
-        memory=memory,
-        supervisor=os.getpid(),
-        epoch_offset_ns=epoch_offset_ns,
-        features=plan.features,
-        feature_plans=plan.feature_plans,
     )
+    paths = tuple(ports.get(bus.name, bus.port) for bus in plan.buses)
+    return GuardianJob(share, paths, memory, os.getpid(), take_over, epoch_offset_ns)
 
 
 def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMessage]:

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -133,52 +133,56 @@ class _SensorProcess:
         self.child = None
 
 
-@dataclass(slots=True)
 class _Run:
     """The processes of one run, as far as they were started, and what became of them."""
 
-    plan: Plan
-    options: RunOptions
-    memory: RunMemory
-    out: Console
-    kept: KeptStates = field(default_factory=KeptStates)
-    """What controllers kept in earlier runs."""
-    offset_ns: int = field(default_factory=epoch_offset_ns)
-    """Wall time minus the run's clock."""
-    simulation: Child[SimulationMessage] | None = None
-    recorder: Child[RecorderMessage] | None = None
-    guardian: Child[GuardianMessage] | None = None
-    gateway: Child[GatewayMessage] | None = None
-    sensors: list[_SensorProcess] = field(default_factory=list)
-    writer: KeptStateWriter | None = None
-    socket: Path | None = None
-    """Where the gateway listens; None before it does."""
-    remarks: list[str] = field(default_factory=list)
-    job: GuardianJob | None = None
-    loop: int | None = None
-    """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
-    loop_signs: SignsOfLife | None = None
-    """None as long as there is no loop."""
-    log: Path | None = None
-    sentences: list[str] = field(default_factory=list)
-    ended: Ended | None = None
-    """The guardian's last message."""
-    messages: int = 0
-    closed: LogClosed | None = None
-    """The recorder's last message; None: there was no recorder, or it ended early."""
-    guardian_grants: tuple[Grant, ...] = ()
-    grants: tuple[Grant, ...] = ()
-    """What the operating system granted, once the loop runs."""
-    signals: int = 0
-    """How many SIGINT and SIGTERM came: the first asks the robot to stop in order, the second cuts torque."""
-    steerable: bool = field(init=False)
-    """False without a gateway, and after it ended."""
-    held: bool = field(init=False)
-    """The loop is paused until the gateway answers, so that a robot can be stopped before it moves."""
-
-    def __post_init__(self) -> None:
-        self.steerable = self.options.gateway and self.plan.gateway
-        self.held = self.steerable and (not self.plan.simulated or bool(self.options.listen))
+    def __init__(
+        self,
+        plan: Plan,
+        options: RunOptions,
+        memory: RunMemory,
+        out: Console,
+        kept: KeptStates | None = None,
+    ) -> None:
+        """`kept`: what controllers kept in earlier runs."""
+        self.plan = plan
+        self.options = options
+        self.memory = memory
+        self.out = out
+        self.kept = kept or KeptStates()
+        self.offset_ns = epoch_offset_ns()
+        """Wall time minus the run's clock."""
+        self.simulation: Child[SimulationMessage] | None = None
+        self.recorder: Child[RecorderMessage] | None = None
+        self.guardian: Child[GuardianMessage] | None = None
+        self.gateway: Child[GatewayMessage] | None = None
+        self.sensors: list[_SensorProcess] = []
+        self.writer: KeptStateWriter | None = None
+        self.socket: Path | None = None
+        """Where the gateway listens; None before it does."""
+        self.remarks: list[str] = []
+        self.job: GuardianJob | None = None
+        self.loop: int | None = None
+        """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
+        self.loop_signs: SignsOfLife | None = None
+        """None as long as there is no loop."""
+        self.log: Path | None = None
+        self.sentences: list[str] = []
+        self.ended: Ended | None = None
+        """The guardian's last message."""
+        self.messages = 0
+        self.closed: LogClosed | None = None
+        """The recorder's last message; None: there was no recorder, or it ended early."""
+        self.guardian_grants: tuple[Grant, ...] = ()
+        self.grants: tuple[Grant, ...] = ()
+        """What the operating system granted, once the loop runs."""
+        self.signals = 0
+        """How many SIGINT and SIGTERM came: the first asks the robot to stop in order, the second cuts
+        torque."""
+        self.steerable = options.gateway and plan.gateway
+        """False without a gateway, and after it ended."""
+        self.held = self.steerable and (not plan.simulated or bool(options.listen))
+        """The loop is paused until the gateway answers, so that a robot can be stopped before it moves."""
 
     @property
     def steering(self) -> Steering:
