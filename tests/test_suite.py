@@ -157,7 +157,7 @@ def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
 
 RUNTIME = ROOT / "runtime"
 MOST_ENTRIES = 16
-MOST_ROOMS = 18
+MOST_ROOMS = 19
 """In the package itself, whose rooms docs/explanation/architecture.md lists."""
 
 

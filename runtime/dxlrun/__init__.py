@@ -7,4 +7,4 @@ Packages with verbs find the names of their trade in `dxlrun.tooling`.
 
 from dxlwire.faces import lazy_face
 
-__all__, __getattr__, __dir__ = lazy_face(__name__, f"{__file__.rpartition('.')[0]}.pyi")
+__getattr__, __dir__ = lazy_face(__name__, f"{__file__.rpartition('.')[0]}.pyi")

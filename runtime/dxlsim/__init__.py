@@ -7,23 +7,6 @@ Each name is imported when it is first used, so that a program that only describ
 simulates them. The names are in `__init__.pyi` alone, a line each.
 """
 
-from __future__ import annotations
+from dxlwire.faces import lazy_face
 
-from importlib import import_module
-
-with open(f"{__file__.rpartition('.')[0]}.pyi", encoding="utf-8") as _names:
-    _HOME = {_line.split()[-1]: _line.split()[1] for _line in _names if _line.startswith("from ")}
-del _names
-__all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module 'dxlsim' has no attribute {name!r}")
-    value: object = getattr(import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_face(__name__, f"{__file__.rpartition('.')[0]}.pyi")

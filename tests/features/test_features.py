@@ -14,6 +14,7 @@ from dxlrun.compile.contribution import CompileStage
 from dxlrun.description.robot import Robot, robot_form
 from dxlrun.features import FEATURES, stages
 from dxlrun.features.feature import Feature, Section
+from dxlrun.installed_plugins import InstalledPlugin
 
 
 def test_each_feature_has_the_section_of_its_name() -> None:
@@ -61,9 +62,8 @@ def test_broken_section_of_plugin_leaves_robots_usable(
         "def dxlrun_features():\n"
         "    return [Feature('lamps', 'wrong_plugin'), Feature('devices', 'dxlrun.features.devices')]\n"
     )
-    point = EntryPoint("wrong", "wrong_plugin", "dxlrun")
-    monkeypatch.setattr(dxlrun.features, "entry_points", lambda group: [point])
-    installed, broken = dxlrun.features._installed.__wrapped__()
+    plugin = InstalledPlugin("wrong", "wrong 1.0", EntryPoint("wrong", "wrong_plugin", "dxlrun"))
+    installed, broken = dxlrun.features._installed((plugin,))
     assert installed == FEATURES
     assert broken.keys() == {"lamps", "devices"}
     assert "is there already" in broken["devices"]

@@ -17,7 +17,6 @@ from dxlrun.compile.robot import Compiled, compile_files
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.description.robot import robot_form
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
-from dxlrun.features import forget_installed
 from dxlrun.plan.loop_plan import JointValues
 from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.testing import installed, simulated_robot
@@ -60,7 +59,6 @@ def with_backlash(tmp_path: Path) -> Iterator[None]:
     )
     with installed(tmp_path / "project"):
         yield
-    forget_installed()
     robot_form.cache_clear()
 
 

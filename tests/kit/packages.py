@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli import verbs
+from dxlrun import installed_plugins
 
 Install = Callable[..., None]
 
@@ -26,10 +26,10 @@ def installing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Instal
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
         (info / "entry_points.txt").write_text(f"[dxlrun]\n{module}_entry = {module}\n")
-        verbs.packaged.cache_clear()
+        installed_plugins._read.cache_clear()
 
     yield install
-    verbs.packaged.cache_clear()
+    installed_plugins._read.cache_clear()
     for name in set(sys.modules) - modules:
         if str(folder) in str(getattr(sys.modules[name], "__file__", None)):
             del sys.modules[name]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from dxlrun.installed_plugins import distribution_name, installed_plugins
 
 if TYPE_CHECKING:
     from dxlrun.contract.hookspecs import Command
@@ -21,8 +22,8 @@ _BEHIND = "Arguments"
 def print_help() -> None:
     """Print the help, with the verbs of packages that did not come with dxlrun."""
     text = TEXT.read_text("utf-8")
-    foreign = {one.name for one in entry_points(group="dxlrun") if one.dist and one.dist.name != "dxlrun"}
-    if foreign:  # only then is the code of packages imported
+    publishers = {distribution_name(each.publisher) for each in installed_plugins()}
+    if publishers - {"dxlrun"}:  # only then is the code of packages imported
         from dxlrun.cli.verbs import packaged
 
         for command in packaged().values():

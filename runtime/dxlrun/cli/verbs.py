@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from itertools import chain
 from typing import TYPE_CHECKING
+
+from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 if TYPE_CHECKING:
     from dxlrun.contract.hookspecs import Command
@@ -111,16 +112,20 @@ def is_verb(word: str) -> bool:
     return re.fullmatch(r"[a-z][a-z0-9-]*", word) is not None
 
 
-@cache
 def packaged() -> Mapping[str, Command]:
     """Return the verbs that installed packages add; a verb of the core stays the core's.
 
     A package that cannot be asked adds none: `dxlrun plugins` says why.
     """
+    return _packaged(installed_plugins())
+
+
+@cache
+def _packaged(plugins: tuple[InstalledPlugin, ...]) -> Mapping[str, Command]:
     found: dict[str, Command] = {}
-    for point in sorted(entry_points(group="dxlrun"), key=lambda each: each.name):
+    for plugin in plugins:
         with suppress(Exception, SystemExit):  # foreign code: what it does on import is its fault alone
-            hook = getattr(point.load(), "dxlrun_commands", None)
+            hook = getattr(plugin.point.load(), "dxlrun_commands", None)
             for command in hook() if hook is not None else ():
                 found.setdefault(command.name, command)
     return {name: one for name, one in found.items() if not any(name in verbs for verbs in GROUPS.values())}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -43,6 +42,7 @@ from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Feature
+from dxlrun.installed_plugins import PHYSICS_GROUP, distribution_name, installed_plugins
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
@@ -256,20 +256,22 @@ def _used_features(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tupl
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:
     """Return the packages of the plug-ins whose features the robot file uses, with their distributions."""
-    used = [each for each in features if each.distribution]
-    if not used:
-        return {}
-    from dxlrun.log.identity import distribution_name  # not above: most robots use no such section
-
-    return {each.package.partition(".")[0]: distribution_name(each.distribution) for each in used}
+    return {
+        each.package.partition(".")[0]: distribution_name(each.distribution)
+        for each in features
+        if each.distribution
+    }
 
 
 def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:
     """Return the package that moves the bodies of simulated servos, with its distribution; {} without."""
     if not any(bus.port == SIMULATED for bus in buses):
         return {}
-    points = entry_points(group="dxlrun.physics", name=simulation.physics)
-    return {one.module.partition(".")[0]: one.dist.name for one in points if one.dist is not None}
+    return {
+        each.point.module.partition(".")[0]: distribution_name(each.publisher)
+        for each in installed_plugins(PHYSICS_GROUP)
+        if each.name == simulation.physics
+    }
 
 
 def _check_scheduler(file: RobotFile) -> None:

@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import pluggy
 
+from dxlrun.installed_plugins import GROUP
+
 if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
     from dxlrun.contract.controller import Controller
     from dxlrun.contract.sensor import Sensor
     from dxlrun.features.feature import Feature
 
-GROUP = "dxlrun"
 CONTRACT_VERSION = 4
 """Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
 references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 
 from dxlrun.features.feature import Feature, JointKey, S, Section
+from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
@@ -34,7 +34,7 @@ def stages(kind: type[S], features: Iterable[Feature]) -> Iterator[tuple[Feature
 
 def installed_features() -> tuple[Feature, ...]:
     """Return all features that a robot file may have: ours, then those of plug-ins by name."""
-    return _installed()[0]
+    return _installed(installed_plugins())[0]
 
 
 def find_installed(features: Iterable[Feature]) -> tuple[Feature, ...]:
@@ -43,24 +43,19 @@ def find_installed(features: Iterable[Feature]) -> tuple[Feature, ...]:
     return tuple(feature for feature in installed_features() if feature.name in names)
 
 
-def forget_installed() -> None:
-    """Look for installed features again when they are needed next."""
-    _installed.cache_clear()
-
-
 def broken_features() -> dict[str, str]:
     """Return the features of plug-ins that cannot be used, with the reason, by name."""
-    return _installed()[1]
+    return _installed(installed_plugins())[1]
 
 
 @cache
-def _installed() -> tuple[tuple[Feature, ...], dict[str, str]]:
+def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...], dict[str, str]]:
     found = {feature.name: feature for feature in FEATURES}
     broken: dict[str, str] = {}
-    for point in sorted(entry_points(group="dxlrun"), key=lambda each: each.name):
+    for plugin in plugins:
         features: list[Feature] = []
         with suppress(Exception, SystemExit):  # foreign code: `dxlrun plugins` says why it cannot be used
-            features += _features_of(point)
+            features += _features_of(plugin)
         for feature in features:
             try:
                 keys = feature.stage(Section), feature.stage(JointKey)
@@ -81,9 +76,8 @@ def _installed() -> tuple[tuple[Feature, ...], dict[str, str]]:
     return tuple(found.values()), broken
 
 
-def _features_of(point: EntryPoint) -> Iterator[Feature]:
+def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:
     """Yield the features of one plug-in; raises whatever its code raises."""
-    hook = getattr(point.load(), "dxlrun_features", None)
-    publisher = "" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+    hook = getattr(plugin.point.load(), "dxlrun_features", None)
     for feature in () if hook is None else hook():
-        yield replace(feature, distribution=publisher)
+        yield replace(feature, distribution=plugin.publisher)

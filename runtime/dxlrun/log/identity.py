@@ -15,6 +15,8 @@ from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 
+from dxlrun.installed_plugins import distribution_name
+
 IDENTITY_NAME = "identity"
 """The metadata record; docs/how-to/logs.md has its keys."""
 ROBOT, INCLUDED, MOTION, URDF, PLUGIN, RUNTIME = "robot", "included", "motion", "urdf", "plugin", "runtime"
@@ -78,11 +80,6 @@ def package_of(key: str) -> tuple[str, str]:
     """Return package and distribution of a key of a plug-in's file."""
     distribution, _, name = key.removeprefix(file_key(PLUGIN, "")).rpartition(" ")
     return name.partition("/")[0].removesuffix(".py"), distribution
-
-
-def distribution_name(publisher: str) -> str:
-    """Return the distribution of a publisher, `name version`, without the version."""
-    return publisher.rpartition(" ")[0] or publisher
 
 
 def changed_code(then: Mapping[str, str], publishers: Iterable[str]) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.description.robot import robot_form
 from dxlrun.errors import InputError
-from dxlrun.features import forget_installed
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
@@ -130,5 +129,4 @@ def installed(project: str | Path) -> Iterator[None]:
 
 def _look_for_packages() -> None:
     invalidate_caches()
-    forget_installed()
     robot_form.cache_clear()

@@ -52,4 +52,4 @@ if TYPE_CHECKING:
     from dxlwire.transaction import Program as Program
     from dxlwire.transaction import Reply as Reply
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

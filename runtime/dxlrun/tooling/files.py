@@ -33,4 +33,4 @@ if TYPE_CHECKING:
     from dxlrun.errors import Problem as Problem
     from dxlrun.errors import suggestion as suggestion
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -27,4 +27,4 @@ if TYPE_CHECKING:
     from dxlrun.output.html import section as section
     from dxlrun.output.html import table_element as table_element
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -40,4 +40,4 @@ if TYPE_CHECKING:
     from dxlrun.remote.sockets import SocketLink as SocketLink
     from dxlrun.remote.sockets import sockets as sockets
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

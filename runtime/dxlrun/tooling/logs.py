@@ -35,4 +35,4 @@ if TYPE_CHECKING:
     from dxlrun.log.stored import oldest_beyond as oldest_beyond
     from dxlrun.log.stored import stored_logs as stored_logs
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -46,4 +46,4 @@ if TYPE_CHECKING:
     from dxlrun.output.unblocked import leave_real_time as leave_real_time
     from dxlrun.output.unblocked import unblocked as unblocked
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

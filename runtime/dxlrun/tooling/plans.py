@@ -36,4 +36,4 @@ if TYPE_CHECKING:
     from dxlrun.plan.robot_plan import decode_plan as decode_plan
     from dxlrun.plan.robot_plan import from_json as from_json
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

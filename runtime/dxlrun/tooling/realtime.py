@@ -26,4 +26,4 @@ if TYPE_CHECKING:
     from dxlrun.control.realtime import may_lock as may_lock
     from dxlrun.control.realtime import missing_priority as missing_priority
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

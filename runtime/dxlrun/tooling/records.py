@@ -43,4 +43,4 @@ if TYPE_CHECKING:
     from dxlrun.plan.machine_load import MachineLoad as MachineLoad
     from dxlrun.plan.machine_load import SimulationWait as SimulationWait
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

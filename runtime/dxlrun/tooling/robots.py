@@ -40,4 +40,4 @@ if TYPE_CHECKING:
     from dxlrun.description.reading import read_robot as read_robot
     from dxlrun.description.robot import Recording as Recording
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -29,4 +29,4 @@ if TYPE_CHECKING:
     from dxlrun.run.virtual_run import VirtualRobot as VirtualRobot
     from dxlrun.testing.virtual_link import VirtualLink as VirtualLink
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -30,4 +30,4 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.tool_line import ToolLine as ToolLine
     from dxlrun.dynamixel.tools.tool_line import TunablePort as TunablePort
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -28,4 +28,4 @@ if TYPE_CHECKING:
     from dxlrun.messages.declared import declared_message as declared_message
     from dxlrun.messages.definition import MessageType as MessageType
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

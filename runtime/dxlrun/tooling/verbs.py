@@ -44,4 +44,4 @@ if TYPE_CHECKING:
     from dxlrun.description.units import duration as duration
     from dxlrun.errors import missing_extra as missing_extra
 else:
-    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
+    __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Never, TypeAlias, TypeVar, cast
@@ -21,7 +20,7 @@ from msgspec.structs import asdict
 from pydantic import ValidationError
 
 from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Mismatch, RobotModel
-from dxlrun.contract.hookspecs import CONTRACT_VERSION, GROUP, HookSpecs
+from dxlrun.contract.hookspecs import CONTRACT_VERSION, HookSpecs
 from dxlrun.contract.joint_controller import LAWS, JointController, laws_of
 from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.single_files import class_in_file, file_of, publisher_of
@@ -29,7 +28,7 @@ from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.features import broken_features
-from dxlrun.log.identity import distribution_name
+from dxlrun.installed_plugins import GROUP, InstalledPlugin, distribution_name, installed_plugins
 from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
 from dxlsim.motor_model import MotorModel
@@ -278,16 +277,16 @@ def load_plugins(
     raises passes through: the loop's process counts its threads there, and again when a controller was
     configured. Itself raises nothing.
     """
-    broken = dict(broken_features())
+    broken: dict[str, str] = {}
     loaded: list[LoadedPlugIn] = []
-    # the order must not depend on the file system: two runs load the same plug-ins in the same order
-    found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]
-    for publisher, name, entry_point in sorted(found_points, key=lambda each: each[:2]):
+    for plugin in sorted(installed_plugins(), key=lambda each: each.publisher):
+        named = f"{plugin.name} ({plugin.publisher})"
         try:
-            loaded.append(_load(entry_point, publisher))
+            loaded.append(_load(plugin))
         except PlugInError as error:
-            broken[name if name not in broken else f"{name} ({publisher})"] = str(error)
-        after_each(f"{name} ({publisher})")
+            broken[plugin.name if plugin.name not in broken else named] = str(error)
+        after_each(named)
+    broken = {**broken_features(), **broken}  # not above: it imports every plug-in
     controllers = _together("controller", [(one.distribution, one.controllers) for one in loaded], broken)
     sensors = _together("sensor", [(one.distribution, one.sensors) for one in loaded], broken)
     offers = Offers(controllers, broken, partial(_offer_of_file, files))
@@ -327,24 +326,18 @@ def _top(module: str) -> str:
     return module.partition(".")[0]
 
 
-def _publisher(entry_point: EntryPoint) -> str:
-    if entry_point.dist is None:
-        return "an unknown distribution"
-    about = entry_point.dist.metadata  # parsed at each access
-    return f"{about['Name']} {about['Version']}"
-
-
 def _one_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _load(entry_point: EntryPoint, publisher: str) -> LoadedPlugIn:
+def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
+    publisher = plugin.publisher
 
     def refuse(what: str, fix: str) -> PlugInError:
-        return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {fix}")
+        return PlugInError(f"plug-in {plugin.name} of {publisher} {what}; {fix}")
 
-    module = _asked(refuse, "cannot be imported", entry_point.load, "reinstall it, or ")
+    module = _asked(refuse, "cannot be imported", plugin.point.load, "reinstall it, or ")
     unmarked = [name for name, hook in _functions(module) if not hasattr(hook, f"{GROUP}_impl")]
     if unmarked:
         what = f"has a function {unmarked[0]} that is not marked as a hook"
@@ -352,7 +345,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> LoadedPlugIn:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
     # pluggy says which hook there is not, and which argument a hook does not have
-    _asked(refuse, "has a wrong hook", partial(manager.register, module, entry_point.name))
+    _asked(refuse, "has a wrong hook", partial(manager.register, module, plugin.name))
     _asked(refuse, "has a wrong hook", manager.check_pending)
     contracts, controllers, servo_models, sensors, commands = (
         _asked(refuse, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
@@ -367,9 +360,9 @@ def _load(entry_point: EntryPoint, publisher: str) -> LoadedPlugIn:
             "install a version of it that fits",
         )
     return LoadedPlugIn(
-        entry_point.name,
+        plugin.name,
         publisher,
-        _top(entry_point.module),
+        _top(plugin.point.module),
         contract,
         dict(_makes(controllers, "dxlrun_controllers", refuse, partial(_offer, publisher, refuse))),
         tuple(name for models in servo_models for name in _add_servo_models(models, refuse)),
