@@ -108,7 +108,7 @@ def command_cycle() -> Calls:
     os.close(box)
     os.close(answers)
     return _most_frequent(
-        [calls for calls in cycles if any(code.co_qualname == "Steering.take" for code in calls)]
+        [calls for calls in cycles if any(code.co_qualname == "Steering.execute_commands" for code in calls)]
     )
 
 

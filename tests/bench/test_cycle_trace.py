@@ -23,5 +23,10 @@ def test_a_steady_cycle_goes_through_few_functions_and_files():
 def test_a_cycle_that_takes_a_command_goes_through_few_functions():
     calls = cycle_trace.command_cycle()
     names = {code.co_qualname for code in calls}
-    assert {"Mailbox.take", "Steering.take", "Manager.hand", "_GroupController.on_command"} <= names
+    assert {
+        "Mailbox.take",
+        "Steering.execute_commands",
+        "Manager.dispatch_command",
+        "_GroupController.on_command",
+    } <= names
     assert len(calls) <= MOST_OF_COMMAND

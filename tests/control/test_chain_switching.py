@@ -322,10 +322,10 @@ def test_a_fallback_of_a_lower_end_that_fails_as_it_is_taken_over_comes_after_al
     story.controller("beside", joints=("j2",), **OFF).controller("greedy", **OFF)
 
     def fails_to_follow():
-        def follow(time_ns):
+        def follow():
             raise ControllerFault("controller lower raised in on_cancel")
 
-        story.manager._named["lower"].follow = follow
+        story.manager._named["lower"].follow_upper = follow
 
     story.run(8, {3: [fails_to_follow, story.switches(["upper", "beside"])]})
     story.ends("beside", reason="fault")

@@ -267,7 +267,7 @@ def test_a_command_for_a_controller_that_is_not_active_ends_no_loop_but_is_its_f
     robot.script("one").script("asleep", active=False).build()
     manager, asleep = robot.manager, robot.manager._named["asleep"]
     assert (
-        robot.run(3, {1: lambda: manager._attempt(asleep, 0, asleep.command, "go", np.zeros(1), 0)}).cycles
+        robot.run(3, {1: lambda: manager._attempt(asleep, asleep.give_command, "go", np.zeros(1))}).cycles
         == 3
     )
     fault = ("asleep", "controller asleep is inactive, where a command cannot happen")

@@ -392,10 +392,10 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again()
     robot = Left(fallback="extra")
     manager, extra = robot.build().manager, plan_of("extra", fallback="left", **LEFT)
     assert manager.load(extra) == 1
-    assert manager.switching.switch(("extra",), (), 0) is None
+    assert manager.switching.switch_controllers(("extra",), ()) is None
     for failed, stands_in in (("extra", "left"), ("left", "extra")):
         robot.breaks(failed)()
-        manager.update(0, 0)
+        manager.update(0)
         assert manager.active == (stands_in,)
         if stands_in == "left":
             assert manager.unload("extra") is None

@@ -42,7 +42,7 @@ class Anchoring:
         self._coasts = np.zeros(len(self._names), dtype=np.bool_)
         """Joints that have not stood yet in the pause."""
 
-    def anchor_given(self, time_ns: int) -> None:
+    def anchor_given(self) -> None:
         """Anchor the joints that were given torque, and let their servos get goals; after a read.
 
         One whose reply is missing waits for it: it is not known where the joint is.
@@ -50,7 +50,7 @@ class Anchoring:
         states = self._record.states
         given = (states.torque == Torque.GIVEN) & states.valid
         if given.any():
-            self._anchor(given, "regained torque", time_ns)
+            self._anchor(given, "regained torque")
             self._hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def begin_pause(self) -> None:
@@ -68,15 +68,15 @@ class Anchoring:
         self._coasts &= np.abs(states.velocity) > self._still
         np.copyto(self._paused_at, states.position, where=self._coasts)
 
-    def end_pause(self, time_ns: int) -> None:
+    def end_pause(self) -> None:
         """Anchor the joints that do not hold a position and were moved in the pause."""
         states = self._record.states
         moved = ~np.isin(states.mode, _HOLDING) & (np.abs(states.position - self._paused_at) > self._moved)
         if moved.any():
-            self._anchor(moved, "moved in the pause", time_ns)
+            self._anchor(moved, "moved in the pause")
 
-    def _anchor(self, rows: NDArray[np.bool_], why: str, time_ns: int) -> None:
+    def _anchor(self, rows: NDArray[np.bool_], why: str) -> None:
         names = [self._names[row] for row in np.flatnonzero(rows).tolist()]
         self._gate.anchor(rows)
         self._paused_at[rows] = self._record.states.position[rows]
-        self._switching.restart(names, why, time_ns)
+        self._switching.restart_controllers(names, why)

@@ -11,6 +11,7 @@ from dxlrun.channels.commands import CommandSink, Inbox, NoCommands, NoInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventSink
 from dxlrun.contract.hardware import Hardware
+from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlwire.clock import Clock
 
@@ -75,3 +76,8 @@ class ControlContext:
     inbox: Inbox = field(default_factory=NoInbox)
     """Commands of clients, and the way of their answers."""
     supervision: Supervision = field(default_factory=Unsupervised)
+    schedule: Schedule = field(init=False)
+    """When cycles are due, their period, and the controllers' time."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "schedule", schedule_of(self.plan))

@@ -51,9 +51,9 @@ class Halt:
         self._began_ns = self._still_ns = 0
         self._before = b""
 
-    def begin(self, number: int, time_ns: int) -> Refusal | Waiting:
+    def halt_joints(self, number: int) -> Refusal | Waiting:
         """Deactivate the controllers, upper ends of chains first; the joints are watched from now on."""
-        refusal = self._switching.switch((), self._switching.commanding(self._joints), time_ns)
+        refusal = self._switching.switch_controllers((), self._switching.commanding(self._joints))
         if isinstance(refusal, Refusal):
             return refusal
         self.waiting.append(number)

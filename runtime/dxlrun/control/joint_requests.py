@@ -46,8 +46,8 @@ class JointRequests:
         self._answer = answer
         self._pending: dict[int, _Pending] = {}
 
-    def execute(
-        self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading, time_ns: int
+    def execute_request(
+        self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading
     ) -> Refusal | None:
         """Execute a request by its command's number; None: it is answered later.
 
@@ -55,9 +55,9 @@ class JointRequests:
         """
         match request:
             case TorqueRequest():
-                return self._torque(number, request, time_ns)
+                return self._torque(number, request)
             case RebootRequest():
-                return self._reboot(number, request, time_ns)
+                return self._reboot(number, request)
         row = request.row
         if row is None:
             rows = self._known((request.joint,))
@@ -72,7 +72,7 @@ class JointRequests:
             self._hardware.read_register(row, request.item, done)
         return None
 
-    def _torque(self, number: int, request: TorqueRequest, time_ns: int) -> Refusal | None:
+    def _torque(self, number: int, request: TorqueRequest) -> Refusal | None:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
@@ -80,9 +80,9 @@ class JointRequests:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
             names = self._switching.commanding(self._limp(rows)) if request.release else ()
-            released = self._release(rows, names, request.release, time_ns)
+            released = self._release(rows, names, request.release)
         else:
-            released = self._release(rows, self._switching.stopped_by(rows), request.release, time_ns)
+            released = self._release(rows, self._switching.stopped_by(rows), request.release)
         if isinstance(released, Refusal):
             return released
         if request.on:
@@ -93,12 +93,12 @@ class JointRequests:
             self._hardware.switch_torque(row, request.on, done)
         return None
 
-    def _reboot(self, number: int, request: RebootRequest, time_ns: int) -> Refusal | None:
+    def _reboot(self, number: int, request: RebootRequest) -> Refusal | None:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
         names = self._switching.commanding(rows)
-        released = self._refuse_lost(rows) or self._release(rows, names, request.release, time_ns)
+        released = self._refuse_lost(rows) or self._release(rows, names, request.release)
         if isinstance(released, Refusal):
             return released
         for row, done in self._await(number, Code.NOT_REBOOTED, rows, released):
@@ -159,13 +159,13 @@ class JointRequests:
         return {joint: row for joint, row in rows.items() if torque[row] in LIMP}
 
     def _release(
-        self, rows: dict[str, int], names: tuple[str, ...], release: bool, time_ns: int
+        self, rows: dict[str, int], names: tuple[str, ...], release: bool
     ) -> tuple[str, ...] | Refusal:
         """Deactivate controllers that command joints and return them, or refuse because of them."""
         if not names:
             return ()
         if release:
-            answer = self._switching.switch((), names, time_ns)
+            answer = self._switching.switch_controllers((), names)
             return answer if isinstance(answer, Refusal) else names
         joints = tuple(
             joint for joint in rows if not set(names).isdisjoint(self._switching.commanding((joint,)))

@@ -21,7 +21,6 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.schedule import schedule_of
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
@@ -100,11 +99,9 @@ class Loop:
         self.plan, self.record = context.plan, context.record
         self.clock, self.hardware = context.clock, context.hardware
         self._stop, self._beat = context.supervision.stop, context.supervision.beat
-        self.schedule = schedule_of(context.plan)
+        self.schedule = context.schedule
         self._overruns = Overruns(context.plan.overrun, overrun_hooks, context.events)
         self._paused_cycles = 0
-        self._time_ns = 0
-        """The controllers' time in the last cycle."""
         self._woken_ns = 0
         self._cycles = 0
         joints = len(context.plan.joints)
@@ -115,7 +112,7 @@ class Loop:
         self._late = False
         self._actions = PolicyActions(context, manager, gate)
         self._monitors = build_monitors(context.plan, context.record, self._actions)
-        self.steering = Steering(context, manager, gate, self.schedule, self._actions)
+        self.steering = Steering(context, manager, gate, self._actions)
         self._anchoring = self.steering.anchoring
         self._motion: SafeMotion | None = None
         self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
@@ -134,8 +131,8 @@ class Loop:
             reason, detail = "fault", str(error)
         finally:
             # behind the last cycle of a pause, the period until the next one is left out already
-            now_ns = self.clock.now_ns()
-            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(now_ns)))
+            self.schedule.end_cycles(self.clock.now_ns())
+            self.manager.deactivate()
             self.steering.end()
         if reason != "fault" and self.manager.switching.fault is not None:
             reason, detail = "fault", self.manager.switching.fault
@@ -162,7 +159,7 @@ class Loop:
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()
-        self.manager.switching.start(0)
+        self.manager.switching.start_controllers()
 
     def _take_servo_limits(self) -> None:
         self._servo_limits = self.hardware.servo_limits
@@ -190,7 +187,7 @@ class Loop:
         cycle, deadline_ns = schedule.cycle, schedule.due_ns
         self.hardware.idle(deadline_ns, schedule.grid_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
-        time_ns = schedule.begin(woken_ns)
+        behind_ns = schedule.begin_cycle(woken_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
@@ -213,14 +210,14 @@ class Loop:
         if record.states.mode.tobytes() != self.gate.modes:
             self.gate.enter_modes()
         if Torque.GIVEN in record.states.torque.tobytes():
-            self._anchoring.anchor_given(max(self._time_ns, time_ns))
+            self._anchoring.anchor_given()
         valid = record.states.valid
         all_valid = valid.tobytes() == self._all_valid
         if self._motion:
             steering.refuse()
             self._motion.command()
         else:
-            self._update(cycle, time_ns)
+            self._update(cycle, behind_ns)
         self.gate.apply(dt_ns)
         updated_ns = now_ns()
         self.hardware.write()
@@ -231,21 +228,21 @@ class Loop:
             self._invalid += ~valid & (record.states.torque != Torque.REBOOTING)
         self._beat()
 
-    def _update(self, cycle: int, time_ns: int) -> None:
+    def _update(self, cycle: int, behind_ns: int) -> None:
         """Let the monitors look, take commands, and update the controllers unless the loop is paused."""
         record, steering, manager = self.record, self.steering, self.manager
-        # it never goes back: a cycle that was late when a pause began catches up
-        self.schedule.grid_ns += max(0, self._time_ns - time_ns)
-        self._time_ns = max(self._time_ns, time_ns)
+        if behind_ns > 0:  # a cycle that was late when a pause began catches up
+            self.schedule.grid_ns += behind_ns
+        time_ns = self.schedule.time_ns
         for monitor in self._monitors:
-            monitor.check(self._time_ns)
+            monitor.check(time_ns)
         commands = steering.inbox.take()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
-            record.command_count = steering.take(commands, self._time_ns)
+            record.command_count = steering.execute_commands(commands)
         if steering.paused_until_ns:
             record.commands.clear()
         else:
-            manager.update(cycle - self._paused_cycles, self._time_ns)
+            manager.update(cycle - self._paused_cycles)
         if manager.switching.ended:
             steering.answer_late()
 
@@ -256,7 +253,7 @@ class Loop:
         if not motion.over:
             self._log_policy(name, policy.text)
             if self.steering.paused_until_ns:
-                self.steering.resume(self._time_ns)
+                self.steering.resume()
             self._motion = motion
             try:
                 while not motion.over:

@@ -33,21 +33,31 @@ class Schedule:
     """When `cycle` is due, if all before it begin on time."""
     grid_ns: int = 0
     """The controllers' time in `cycle`, if that begins on time: since the first deadline, pauses left out."""
+    time_ns: int = 0
+    """The controllers' time in the cycle that runs; it never goes back."""
 
     def start(self, now_ns: int) -> None:
         """Make the first deadline one period from now."""
-        self.cycle = self.grid_ns = 0
+        self.cycle = self.grid_ns = self.time_ns = 0
         self.due_ns = now_ns + self.period_ns
 
-    def begin(self, woken_ns: int) -> int:
-        """Begin the cycle that is due; return the controllers' time in it."""
+    def begin_cycle(self, woken_ns: int) -> int:
+        """Begin the cycle that is due; return by how much its time would go back.
+
+        That is more than 0 after a pause that a cycle began late.
+        """
         if self.sequential:
             self.due_ns = woken_ns
-        return self.grid_ns + woken_ns - self.due_ns
+        time_ns = self.grid_ns + woken_ns - self.due_ns
+        behind_ns = self.time_ns - time_ns
+        if behind_ns < 0:
+            self.time_ns = time_ns
+        return behind_ns
 
-    def time_ns(self, now_ns: int) -> int:
-        """Return the controllers' time."""
-        return self.grid_ns if self.sequential else self.grid_ns + now_ns - self.due_ns
+    def end_cycles(self, now_ns: int) -> None:
+        """Let the controllers' time pass until now, after the last cycle."""
+        passed_ns = 0 if self.sequential else now_ns - self.due_ns
+        self.time_ns = max(self.time_ns, self.grid_ns + passed_ns)
 
     def advance(self, cycle: int) -> None:
         """Go to a later cycle."""

@@ -33,7 +33,6 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.monitors.policy_actions import PolicyActions
-from dxlrun.control.schedule import Schedule
 from dxlrun.plan.loop_plan import ControllerPlan
 
 MOST_RATE = 100_000.0
@@ -89,7 +88,6 @@ class Steering:
         context: ControlContext,
         manager: Manager,
         gate: Gate,
-        schedule: Schedule,
         actions: PolicyActions,
     ) -> None:
         self.inbox = context.inbox
@@ -105,13 +103,13 @@ class Steering:
         self._supervision = context.supervision
         self._manager = manager
         self._gate = gate
-        self._schedule = schedule
+        self._schedule = context.schedule
         self._actions = actions
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.inbox.answer(number, answer)
 
-    def take(self, commands: Sequence[Command], time_ns: int) -> int:
+    def execute_commands(self, commands: Sequence[Command]) -> int:
         """Execute what has come, and end streams and pauses whose lease ran out; called where anything may.
 
         Returns the number of commands for controllers.
@@ -138,9 +136,9 @@ class Steering:
             )
             answer: Answer | None
             if for_loop := command.controller == LOOP:
-                answer = self._for_loop(command, time_ns)
+                answer = self._for_loop(command)
             else:
-                found = manager.hand(command, time_ns)
+                found = manager.dispatch_command(command)
                 goals = (found,) if isinstance(found, int) and found else ()
                 answer = found if isinstance(found, Refusal) else Done(record.cycle, goals=goals)
             if for_loop or isinstance(answer, Refusal):
@@ -151,15 +149,15 @@ class Steering:
             if answer is not None:
                 self.inbox.answer(command.number, answer)
         if 0 < self.paused_until_ns < record.woken_ns:
-            self.resume(time_ns)
+            self.resume()
             what = "its controllers are deactivated, and the joints are held"
             if not (ends := self._stale("no client ended the pause")):
                 commanding = manager.switching.commanding(record.layout.joints)
-                manager.switching.switch((), commanding, time_ns)
+                manager.switching.switch_controllers((), commanding)
             self._log_stale("loop", f"no client ended the pause; {ends or what}")
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
-                manager.hold(name, time_ns)
+                manager.hold_controller(name)
             self._log_stale(name, f"the stream of commands ended; {ends or 'its joints are held'}")
         return count
 
@@ -219,12 +217,12 @@ class Steering:
         self._set_cycle_limit()
         return None
 
-    def resume(self, time_ns: int) -> Refusal | None:
+    def resume(self) -> Refusal | None:
         """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
         if not self.paused:
             return Refusal(Code.NOT_PAUSED)
         self.paused_until_ns = 0
-        self.anchoring.end_pause(time_ns)
+        self.anchoring.end_pause()
         self._gate.ease_in()
         self._set_cycle_limit()
         return None
@@ -245,7 +243,7 @@ class Steering:
 
     # Commands
 
-    def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
+    def _for_loop(self, command: Command) -> Answer | None:
         """Execute a command for the loop itself; None: it is answered later."""
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
@@ -261,26 +259,24 @@ class Steering:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             return Refusal(Code.INVALID, {"problem": f"the data of {kind} do not fit: {error}"})
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
-            return self.joints.execute(command.number, request, time_ns)
-        return self._execute(command, request, numbers, time_ns) or Done(self._record.cycle)
+            return self.joints.execute_request(command.number, request)
+        return self._execute(command, request, numbers) or Done(self._record.cycle)
 
-    def _execute(
-        self, command: Command, request: msgspec.Struct | None, numbers: bytes, time_ns: int
-    ) -> Answer | None:
+    def _execute(self, command: Command, request: msgspec.Struct | None, numbers: bytes) -> Answer | None:
         """Execute a command for the loop; None: it is done, and there is nothing to say about it."""
         manager = self._manager
         found: Answer | None = None
         match request:
             case Switch():
                 activate, deactivate = request.activate, request.deactivate
-                found = manager.switching.switch(activate, deactivate, time_ns, command.number)
+                found = manager.switching.switch_controllers(activate, deactivate, command.number)
             case Cancel():
-                found = manager.cancel(request.goal, request.controller, time_ns)
+                found = manager.cancel_goal(request.goal, request.controller)
             case Play():
-                goals = manager.play(request.parts, numbers, command.origin, time_ns)
+                goals = manager.play_motion(request.parts, numbers, command.origin)
                 found = goals if isinstance(goals, Refusal) else Done(self._record.cycle, goals=goals)
             case Parameters():
-                found = manager.change_parameters(request.controller, request.values, time_ns)
+                found = manager.change_parameters(request.controller, request.values)
             case Rate():
                 found = self.change_rate(request.rate)
             case ControllerPlan():
@@ -292,11 +288,11 @@ class Steering:
             case NewCommander():
                 pass
             case _ if command.kind == "halt":
-                found = self.halt.begin(command.number, time_ns)
+                found = self.halt.halt_joints(command.number)
             case _ if command.kind == "pause":
                 found = self.pause()
             case _ if command.kind == "resume":
-                found = self.resume(time_ns)
+                found = self.resume()
             case _:
                 self._supervision.stop.request()
         return found

@@ -107,11 +107,8 @@ class Managed:
     `place` is that of the controller: its bit in the record's masks.
     """
 
-    def __init__(self, plan: ControllerPlan, place: int, context: ControllersContext, period_ns: int) -> None:
-        """`period_ns` is the loop's.
-
-        Raises ControllerFault for a reference, or something that it reads, which is not there.
-        """
+    def __init__(self, plan: ControllerPlan, place: int, context: ControllersContext) -> None:
+        """Raises ControllerFault for a reference, or something that it reads, which is not there."""
         record, joints = context.run.record, context.run.plan.joints
         self.plan = plan
         self.place = place
@@ -139,6 +136,7 @@ class Managed:
         """Rows of its joints in the robot's arrays."""
         self._record = record
         self._shared = context
+        self._schedule = context.run.schedule
         self._call: Callable[..., None] = partial(context.activity.call, place)
         self._inputs = Inputs(plan, record, self.rows)
         self._outputs = Outputs(plan, record, self.rows)
@@ -146,7 +144,7 @@ class Managed:
         """The states that it provides; None: it provides none."""
         self._topics = context.topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
-        self._nominal_ns = plan.every * period_ns
+        self._nominal_ns = plan.every * context.run.schedule.period_ns
         self._last_ns = -1
         self._context = self._new_context([joints[row] for row in self.rows])
 
@@ -228,32 +226,31 @@ class Managed:
         """True when it is active."""
         return self.state is State.ACTIVE
 
-    def activate(self, time_ns: int, *, restarts: bool = False) -> None:
+    def activate(self, *, restarts: bool = False) -> None:
         """Let the controller take over its joints, or begin again with them. Raises ControllerFault."""
         if restarts:
-            self._call_without_commands(ControllerMethod.ON_RESTART, self.controller.on_restart, time_ns)
+            self._call_without_commands(ControllerMethod.ON_RESTART, self.controller.on_restart)
         else:
-            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
+            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate)
         self._last_ns = -1
         self.due_cycle = self.until_ns = 0
         self.on(Event.ENTER)
 
-    def _call_without_commands(
-        self, method: ControllerMethod, call: Callable[[int], None], time_ns: int
-    ) -> None:
+    def _call_without_commands(self, method: ControllerMethod, call: Callable[[int], None]) -> None:
         """Call a method with the current states and no commands. Raises ControllerFault."""
         self.withheld = False
         self._outputs.forget()
         self._inputs.gather()
-        self._call(method, "", call, time_ns)
+        self._call(method, "", call, self._schedule.time_ns)
 
-    def deactivate(self, time_ns: int, why: str = "") -> None:
+    def deactivate(self, why: str = "") -> None:
         """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
 
         `why` its goal is aborted; empty: because it is deactivated.
         """
         self.release(Event.LEAVE, why or f"{self.plan.name} was deactivated")
-        self._call(ControllerMethod.ON_DEACTIVATE, "", self.controller.on_deactivate, time_ns)
+        on_deactivate, time_ns = self.controller.on_deactivate, self._schedule.time_ns
+        self._call(ControllerMethod.ON_DEACTIVATE, "", on_deactivate, time_ns)
 
     def release(self, event: Event, why: str) -> None:
         """Take its commands out of the robot's, by an event after which it has none: the gate holds what it
@@ -264,20 +261,21 @@ class Managed:
 
     # In a cycle
 
-    def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+    def give_command(self, kind: str, data: NDArray[np.float64]) -> None:
         """Hand over a prepared command, which never runs out. Raises ControllerFault."""
-        self._begin_command(time_ns)
+        self._begin_command()
         if self._inputs.gathered:
             self._inputs.gather()
-        self._call(ControllerMethod.ON_COMMAND, kind, self.controller.on_command, kind, data, time_ns)
+        on_command, time_ns = self.controller.on_command, self._schedule.time_ns
+        self._call(ControllerMethod.ON_COMMAND, kind, on_command, kind, data, time_ns)
 
-    def _begin_command(self, time_ns: int) -> None:
+    def _begin_command(self) -> None:
         """End the stream of before; activate the controller again if its commands were withheld, as they are
         of another time. Raises ControllerFault."""
         self.on(Event.COMMAND)
         self.until_ns = 0
         if self.withheld:
-            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate, time_ns)
+            self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate)
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -295,15 +293,15 @@ class Managed:
         """Have a goal that the runtime leads for it, by plain commands."""
         self._goal = goal
 
-    def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64], time_ns: int) -> None:
+    def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64]) -> None:
         """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
         self._goal = goal
-        self._begin_command(time_ns)
+        self._begin_command()
         self._inputs.gather()
-        on_goal = self.controller.on_goal
+        on_goal, time_ns = self.controller.on_goal, self._schedule.time_ns
         self._call(ControllerMethod.ON_GOAL, goal.kind, on_goal, goal, data, time_ns)
 
-    def cancel(self, goal: RunningGoal, time_ns: int) -> None:
+    def cancel_goal(self, goal: RunningGoal) -> None:
         """Let the controller bring its goal to an end. Raises ControllerFault.
 
         One that the runtime leads ends at once: the controller keeps what it was given last.
@@ -313,17 +311,19 @@ class Managed:
             return
         goal.cancelling, judged = True, goal.is_judged
         self._inputs.gather()
-        self._call(ControllerMethod.ON_CANCEL, "", self.controller.on_cancel, goal, time_ns)
+        on_cancel, time_ns = self.controller.on_cancel, self._schedule.time_ns
+        self._call(ControllerMethod.ON_CANCEL, "", on_cancel, goal, time_ns)
         if judged:  # its controller has handed it over, and does not end it
             goal.end(Outcome.CANCELLED, "stopped at its end")
 
-    def change_parameters(self, values: LiveValues, time_ns: int) -> None:
+    def change_parameters(self, values: LiveValues) -> None:
         """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name
         that is none of a live one: then nothing is changed."""
         self.controller.parameters = with_values(self.controller.parameters, values)
-        self._call(ControllerMethod.ON_PARAMETERS, "", self.controller.on_parameters, time_ns)
+        on_parameters, time_ns = self.controller.on_parameters, self._schedule.time_ns
+        self._call(ControllerMethod.ON_PARAMETERS, "", on_parameters, time_ns)
 
-    def hold(self, time_ns: int) -> None:
+    def hold_joints(self) -> None:
         """Hold its joints: the stream of commands ended. It is updated all the same. Raises ControllerFault.
 
         A controller without an `on_hold` of its own may go on with the last command, so its commands are
@@ -335,13 +335,13 @@ class Managed:
             self.withheld = True
             self._outputs.withdraw()
         else:
-            self._call_without_commands(ControllerMethod.ON_HOLD, self.controller.on_hold, time_ns)
+            self._call_without_commands(ControllerMethod.ON_HOLD, self.controller.on_hold)
 
-    def follow(self, time_ns: int) -> None:
+    def follow_upper(self) -> None:
         """End what clients had it do: one above commands its references now. Raises ControllerFault."""
-        self._begin_command(time_ns)
+        self._begin_command()
         if (goal := self.goal) is not None and not goal.cancelling:
-            self.cancel(goal, time_ns)
+            self.cancel_goal(goal)
 
     def hold_lost(self, lost: Collection[int], *, below: bool) -> bool:
         """Hold its joints while it commands a lost one, of these rows, or a controller below it is held.
@@ -375,8 +375,9 @@ class Managed:
         self._nominal_ns = self._divider * period_ns
         self.due_cycle = 0  # counted anew
 
-    def update(self, cycle: int, time_ns: int) -> None:
+    def update(self, cycle: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
+        time_ns = self._schedule.time_ns
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
         self.due_cycle = (cycle // self._divider + 1) * self._divider

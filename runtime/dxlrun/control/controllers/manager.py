@@ -73,7 +73,7 @@ class Manager:
             keeping=self._keeping,
             requests=self._requests,
         )
-        self._period_ns = context.plan.period_ns
+        self._schedule = context.schedule
         self._managed: tuple[Managed, ...] = ()
         """By their places; those that were unloaded keep theirs until another one gets it."""
         self._named = self.switching.named
@@ -108,62 +108,62 @@ class Manager:
 
     # In a cycle
 
-    def update(self, cycle: int, time_ns: int) -> None:
+    def update(self, cycle: int) -> None:
         """Hand over the commands that are due and update every active controller that is due.
 
-        `cycle` counts the periods since the first deadline, `time_ns` is the controllers' time; pauses are in
-        neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
-        held by the gate; the others are updated all the same.
+        `cycle` counts the periods since the first deadline, without pauses. A controller that breaks its
+        contract is ended, its fallback takes over, or its joints are held by the gate; the others are updated
+        all the same.
         """
-        self._goals.time_ns = time_ns
-        self._dispatch_due(time_ns)
+        self._goals.time_ns = self._schedule.time_ns
+        self._dispatch_due()
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         for left in range(len(self._order), -1, -1):  # one that entered by a request may have one of its own
             for managed in self._order:
                 if managed.state is State.ACTIVE and cycle >= managed.due_cycle:
                     begin_ns = now_ns()
                     try:
-                        managed.update(cycle, time_ns)
+                        managed.update(cycle)
                     except ControllerFault as fault:
-                        self.switching.end(managed, fault, time_ns)
+                        self.switching.end_controller(managed, fault)
                     if managed.place < len(took_ns):
                         took_ns[managed.place] = now_ns() - begin_ns
             if not (left and self._requests):
                 break
-            self._execute_requests(time_ns)
+            self._execute_requests()
         if self._lost:
             self._record.commands.values[:, self._lost] = np.nan
         if self._keeping.controllers:
             self._keeping.step()
 
-    def _dispatch_due(self, time_ns: int) -> None:
+    def _dispatch_due(self) -> None:
         """Activate what waited for modes, hand over what is due, and judge goals, before the updates."""
         if self.switching.groups:
-            self.switching.admit(time_ns)
+            self.switching.admit_groups()
         if self._next < len(self._plan.commands):
-            self._hand_over(time_ns)
+            self._hand_over()
         if self._goals.running:
             self._goals.judge_running()
         if self._motions:
-            self._play_on(time_ns)
+            self._play_on()
 
-    def _execute_requests(self, time_ns: int) -> None:
+    def _execute_requests(self) -> None:
         """Let controllers take over as others have requested it; endings of the run behind that."""
         requests = sorted(self._requests, key=lambda request: not request.takes_over)
         self._requests.clear()
         for request in requests:
             requester = self._named.get(request.requester)
             if requester is not None and requester.active:
-                self.switching.execute(request, time_ns)
+                self.switching.execute_request(request)
 
-    def deactivate(self, time_ns: int) -> None:
+    def deactivate(self) -> None:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`.
 
         Goals that are neither reached nor missed by now end as aborted, because the run ended.
         """
-        self._goals.time_ns = time_ns
+        self._goals.time_ns = self._schedule.time_ns
         self._goals.judge_running()
-        self.switching.deactivate_all(time_ns)
+        self.switching.deactivate_all()
         self._keeping.finish()
 
     # Commands
@@ -173,7 +173,7 @@ class Manager:
         """True while the motion of a goal has ended and its joints may still settle."""
         return self._goals.are_settling
 
-    def hand(self, command: Command, time_ns: int, pursued: RunningGoal | None = None) -> int | Refusal:
+    def dispatch_command(self, command: Command, pursued: RunningGoal | None = None) -> int | Refusal:
         """Hand a prepared command to its controller; return the number of the goal that it is, else 0.
 
         `pursued`: the goal that the runtime pursues with this command; another one is preempted.
@@ -181,7 +181,7 @@ class Manager:
         With a lease it runs out unless another one follows (see `stale`). Of a stream, only the first one has
         an event.
         """
-        self._goals.time_ns = time_ns
+        self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
             problem = f"{len(command.data)} bytes are no array of numbers"
             return Refusal(Code.INVALID, {"problem": problem})
@@ -192,16 +192,16 @@ class Manager:
         if kind in managed.controller.Goals:
             if command.lease_ns:
                 return Refusal(Code.GOAL_STREAMED, {"controller": managed.plan.name, "kind": kind})
-            return self._begin_goal(managed, kind, data, command.origin, time_ns)
+            return self._begin_goal(managed, kind, data, command.origin)
         goal = managed.goal
         led = goal is not None and (goal.is_judged or managed.plan.name in self._motions)
         if goal is not None and led and goal is not pursued:
             goal.end(Outcome.PREEMPTED, "another command took its place")
         streaming = command.lease_ns and managed.until_ns
         try:
-            managed.command(kind, data, time_ns)
+            managed.give_command(kind, data)
         except ControllerFault as fault:
-            return self._end(managed, fault, time_ns)
+            return self._end(managed, fault)
         if command.lease_ns:
             managed.until_ns = self._record.woken_ns + command.lease_ns
             self.streams[managed.place] = managed
@@ -211,14 +211,13 @@ class Manager:
             )
         return 0
 
-    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> Refusal:
-        self.switching.end(managed, fault, time_ns)
+    def _end(self, managed: Managed, fault: ControllerFault) -> Refusal:
+        self.switching.end_controller(managed, fault)
         return fault_of(managed, str(fault))
 
     def _attempt(
         self,
         managed: Managed,
-        time_ns: int,
         call: Callable[P, None],
         *arguments: P.args,
         **named: P.kwargs,
@@ -227,7 +226,7 @@ class Manager:
         try:
             call(*arguments, **named)
         except ControllerFault as fault:
-            return self._end(managed, fault, time_ns)
+            return self._end(managed, fault)
         return None
 
     def _known(self, controller: str) -> Managed | Refusal:
@@ -247,17 +246,17 @@ class Manager:
                 return _commanded_by(controller, upper.plan.name, hint)
         return managed
 
-    def _hand_over(self, time_ns: int) -> None:
+    def _hand_over(self) -> None:
         """Give each command of the plan whose time has come to its controller, and count those taken."""
         commands, record = self._plan.commands, self._record
-        while self._next < len(commands) and commands[self._next].at_ns <= time_ns:
+        while self._next < len(commands) and commands[self._next].at_ns <= self._schedule.time_ns:
             place, command = self._next, commands[self._next]
             name, kind, origin = command.controller, command.kind, command.origin
             taken = TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b"")
             self._command_log.take(taken)
             self._next += 1
             pursued = self._pursue(command)
-            answer = self.hand(Command(place, name, kind, command.data, origin), time_ns, pursued)
+            answer = self.dispatch_command(Command(place, name, kind, command.data, origin), pursued)
             if isinstance(answer, Refusal):
                 text = f"{kind} from {origin} refused: {answer.text}"
                 self.switching.report_refusal(name, text, CommandOutcome(kind, origin, answer))
@@ -275,13 +274,13 @@ class Manager:
             self._motions[name] = PlayedMotion(goal, part, (), 0)
         return self._pursued.get(name)
 
-    def change_parameters(self, controller: str, values: LiveValues, time_ns: int) -> Refusal | None:
+    def change_parameters(self, controller: str, values: LiveValues) -> Refusal | None:
         """Replace live parameters of a controller, active or not, all of them together."""
         managed = self._known(controller)
         if isinstance(managed, Refusal):
             return managed
         try:
-            refusal = self._attempt(managed, time_ns, managed.change_parameters, values, time_ns)
+            refusal = self._attempt(managed, managed.change_parameters, values)
         except ValueError as error:
             return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
         if refusal is None:
@@ -298,10 +297,10 @@ class Manager:
             del self.streams[managed.place]
         return [managed.plan.name for managed in sorted(stale, key=lambda one: one.place)]
 
-    def hold(self, controller: str, time_ns: int) -> None:
+    def hold_controller(self, controller: str) -> None:
         """Let a controller hold its joints until it gets another command; it stays active."""
         if (managed := self._named.get(controller)) is not None:
-            self._attempt(managed, time_ns, managed.hold, time_ns)
+            self._attempt(managed, managed.hold_joints)
 
     def hold_lost(self, lost: Collection[int]) -> tuple[int, ...]:
         """Hold the controllers that command a lost joint, of these rows, and those above them.
@@ -336,12 +335,12 @@ class Manager:
         return self._goals.accept(managed.plan.name, kind, origin)
 
     def _begin_goal(
-        self, managed: Managed, kind: str, data: NDArray[np.float64], origin: str, time_ns: int
+        self, managed: Managed, kind: str, data: NDArray[np.float64], origin: str
     ) -> int | Refusal:
         goal = self._accept(managed, kind, origin)
-        return self._attempt(managed, time_ns, managed.begin_goal, goal, data, time_ns) or goal.number
+        return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
 
-    def cancel(self, number: int, controller: str, time_ns: int) -> Refusal | None:
+    def cancel_goal(self, number: int, controller: str) -> Refusal | None:
         """Let a controller end a goal, by the goal's number, or the one that a controller has."""
         if controller:
             managed = self._known(controller)
@@ -355,16 +354,16 @@ class Manager:
         if goal.cancelling:
             return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
         managed = self._named[goal.controller]
-        return self._attempt(managed, time_ns, managed.cancel, goal, time_ns)
+        return self._attempt(managed, managed.cancel_goal, goal)
 
-    def play(
-        self, parts: Sequence[PlayedPart], numbers: bytes, origin: str, time_ns: int
+    def play_motion(
+        self, parts: Sequence[PlayedPart], numbers: bytes, origin: str
     ) -> tuple[int, ...] | Refusal:
         """Begin the parts of a motion in this cycle, or none; return the numbers of their goals.
 
         `numbers` has the commands of all parts in a row, little-endian float64.
         """
-        self._goals.time_ns = time_ns
+        self._goals.time_ns = self._schedule.time_ns
         sizes = [size for part in parts for size in part.sizes]
         fits = all(size >= 0 for size in sizes) and 8 * sum(sizes) == len(numbers)
         if not fits or any(len(part.at_ns) != len(part.sizes) for part in parts):
@@ -381,33 +380,34 @@ class Manager:
         begun: list[int] = []
         for part in parts:
             own, commands = commands[: len(part.sizes)], commands[len(part.sizes) :]
-            found = self._begin_part(part, tuple(own), origin, time_ns)
+            found = self._begin_part(part, tuple(own), origin)
             if isinstance(found, Refusal):
                 for number in begun:
-                    self.cancel(number, "", time_ns)
+                    self.cancel_goal(number, "")
                 return found
             begun.append(found)
         return tuple(begun)
 
     def _begin_part(
-        self, part: PlayedPart, commands: tuple[NDArray[np.float64], ...], origin: str, time_ns: int
+        self, part: PlayedPart, commands: tuple[NDArray[np.float64], ...], origin: str
     ) -> int | Refusal:
         managed = self._commandable(part.controller)
         if isinstance(managed, Refusal):  # a fault of another one took it out
             return managed
         if part.kind in managed.controller.Goals:
-            return self._begin_goal(managed, part.kind, commands[0], origin, time_ns)
+            return self._begin_goal(managed, part.kind, commands[0], origin)
         goal = self._accept(managed, part.kind, origin)
         managed.adopt(goal)
-        self._motions[part.controller] = PlayedMotion(goal, part, commands, time_ns)
+        self._motions[part.controller] = PlayedMotion(goal, part, commands, self._schedule.time_ns)
         return goal.number
 
-    def _play_on(self, time_ns: int) -> None:
+    def _play_on(self) -> None:
         """Hand over what is due of each motion, and forget those that have ended."""
+        time_ns = self._schedule.time_ns
         for name, motion in tuple(self._motions.items()):
             managed, kind = self._named[name], motion.part.kind  # active: else its goal has ended
             while motion.goal.outcome is None and (data := motion.due(time_ns)) is not None:
-                self._attempt(managed, time_ns, managed.command, kind, data, time_ns)
+                self._attempt(managed, managed.give_command, kind, data)
             if motion.goal.outcome is None:
                 motion.report(time_ns)
             if motion.goal.outcome is not None:
@@ -424,7 +424,7 @@ class Manager:
         place = self._free_place()
         if refusal := next(self._refusals(plan, place), None):
             return refusal
-        plan = replace(plan, active=False, every=rate_divider(plan.rate, self._period_ns))
+        plan = replace(plan, active=False, every=rate_divider(plan.rate, self._schedule.period_ns))
         begin_ns = self._clock.now_ns()
         try:
             managed = self._configured(place, plan)
@@ -442,8 +442,8 @@ class Manager:
         known, layout = self.switching.standing.known, self._record.layout
         if plan.name in known:
             yield Refusal(Code.NAME_TAKEN, {"controller": plan.name})
-        if not rate_fits(plan.rate, self._period_ns):
-            yield from _refused_rates({plan.name: plan}, self._period_ns)
+        if not rate_fits(plan.rate, self._schedule.period_ns):
+            yield from _refused_rates({plan.name: plan}, self._schedule.period_ns)
         if place >= MOST_CONTROLLERS:
             yield Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
         if unknown := tuple(joint for joint in plan.joints if joint not in layout.joints):
@@ -461,7 +461,7 @@ class Manager:
             update_order([*known.values(), plan])
         except ValueError as error:
             yield Refusal(Code.INVALID, {"problem": str(error)})
-        yield from _refused_rates({**known, plan.name: plan}, self._period_ns)
+        yield from _refused_rates({**known, plan.name: plan}, self._schedule.period_ns)
 
     def _free_place(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
@@ -493,7 +493,6 @@ class Manager:
         """Let every controller keep its own rate in another period of the loop."""
         if refusal := next(_refused_rates(self.switching.standing.known, period_ns), None):
             return refusal
-        self._period_ns = period_ns
         for managed in self._named.values():
             managed.change_period(period_ns)
         return None
@@ -528,7 +527,7 @@ class Manager:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
     def _configured(self, place: int, plan: ControllerPlan) -> Managed:
-        managed = Managed(plan, place, self._shared, self._period_ns)
+        managed = Managed(plan, place, self._shared)
         plans = {one.name: one for one in self._plan.controllers} | dict(self.switching.standing.known)
         managed.configure(plans)
         if managed.controller.Goals:

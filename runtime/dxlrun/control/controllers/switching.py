@@ -69,6 +69,7 @@ class Switching:
         self._states = context.record.states
         self._events = context.events
         self._hardware = context.hardware
+        self._schedule = context.schedule
 
     @property
     def standing(self) -> Standing:
@@ -80,14 +81,14 @@ class Switching:
             {name: managed.plan for name, managed in named if managed.state is State.ENTERING},
         )
 
-    def start(self, time_ns: int) -> None:
+    def start_controllers(self) -> None:
         """Activate the controllers that are active from the start."""
         known = self.standing.known
         names = [name for name, managed in self.named.items() if managed.plan.active and not managed.active]
-        self._enter([name for name in lowers_first(names, known) if name in names], time_ns, None, "")
+        self._enter([name for name in lowers_first(names, known) if name in names], None, "")
 
-    def switch(
-        self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, number: int | None = None
+    def switch_controllers(
+        self, activate: Sequence[str], deactivate: Sequence[str], number: int | None = None
     ) -> Refusal | Waiting | None:
         """Deactivate and activate controllers in one step, or refuse all of it; None: it is done.
 
@@ -99,9 +100,9 @@ class Switching:
         step = self.standing.switch(activate, deactivate)
         if isinstance(step, Refusal):
             return step
-        return self._refuse_limp(step.enter) or self._take(step, time_ns, number)
+        return self._refuse_limp(step.enter) or self._take(step, number)
 
-    def execute(self, request: Request, time_ns: int) -> None:
+    def execute_request(self, request: Request) -> None:
         """Let controllers take over because an active one requests it, or report why they do not; or end the
         run behind this cycle, by the policy for faults."""
         requester, names, why = request
@@ -121,9 +122,9 @@ class Switching:
         instead = f" from {', '.join(step.leave)}" if step.leave else ""
         text = f"{taken} {verb} over{instead}: {why}"
         self._events.emit(EventCode.TAKEOVER, Severity.WARNING, requester, text)
-        self._take(step, time_ns, None, f"{requester}: {why}")
+        self._take(step, None, f"{requester}: {why}")
 
-    def restart(self, joints: Collection[str], why: str, time_ns: int) -> None:
+    def restart_controllers(self, joints: Collection[str], why: str) -> None:
         """Activate again every active controller that commands one of these joints, with those above it.
 
         Each begins where its joints and their goals are now. Its goal is aborted; the reason is the names of
@@ -137,19 +138,19 @@ class Switching:
             reason = f"{list_names(own)} {why}"
             text = f"restarted at the measured positions: {reason}"
             self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
-            self._deactivate(managed, time_ns, reason)
+            self._deactivate(managed, reason)
         if self.fault is not None:
             return
         named = {managed.plan.name: managed for managed in again}
         names = [name for name in lowers_first(list(named), self.standing.known) if name in named]
         failed: list[_Failed] = []
-        self._activate_all([named[name] for name in names], time_ns, failed, restarts=True)
-        self._fall_back_all(failed, time_ns)
+        self._activate_all([named[name] for name in names], failed, restarts=True)
+        self._fall_back_all(failed)
         for managed in withheld:
             if managed.active:
-                managed.hold(time_ns)
+                managed.hold_joints()
 
-    def end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
+    def end_controller(self, managed: Managed, fault: ControllerFault) -> None:
         """Take a controller that broke its contract out of the robot, and let a fallback take over.
 
         Those above it leave too. Its own fallback comes first, then theirs, the nearest first. One that waits
@@ -159,13 +160,13 @@ class Switching:
         if managed.state is State.INACTIVE:
             self._take_out(managed, fault)
         else:
-            self._fall_back(*self._take_out_with_uppers(managed, fault, time_ns), time_ns)
+            self._fall_back(*self._take_out_with_uppers(managed, fault))
 
-    def deactivate_all(self, time_ns: int) -> None:
+    def deactivate_all(self) -> None:
         """Deactivate all controllers, those above first, else the last one first; raises nothing."""
         standing = self.standing
         for name in uppers_first(tuple(standing.active)[::-1], standing.known):
-            self._deactivate(self.named[name], time_ns, RUN_ENDED)
+            self._deactivate(self.named[name], RUN_ENDED)
         for group in self.groups:
             self._end_switch(group.number, Refusal(Code.RUN_ENDING))
         self.groups = []
@@ -229,7 +230,7 @@ class Switching:
 
     # Modes
 
-    def admit(self, time_ns: int) -> None:
+    def admit_groups(self) -> None:
         """Activate controllers whose modes are there now; give up those that waited too long.
 
         Given up after the timeout, and when a joint is in another mode although another was requested: a
@@ -241,18 +242,18 @@ class Switching:
             refused = self.modes_requested and any(now != Mode.UNKNOWN for _, now in missing.values())
             if not missing:
                 ready.append(group)
-            elif refused or time_ns >= group.until_ns:
+            elif refused or self._schedule.time_ns >= group.until_ns:
                 late.append(group)
         self.groups = [group for group in self.groups if group not in ready and group not in late]
         failed: list[_Failed] = []
         for group in ready:
-            self._end_switch(group.number, self._activate_all(group.entering, time_ns, failed))
+            self._end_switch(group.number, self._activate_all(group.entering, failed))
         for group in late:
             problem = self._mode_problem(group)
             names = tuple(managed.plan.name for managed in group.entering)
             refusal = Refusal(Code.MODE_NOT_ENTERED, {"controller": names, "problem": problem})
             self._give_up(group, refusal, problem)
-        self._fall_back_all(failed, time_ns)
+        self._fall_back_all(failed)
 
     def request_modes(self) -> None:
         """Request modes from the hardware, by the claims of the controllers that are active or wait."""
@@ -319,14 +320,14 @@ class Switching:
 
     # Entering and leaving
 
-    def _take(self, step: Step, time_ns: int, number: int | None, why: str = "") -> Refusal | Waiting | None:
+    def _take(self, step: Step, number: int | None, why: str = "") -> Refusal | Waiting | None:
         """Deactivate and activate controllers as planned; None: it is done (see `switch`).
 
         `why`: the fault for which these take over; empty: they were asked for.
         """
         for managed in (self.named[name] for name in step.leave):
             if managed.active:
-                self._deactivate(managed, time_ns)
+                self._deactivate(managed)
                 continue
             self.modes_requested = False
             managed.on(Event.LEAVE)
@@ -335,27 +336,26 @@ class Switching:
                 self._end_switch(
                     group.number, Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
                 )
-        return self._enter(step.enter, time_ns, number, why)
+        return self._enter(step.enter, number, why)
 
-    def _enter(
-        self, names: Sequence[str], time_ns: int, number: int | None, why: str
-    ) -> Refusal | Waiting | None:
+    def _enter(self, names: Sequence[str], number: int | None, why: str) -> Refusal | Waiting | None:
         """Activate controllers whose claims were checked together, at once or when their modes are there."""
         entering = [self.named[name] for name in names]
         self.modes_requested = False
         if not self._missing(entering):
             failed: list[_Failed] = []
-            refusal = self._activate_all(entering, time_ns, failed)
-            self._fall_back_all(failed, time_ns)
+            refusal = self._activate_all(entering, failed)
+            self._fall_back_all(failed)
             return refusal
-        self.groups.append(Group(tuple(entering), time_ns + MODE_TIMEOUT_NS, number, why))
+        until_ns = self._schedule.time_ns + MODE_TIMEOUT_NS
+        self.groups.append(Group(tuple(entering), until_ns, number, why))
         for managed in entering:
             managed.on(Event.AWAIT)
             self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
         return Waiting(tuple(names))
 
     def _activate_all(
-        self, entering: Sequence[Managed], time_ns: int, failed: list[_Failed], *, restarts: bool = False
+        self, entering: Sequence[Managed], failed: list[_Failed], *, restarts: bool = False
     ) -> Refusal | None:
         """Activate controllers whose claims were checked together; add what fails to `failed`.
 
@@ -373,7 +373,7 @@ class Switching:
                 self._report_left_out(name, f"{name} is not activated: {problem}", fault_of(managed, problem))
                 continue
             try:
-                managed.activate(time_ns, restarts=restarts)
+                managed.activate(restarts=restarts)
             except ControllerFault as fault:
                 self._take_out(managed, fault)
                 uppers = above([one.plan for one in entering], name)
@@ -382,18 +382,18 @@ class Switching:
             self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
             for lower in (one for one in lowers if one.active):  # from now on this one commands them
                 try:
-                    lower.follow(time_ns)
+                    lower.follow_upper()
                 except ControllerFault as fault:
-                    failed.append(self._take_out_with_uppers(lower, fault, time_ns))
+                    failed.append(self._take_out_with_uppers(lower, fault))
         if len(failed) == begun:
             return None
         taken, why = failed[begun]
         return fault_of(taken[0], why)
 
-    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
+    def _deactivate(self, managed: Managed, why: str = "") -> None:
         self.modes_requested = False
         try:
-            managed.deactivate(time_ns, why)
+            managed.deactivate(why)
         except ControllerFault as fault:
             self._take_out(managed, fault)  # without a fallback: it was leaving anyway
             self.fault = self.fault or str(fault)
@@ -409,7 +409,7 @@ class Switching:
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
 
-    def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault, time_ns: int) -> _Failed:
+    def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault) -> _Failed:
         """Take out one that broke its contract, and those above it; return them, the nearest first."""
         engaged = tuple(self.standing.engaged.values())
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
@@ -418,16 +418,16 @@ class Switching:
         why = f"{managed.plan.name}, whose references it commands, broke its contract"
         for upper in reversed(uppers):
             if upper.active:
-                self._deactivate(upper, time_ns, why)
+                self._deactivate(upper, why)
             else:
                 self._drop_group(upper, why)
         return (managed, *uppers), str(fault)
 
-    def _fall_back_all(self, failed: Sequence[_Failed], time_ns: int) -> None:
+    def _fall_back_all(self, failed: Sequence[_Failed]) -> None:
         for taken, why in failed:
-            self._fall_back(taken, why, time_ns)
+            self._fall_back(taken, why)
 
-    def _fall_back(self, taken: Sequence[Managed], why: str, time_ns: int) -> None:
+    def _fall_back(self, taken: Sequence[Managed], why: str) -> None:
         """Let the first fallback of these take over that can, else the policy for faults applies.
 
         None can that broke its own contract before: two that fall back on each other would do so for ever.
@@ -441,7 +441,7 @@ class Switching:
                 continue
             refusal = self._refuse_limp(step.enter)
             if refusal is None:
-                self._take(step, time_ns, None, why)
+                self._take(step, None, why)
                 return
             self._report_left_out(fallback, f"{fallback} does not take over: {refusal.text}", refusal)
         self.fault = self.fault or why
