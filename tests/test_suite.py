@@ -120,8 +120,8 @@ def test_the_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
     assert {str(path) for path in files} - packed == set()
 
 
-def test_the_campaigns_are_those_of_the_table_of_contributing() -> None:
-    rows = re.findall(r"^\| `DXLRUN_.*", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+def test_the_campaigns_are_those_of_the_table() -> None:
+    rows = re.findall(r"^\| `DXLRUN_.*", (ROOT / "tests/CAMPAIGNS.md").read_text(), re.MULTILINE)
     named = {path for row in rows for path in re.findall(r"`(tests/[\w/]+\.py)`", row)}
     beside = {str(Path(path).parent) for row in rows if "beside" in row for path in named if path in row}
     texts = {str(path.relative_to(ROOT)): path.read_text() for path in ROOT.glob("tests/*/**/test_*.py")}

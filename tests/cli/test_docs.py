@@ -46,6 +46,7 @@ ROOTS = (ROOT, ROOT / "runtime", ROOT / "runtime/dxlrun", ROOT / "plugins")
 PATHS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
+    ROOT / "tests/CAMPAIGNS.md",
     *sorted({*ROOT.glob("docs/**/*.md")} - {*ROOT.glob("docs/changes/*")}),
 ]
 PAGES = {path.name: path.read_text() for path in PATHS}
@@ -73,6 +74,8 @@ TESTS = {
         "tests/lab/tracking/test_command.py",
     ),
     "by-hand.md": ("tests/hand/test_terminal.py",),
+    "from-lerobot-rustypot-sdk.md": ("tests/cli/test_coming_from.py",),
+    "from-ros2-control.md": ("tests/cli/test_coming_from.py",),
     "frames.md": ("tests/cli/test_frames.py",),
     "gallery.md": ("tests/cli/test_docs.py",),
     "humanoid.md": ("tests/cli/test_tutorial.py",),
@@ -301,7 +304,7 @@ def test_the_files_that_a_page_names_exist(path: Path) -> None:
 
 
 def test_every_page_is_in_the_index() -> None:
-    pages = {str(path.relative_to(ROOT / "docs")) for path in PATHS[2:]} - {"index.md"}
+    pages = {str(path.relative_to(ROOT / "docs")) for path in PATHS[3:]} - {"index.md"}
     assert pages <= set(re.findall(r"\]\(((?:[\w-]+/)?[\w-]+\.md)\)", PAGES["index.md"]))
 
 
@@ -449,8 +452,29 @@ def test_failures_md_names_events_and_keys_that_exist() -> None:
         assert f'"{name}": {{' in schema or name in ("on_configure", "on_restart"), name
 
 
-def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
-    page = PAGES["CONTRIBUTING.md"]
+def test_it_does_not_work_md_quotes_messages_of_the_program() -> None:
+    page = PAGES["it-does-not-work.md"]
+    symptoms = re.split(r"^### ", page, flags=re.MULTILINE)[1:]
+    assert len(symptoms) >= 25
+    assert [text.partition("\n")[0] for text in symptoms if "`dxlrun " not in text] == []
+    written = "\n".join(path.read_text() for path in SOURCES if path.relative_to(ROOT).parts[0] == "runtime")
+    written = re.sub(r'" *\n\s+f?"', "", written)  # a sentence in several lines
+    for quoted in re.findall(r"^> (.+)$", page, re.MULTILINE):
+        if quoted != "dxlrun: command not found":  # the shell's
+            for part in filter(None, map(str.strip, quoted.split("…"))):
+                assert part in written, quoted
+
+
+def test_address_for_reports_is_in_one_place() -> None:
+    address = tomllib.loads(PROJECT)["project"]["urls"]["Issues"]
+    assert [path.name for path in PATHS if address in path.read_text()] == []
+    for page in ("README.md", "CONTRIBUTING.md", "it-does-not-work.md"):
+        assert re.search(r"`Issues`\s+in\s+\[pyproject.toml\]", PAGES[page]), page
+
+
+def test_contributing_md_is_short_and_has_what_ci_runs() -> None:
+    page, table = PAGES["CONTRIBUTING.md"], PAGES["CAMPAIGNS.md"]
+    assert len(page.encode()) <= 8192
     variables = {
         name
         for path in SOURCES
@@ -458,7 +482,7 @@ def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
         for name in re.findall(r"environ\.get\(\s*\"(DXLRUN_\w+)\"", path.read_text())
     }
     assert "DXLRUN_STORMS" in variables
-    assert set(re.findall(r"`(DXLRUN_\w+)`", page)) == variables
+    assert set(re.findall(r"`(DXLRUN_\w+)`", table)) == variables
     linters = {"ruff format", "ruff check", "mypy", "lint-imports"}
     assert set(re.findall(r"^    .*\.venv/bin/(ruff \w+|mypy|lint-imports)", page, re.MULTILINE)) == linters
     ci = (ROOT / ".ci/run").read_text().replace('"', "")
@@ -470,7 +494,7 @@ def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
     every = set(tomllib.loads(PROJECT)["project"]["optional-dependencies"])
     assert set(extras.split(",")) == every - {"release"}  # of 101 MB, to publish
     rows = re.findall(
-        r"^\| `(DXLRUN_\w+)` \|(?: `(DXLRUN_\w+)`)? \| `([\w/.]+)`.*\| (\d+) \| .*\|$", page, re.MULTILINE
+        r"^\| `(DXLRUN_\w+)` \|(?: `(DXLRUN_\w+)`)? \| `([\w/.]+)`.*\| (\d+) \| .*\|$", table, re.MULTILINE
     )
     assert {row[0] for row in rows} | {row[1] for row in rows if row[1]} == variables
     for name, seed, file, count in rows:
