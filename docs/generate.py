@@ -26,7 +26,8 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from functools import cache
-from importlib.metadata import Distribution, EntryPoints
+from importlib.metadata import Distribution
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -66,14 +67,16 @@ class Package(Distribution):
 
 
 def use_only_this_repository() -> None:
-    """Import from this tree, and find entry points of PACKAGES only; call it before importing dxlrun."""
-    points = EntryPoints(point for folder in PACKAGES for point in Package(folder).entry_points)
-    installed = importlib.metadata.entry_points
+    """Import from this tree, and find plug-ins of PACKAGES only; call it before importing dxlrun."""
+    packages = [Package(folder) for folder in PACKAGES]
+    groups = {point.group for package in packages for point in package.entry_points}
+    installed = importlib.metadata.distributions
 
-    def entry_points(*, group: str) -> EntryPoints:
-        return points.select(group=group) if group in points.groups else installed(group=group)
+    def distributions() -> Iterator[Distribution]:
+        others = (each for each in installed() if groups.isdisjoint(each.entry_points.groups))
+        return chain(packages, others)
 
-    importlib.metadata.entry_points = entry_points  # type: ignore[assignment]  # this process only generates
+    importlib.metadata.distributions = distributions  # type: ignore[assignment]  # this process only generates
     sys.path[:0] = [str(ROOT / source) for source in SOURCES]
 
 
