@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile.joints.registers import declarable, register_value, steered_value
+from dxlrun.compile.joints.register_values import declarable, register_value, steered_value
 from dxlwire.control_table import all_tables, control_table
 
 ROBOT = """\

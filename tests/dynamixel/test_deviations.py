@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.compile.joints.registers import register_value
+from dxlrun.compile.joints.register_values import register_value
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect

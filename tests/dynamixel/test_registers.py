@@ -5,7 +5,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.events import EventCode
-from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
+from dxlrun.compile.joints.register_values import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach, reach
 from dxlrun.dynamixel.servo.offline import rejoin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from types import EllipsisType
+from types import EllipsisType, FunctionType
 from typing import Annotated, Any, Protocol, Self, TypeVar, cast
 
 from pydantic import (
@@ -114,7 +114,7 @@ class FormKey(Protocol):
 
     @property
     def form(self) -> object:
-        """Type of its value."""
+        """Type of its value, or a function that returns it."""
 
     @property
     def field(self) -> object:
@@ -135,7 +135,9 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
     """
     added = [*keys]
     definitions: dict[str, Any] = {name: (kind, form.model_fields[name]) for name, kind in replaced.items()}
-    definitions |= {each.name: (each.form, each.field) for each in added}
+    for each in added:
+        kind = each.form() if isinstance(each.form, FunctionType) else each.form
+        definitions[each.name] = (kind, each.field)
     if not definitions:
         return form
     made = create_model(form.__name__, __base__=form, __doc__=form.__doc__, **definitions)

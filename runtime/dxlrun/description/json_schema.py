@@ -27,7 +27,7 @@ from dxlrun.description.document import plain_value
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.joints.groups import DEFAULTS, GROUPS
-from dxlrun.description.joints.joints import JOINT_FORMS
+from dxlrun.description.joints.joints import joint_conditions
 from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion
 from dxlrun.description.robot import robot_form
@@ -101,7 +101,7 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
     own = top["properties"]
     top.pop("description")
     own["joints"]["additionalProperties"] = _any_joint(own["joints"]["additionalProperties"])
-    shared = _shared({form: definitions[form]["properties"] for form, _ in JOINT_FORMS})
+    shared = _shared({form: definitions[form]["properties"] for form, _ in joint_conditions()})
     defaults = {"type": "object", "additionalProperties": False, "properties": shared}
     defaults["description"] = "Keys that every joint has that does not have them itself, or by its groups."
     definitions["Group"]["properties"] |= shared
@@ -190,7 +190,7 @@ def _any_joint(any_form: Schema) -> Schema:
     """Return the schema of a joint: that of the form which its keys tell, so that mistakes have a place."""
     branches: list[Schema] = []
     before: list[Schema] = []
-    for form, told_by in JOINT_FORMS:
+    for form, told_by in joint_conditions():
         branches.append({"if": _and_none_of(told_by, before), "then": {"$ref": f"#/$defs/{form}"}})
         before.append(told_by)
     branches.append({"if": {"not": {"anyOf": before}}, "then": any_form})

@@ -11,13 +11,14 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 
-from dxlrun.features.feature import Feature, JointKey, S, Section
+from dxlrun.features.feature import Feature, JointKey, S, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
     Feature("sensors", "dxlrun.features.sensors"),
     Feature("transmissions", "dxlrun.features.mechanics"),
+    Feature("registers", "dxlrun.features.registers"),
 )
 """In the order in which every stage asks them; their states are in the cycle's record in this order.
 
@@ -58,7 +59,7 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
             features += _features_of(plugin)
         for feature in features:
             try:
-                keys = feature.stage(Section), feature.stage(JointKey)
+                keys = feature.stage(Section), feature.stage(JointKey), feature.stage(ServoKey)
             except (Exception, SystemExit) as error:
                 broken[feature.name] = (
                     f"the section {feature.name} of {feature.distribution} cannot be used "

@@ -1,10 +1,10 @@
 """Feature: a section or a key of the robot file with everything that belongs to it, in a folder of its own.
 
 A feature is a package whose files have fixed names, one for each stage in which it takes part: `form.py` has
-its section, `joint_key.py` its key of joints, `compile.py` its share of the plan, and so on. Such a file has
-one object `STAGE`. Its class belongs to the room that asks for it, and documents when that happens. A feature
-has as many of these files as it needs. The stage that asks for a file imports it, so `dxlrun check` imports
-nothing of the run.
+its section, `joint_key.py` or `servo_key.py` its key of joints or servos, `compile.py` its share of the plan,
+and so on. Such a file has one object `STAGE`. Its class belongs to the room that asks for it, and documents
+when that happens. A feature has as many of these files as it needs. The stage that asks for a file imports
+it, so `dxlrun check` imports nothing of the run.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar, cast
 
 from dxlwire.joint_unit import JointUnit
 
@@ -43,7 +43,8 @@ class Section(Generic[T]):
     name: str
     """Key at the top of the robot file, such as `devices`."""
     form: object
-    """Type of the section's value, for pydantic: `dict[Name, Device]`."""
+    """Type of the section's value, for pydantic, such as `dict[Name, Device]`; or a function that returns it,
+    if features add keys to it."""
     field: T
     """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
@@ -95,6 +96,42 @@ class JointKey(Generic[T]):
         import msgspec  # not above: a file is checked without JSON
 
         return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
+
+
+class KeyedServo(Protocol):
+    """Servo of a robot file, with the keys of features."""
+
+    @property
+    def keys(self) -> Mapping[str, object]:
+        """Values by key, as the form of the key has read them."""
+
+
+@dataclass(frozen=True)
+class ServoKey(Generic[T]):
+    """Key of a servo: `STAGE` of `servo_key.py`, asked for before a file is read.
+
+    A joint with servos of its own has it for all of them, and one of its servos for itself; so have `groups`,
+    `joint_defaults`, and the servos in the section of a feature.
+    """
+
+    FILE: ClassVar[str] = "servo_key"
+
+    name: str
+    """The key, such as `registers`; that of the feature."""
+    form: object
+    """Type of the value in the file, for pydantic."""
+    field: object
+    """Field of the key in a joint, with its default, as `dxlrun.description.form.key` returns it."""
+    of_one: object
+    """Field of the key in one of several servos of a joint. Its default is None: the value of the joint."""
+    of_section: object
+    """Field of the key in a servo that has no joint of its own."""
+    before: str = ""
+    """Key of a servo that follows it in lists of all keys; empty: it is the last."""
+
+    def of(self, servo: KeyedServo) -> T:
+        """Return the value of a servo, which is that of its joint if it has none itself."""
+        return cast("T", servo.keys[self.name])
 
 
 @dataclass(frozen=True)

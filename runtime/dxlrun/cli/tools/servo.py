@@ -279,7 +279,7 @@ def _of_device(one: OneDevice, verb: str, asked: Asked) -> None:
 
 def _device_value(table: DeviceTable, name: str, text: str) -> int:
     """Return the integer on the wire for a word of the command line; raises InputError."""
-    from dxlrun.compile.joints.registers import any_value
+    from dxlrun.compile.joints.register_values import any_value
 
     item = table.items.get(name)
     if item is not None and item.encoding == "float32":
@@ -310,7 +310,7 @@ def _get(one: OneServo | OneDevice, asked: Asked) -> None:
 
 
 def _set(one: OneServo, asked: Asked) -> None:
-    from dxlrun.compile.joints.registers import any_value
+    from dxlrun.compile.joints.register_values import any_value
     from dxlrun.dynamixel.servo.registers import shown
 
     name, text = asked.words

@@ -9,8 +9,7 @@ from typing import ClassVar
 import msgspec
 
 from dxlrun.description.document import KeyPath, Marks
-from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint
-from dxlrun.description.joints.mechanics import Register
+from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint, servo_values
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.features import installed_features, stages
@@ -36,7 +35,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
     unit: JointUnit  # Of the positions of what it moves
     continuous: bool
     torque: bool
-    registers: Mapping[str, Register]
+    keys: Mapping[str, object]  # Of features; `ServoKey.of` returns one with its type
     motor: str | None
 
     @property
@@ -103,6 +102,6 @@ def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
             unit=joint.unit,
             continuous=joint.continuous,
             torque=joint.torque,
-            registers=joint.registers if own is None or own.registers is None else own.registers,
+            keys=servo_values(joint) if own is None else servo_values(own, joint),
             motor=joint.motor if own is None or own.motor is None else own.motor,
         )

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import msgspec
 
 from dxlrun.compile.joints.described_servos import AUTO, DescribedServo, described_servos
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
-from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import Mark, suggestion
+from dxlrun.features import installed_features, stages
 from dxlsim.motor_model import MotorModel
-from dxlwire.bus_plan import RegisterValue
+from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans
 
@@ -35,7 +36,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     described: DescribedServo
     table: ControlTable
-    registers: tuple[RegisterValue, ...]  # Its declared registers, in the order in which they are written
+    registers: tuple[RegisterValue, ...]  # Of features, in the order in which they are written
     motor: MotorModel | None
     known_bus: bool
     certain: bool  # False while its model is still to be read, so that what does not fit it is no error yet
@@ -86,6 +87,21 @@ class CompiledServo(msgspec.Struct, frozen=True):
         )
 
 
+@dataclass(frozen=True)
+class SettingsStage:
+    """`STAGE` of `settings.py`: items of a control table that get a value before their servo gets torque.
+
+    The plan of the servo has them. A start writes those that differ, and so does a return of the servo.
+    """
+
+    FILE: ClassVar[str] = "settings"
+
+    compile: Callable[[RobotFile, DescribedServo, ControlTable], Iterable[RegisterValue]]
+    """Returns the values for one servo in the order in which they are written, EEPROM first."""
+    check: Callable[[RobotFile, BusPlan], None]
+    """Compares the values with the plan of a bus."""
+
+
 def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:
     """Return the servos whose model is known, by their names.
 
@@ -108,7 +124,11 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
         certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
         found = file if certain else RobotFile(file.description)
-        registers = compile_registers(found, servo, table)
+        registers = tuple(
+            register
+            for _, stage in stages(SettingsStage, installed_features())
+            for register in stage.compile(found, servo, table)
+        )
         motor = compile_motor(found, servo, table, registers, motors.of_servo(servo.name))
         compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus, certain)
     return compiled

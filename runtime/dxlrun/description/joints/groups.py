@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from dxlrun.description.document import Grown, KeyPath, Marks
 from dxlrun.description.including import merged
-from dxlrun.description.joints.joints import KEYS_OF_SERVOS
+from dxlrun.description.joints.joints import keys_of_servos
 from dxlrun.description.problems import path_text, shown
 from dxlrun.errors import Problem, suggestion
 from dxlrun.features import installed_features, stages
@@ -188,8 +188,9 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
     sections = (section for _, section in stages(Section, installed_features()))
     named = (one for each in sections for one in each.moved_joints(grown.data.get(each.name)))
     without_servo = {joint for one in named for joint in groups.get(one, (one,))}
+    of_servos = keys_of_servos()
     keys = {
-        joint: [key for key in given if joint not in without_servo or key not in KEYS_OF_SERVOS]
+        joint: [key for key in given if joint not in without_servo or key not in of_servos]
         for joint in joints
     }
     moves: Moves = {

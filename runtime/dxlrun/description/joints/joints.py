@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Self, TypeAlias, get_args
+from dataclasses import replace
+from typing import Annotated, Optional, Self, TypeAlias, TypeVar, get_args
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form import Form, ItemName, key, refuse, with_keys
+from dxlrun.description.form import Form, key, refuse, with_keys
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
@@ -21,7 +22,6 @@ from dxlrun.description.joints.mechanics import (
     Limits,
     MotorFile,
     OneOfServos,
-    Register,
     ServoId,
     SharedTolerance,
     TravelPerTurn,
@@ -40,9 +40,10 @@ from dxlrun.description.units import (
     torque_or_force,
 )
 from dxlrun.features import installed_features, stages
-from dxlrun.features.feature import JointKey
+from dxlrun.features.feature import JointKey, ServoKey
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
+F = TypeVar("F", bound=Form)
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
 """Of simulated servos; real ones are quicker by far."""
 
@@ -140,11 +141,6 @@ class ServoJoint(BareJoint):
     travel_per_turn: TravelPerTurn | None = key(
         "How far the joint moves in one turn of the servo; makes it a linear joint.", "94.2 mm", None
     )
-    registers: dict[ItemName, Register] = key(
-        "What its servo's control table shall hold: written at the start where it differs.",
-        "{position_p_gain: 800, return_delay_time: 0 us}",
-        {},
-    )
     motor: MotorFile | None = key(
         "Motor file of its servo, from the folder of the file that says it.", "elbow.motor.yaml", None
     )
@@ -182,17 +178,22 @@ class SharedJoint(ServoJoint):
 JointEntry: TypeAlias = Joint | SharedJoint | BareJoint
 """A joint as the robot file has it."""
 
-_OF_A_SERVO = frozenset(Joint.model_fields) - frozenset(BareJoint.model_fields)
-"""Keys of a joint with a servo of its own; one without any has its servos in another section."""
 
-KEYS_OF_SERVOS = _OF_A_SERVO | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
-"""Keys that a joint without a servo of its own does not have."""
+def _keys_of_a_servo() -> frozenset[str]:
+    """Return the keys of a joint with a servo of its own; without any, its servos are in another section."""
+    own = Joint.model_fields.keys() - BareJoint.model_fields.keys()
+    return frozenset(own | {key.name for key in servo_keys()})
 
-JOINT_FORMS = (
-    ("SharedJoint", {"required": ["servos"]}),
-    ("Joint", {"anyOf": [{"required": [key]} for key in sorted(_OF_A_SERVO)]}),
-)
-"""Forms by their keys, for editors as JSON Schemas: the first that fits; what fits none may be any form."""
+
+def keys_of_servos() -> frozenset[str]:
+    """Return the keys that a joint without a servo of its own does not have."""
+    return _keys_of_a_servo() | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
+
+
+def joint_conditions() -> tuple[tuple[str, dict[str, object]], ...]:
+    """Return the forms by their keys, as JSON Schemas: the first that fits, else any form."""
+    own = [{"required": [key]} for key in sorted(_keys_of_a_servo())]
+    return (("SharedJoint", {"required": ["servos"]}), ("Joint", {"anyOf": own}))
 
 
 def kind_of_joint(joint: object) -> str:
@@ -201,7 +202,8 @@ def kind_of_joint(joint: object) -> str:
         if "servos" in joint:
             return "<several servos>"
         surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in BareJoint.model_fields}
-        if surplus and (surplus & _OF_A_SERVO or surplus & words_for("BareJoint", _OF_A_SERVO)):
+        own = _keys_of_a_servo()
+        if surplus and (surplus & own or surplus & words_for("BareJoint", own)):
             return "<one servo>"
         return "<no servo>"
     if isinstance(joint, SharedJoint):
@@ -214,9 +216,34 @@ def joint_keys() -> list[JointKey[object]]:
     return [key for _, key in stages(JointKey, installed_features())]
 
 
+def servo_keys() -> list[ServoKey[object]]:
+    """Return the keys that features add to servos."""
+    return [key for _, key in stages(ServoKey, installed_features())]
+
+
+def servo_values(servo: Form, joint: Form | None = None) -> dict[str, object]:
+    """Return the keys of features that a servo has, or its joint for it."""
+    found = {key.name: getattr(servo, key.name) for key in servo_keys()}
+    return {name: getattr(joint, name) if value is None else value for name, value in found.items()}
+
+
+def section_servo(form: type[F]) -> type[F]:
+    """Return the form of a servo in the section of a feature, with the keys of other features."""
+    return with_keys(form, [replace(key, field=key.of_section) for key in servo_keys()])
+
+
 def joint_form() -> object:
     """Return the type of a joint in the file: one of the forms, with the keys of features."""
-    own, shared, bare = (with_keys(form, joint_keys()) for form in (Joint, SharedJoint, BareJoint))
+    every, servos = joint_keys(), servo_keys()
+    optional = [replace(key, form=Optional[key.form], field=key.of_one) for key in servos]  # noqa: UP045  an object has no |
+    one_of_servos = with_keys(OneOfServos, optional)
+    several = Annotated[
+        tuple[one_of_servos, ...],  # type: ignore[valid-type]  # made at run time
+        Field(strict=False, min_length=2),
+    ]
+    own = with_keys(Joint, [*every, *servos])
+    shared = with_keys(SharedJoint, [*every, *servos], servos=several)
+    bare = with_keys(BareJoint, every)
     return Annotated[
         Annotated[own, Tag("<one servo>")]
         | Annotated[shared, Tag("<several servos>")]

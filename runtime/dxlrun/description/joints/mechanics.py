@@ -15,13 +15,12 @@ from pydantic import (
     BeforeValidator,
     Field,
     GetJsonSchemaHandler,
-    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import CoreSchema
 
 from dxlrun.description import units
-from dxlrun.description.form import Form, ItemName, key, refuse
+from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.units import (
     Acceleration,
     Angle,
@@ -108,14 +107,6 @@ def _whole(value: object) -> object:
     return value
 
 
-def _register(value: object) -> object:
-    if isinstance(value, bool) or not isinstance(value, int | str):
-        raise refuse(
-            "this is no value of a register", "write the raw integer, or a quantity with its unit: 500 us"
-        )
-    return value
-
-
 def _ordered(value: tuple[Measure, Measure]) -> tuple[Measure, Measure]:
     if not value[0] < value[1]:
         raise refuse("the lower limit is not below the upper one", "write [lower, upper]")
@@ -125,8 +116,6 @@ def _ordered(value: tuple[Measure, Measure]) -> tuple[Measure, Measure]:
 Direction = Annotated[Literal[1, -1], BeforeValidator(_whole)]
 ServoId = Annotated[int, Field(ge=0, le=253)]
 GearRatio = Annotated[float, Field(ge=LEAST_RATIO, le=MOST_RATIO)]
-Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
-"""A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
 TravelPerTurn = Annotated[Length, Field(ge=LEAST_TRAVEL_M, le=MOST_TRAVEL_M)]
 
 
@@ -166,8 +155,5 @@ class OneOfServos(ServoEntry):
     )
     direction: Direction | None = key(
         "1: the joint's angle grows as the servo's does, -1: against it; none: the joint's.", "-1", None
-    )
-    registers: dict[ItemName, Register] | None = key(
-        "What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None
     )
     motor: MotorFile | None = key("Its motor file; none: the joint's.", "hip.motor.yaml", None)

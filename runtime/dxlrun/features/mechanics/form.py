@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dxlrun.description.form import Form, ItemName, Name, key
+from dxlrun.description.form import Form, Name, key, with_keys
+from dxlrun.description.joints.joints import section_servo
 from dxlrun.description.joints.mechanics import (
     Direction,
     GearRatio,
     MotorFile,
-    Register,
     ServoEntry,
     ServoId,
     Tolerance,
@@ -32,11 +32,6 @@ class TransmissionServo(ServoEntry):
     )
     direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
     gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
-    registers: dict[ItemName, Register] = key(
-        "What its control table shall hold: written at the start where it differs.",
-        "{position_p_gain: 800}",
-        {},
-    )
     motor: MotorFile | None = key(
         "Its motor file, from the folder of the file that says it.", "wrist.motor.yaml", None
     )
@@ -70,6 +65,12 @@ class Transmission(Form):
     )
 
 
+def _form() -> object:
+    """Return the type of the section, whose servos have the keys of features."""
+    servos = {"servos": dict[Name, section_servo(TransmissionServo)]}  # type: ignore[misc]  # made at run time
+    return dict[Name, with_keys(Transmission, (), **servos)]  # type: ignore[misc]  # as above
+
+
 def _moved_joints(section: object) -> Iterator[str]:
     """Yield the names under `joints` in a section that was not validated yet."""
     for entry in section.values() if isinstance(section, dict) else ():
@@ -79,7 +80,7 @@ def _moved_joints(section: object) -> Iterator[str]:
 
 STAGE: Section[dict[str, Transmission]] = Section(
     "transmissions",
-    dict[Name, Transmission],
+    _form,
     key(
         "Several servos that move several joints together, by name.",
         "{wrist: {type: differential, joints: [roll, pitch], ...}}",

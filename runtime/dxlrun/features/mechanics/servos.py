@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dxlrun.compile.joints.described_servos import DescribedServo, ServoStage
+from dxlrun.description.joints.joints import servo_values
 from dxlrun.description.reading import Description
 from dxlrun.features.mechanics import form
 from dxlwire.joint_unit import ROTARY
@@ -32,7 +33,7 @@ def describe_servos(description: Description) -> Iterator[DescribedServo]:
                 unit=ROTARY,
                 continuous=any(joint.continuous for joint in moved),
                 torque=all(joint.torque for joint in moved),
-                registers=servo.registers,
+                keys=servo_values(servo),
                 motor=servo.motor,
             )
 

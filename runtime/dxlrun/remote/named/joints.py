@@ -10,7 +10,7 @@ import numpy as np
 from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.loop_requests import Register, RegisterReading
-from dxlrun.compile.joints.registers import UnfitRegister, steered_value
+from dxlrun.compile.joints.register_values import UnfitRegister, steered_value
 from dxlrun.description.joints.groups import ALL
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion

@@ -1,17 +1,14 @@
-"""Declared registers: the items that a robot file or a client may write, and those of dxlrun alone."""
+"""Values of registers: items that a robot file, a client or a tool may write, and those of dxlrun alone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
-from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
-from dxlrun.compile.problems import RobotFile
-from dxlrun.description.reading import Description
 from dxlrun.description.units import quantity
-from dxlrun.errors import Mark, suggestion
-from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.errors import suggestion
+from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.control_table.device_table import DeviceTable
 
@@ -54,9 +51,6 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
 """Items that dxlrun writes itself or relies on: why, and what to do instead."""
 _RESTORED = ("profile_velocity", "torque_limit")
 """Items that a start writes, but not on all models; on the others they are reported."""
-_LEVEL = "status_return_level"
-_LOWER = ("min_position_limit", "cw_angle_limit")
-_UPPER = ("max_position_limit", "ccw_angle_limit")
 _ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
 
 
@@ -145,69 +139,6 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
     if rule is not None and item.name in _RESTORED and rule.judgement == "report":
         return None  # no start writes it on this model
     return _OWN.get(item.name)
-
-
-def compile_registers(
-    file: RobotFile, servo: DescribedServo, table: ControlTable
-) -> tuple[RegisterValue, ...]:
-    """Return what a servo's keys declare, in the order in which it is written: EEPROM first, by address.
-
-    Before all of it Status Return Level, so that the other writes are acknowledged.
-    """
-    found: list[RegisterValue] = []
-    name = servo.title
-    for register, value in servo.registers.items():
-        mark = servo.mark(file.marks, "registers", register)
-        try:
-            found.append(register_value(table, register, value))
-        except UnfitRegister as error:
-            file.error(mark, f"{name}: {error.what}", error.fix)
-        except ValueError as error:  # a quantity that is none
-            what, _, fix = str(error).partition("; ")
-            file.error(mark, f"{register} of {name}: {what}", fix)
-    bus = file.robot.buses.get(servo.bus)
-    delay = next((one.value for one in found if one.name == "return_delay_time"), None)
-    if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
-        file.warning(
-            servo.mark(file.marks, "registers", "return_delay_time"),
-            f"{name} declares a return delay of {delay * 2} us, but bus {servo.bus} is planned with "
-            f"{bus.return_delay_time / 1000:g} us",
-            f"write `return_delay_time: {delay * 2} us` at the bus if all its servos have it",
-        )
-    return tuple(sorted(found, key=lambda one: (one.name != _LEVEL, not one.eeprom, one.address)))
-
-
-def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
-    """Refuse position limits that are declared narrower than those of the joint: goals would be refused.
-
-    Multi-turn modes know no limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
-    """
-    for servo in plan.servos:
-        if servo.continuous:
-            continue
-        for register, needed in _narrow(servo):
-            file.error(
-                _place(file.description, servo, register.name),
-                f"{servo.joint} declares {register.name} = {register.value}, but its limits reach to tick "
-                f"{needed}, and the servo would refuse goals there",
-                f"declare {needed}, or make `limits: {{position: ...}}` narrower",
-            )
-
-
-def _place(description: Description, servo: ServoPlan, register: str) -> Mark:
-    """Return where a servo of the plan declares a register."""
-    for described in described_servos(description):
-        if described.name == servo.own_name:
-            return described.mark(description.marks, "registers", register)
-    return description.marks.value("joints", servo.joint, "registers", register)
-
-
-def _narrow(servo: ServoPlan) -> Iterator[tuple[RegisterValue, int]]:
-    for register in servo.registers:
-        if register.name in _LOWER and register.value > servo.lower_tick:
-            yield register, servo.lower_tick
-        if register.name in _UPPER and register.value < servo.upper_tick:
-            yield register, servo.upper_tick
 
 
 def _raw(item: ControlItem, value: int | str) -> int:

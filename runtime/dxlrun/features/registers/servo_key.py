@@ -1,0 +1,40 @@
+"""Key `registers` of joints and servos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import BeforeValidator, WithJsonSchema
+
+from dxlrun.description.form import ItemName, key, refuse
+from dxlrun.features.feature import ServoKey
+
+
+def _register(value: object) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise refuse(
+            "this is no value of a register", "write the raw integer, or a quantity with its unit: 500 us"
+        )
+    return value
+
+
+Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
+"""A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
+
+STAGE: ServoKey[Mapping[str, Register]] = ServoKey(
+    "registers",
+    dict[ItemName, Register],
+    field=key(
+        "What its servo's control table shall hold: written at the start where it differs.",
+        "{position_p_gain: 800, return_delay_time: 0 us}",
+        {},
+    ),
+    of_one=key("What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None),
+    of_section=key(
+        "What its control table shall hold: written at the start where it differs.",
+        "{position_p_gain: 800}",
+        {},
+    ),
+    before="motor",
+)
