@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
@@ -269,33 +268,6 @@ class DeviceBlock(msgspec.Struct, frozen=True):
     spare: int = 0  # Bytes behind the block that can be read with it
 
 
-class DeviceCommand(msgspec.Struct, frozen=True):
-    """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
-
-    name: str  # `led`
-    item: str  # As the control table has it
-    address: int
-    size: int
-    encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
-    scale: float
-    offset: float
-    lowest: float  # SI units
-    highest: float
-    column: int  # Of the command among `device_commands` of the cycle's record
-    safe: float | None = None
-    """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
-
-    def data(self, value: float) -> bytes:
-        """Return what is written for a value, SI units, inside of its range; little-endian."""
-        exact = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
-        if self.encoding == "float32":
-            return struct.pack("<f", exact)
-        number = round(exact)
-        if self.encoding == "sign_magnitude":
-            number = abs(number) | (SIGN if number < 0 else 0)
-        return number.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
-
-
 class DevicePlan(msgspec.Struct, frozen=True):
     """Something on a bus that is no servo: read each cycle, never given torque, goals or a mode."""
 
@@ -305,7 +277,6 @@ class DevicePlan(msgspec.Struct, frozen=True):
     model_number: int | None  # None: it is not checked
     source: int  # Row of the device among the sources of the cycle's record
     blocks: tuple[DeviceBlock, ...]  # Each is a read of its own
-    commands: tuple[DeviceCommand, ...] = ()
 
 
 class Budget(msgspec.Struct, frozen=True):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 
+import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -15,9 +16,10 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import StartUpError
+from dxlrun.features.devices.plan import DeviceCommand
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import read_device_table
-from dxlwire.plan.devices import device_blocks, device_command
+from dxlwire.plan.devices import device_blocks
 from dxlwire.plan.line import Line
 from dxlwire.wire import protocol1, protocol2
 
@@ -42,26 +44,30 @@ NONE = "[]"
 SERVOS = (1, 2, 3)
 
 
-def devices(*wanted, first=101, capabilities=ALL, commands=()):
-    """Return devices, each by its items, as `bus_plan` takes them; the first one has commands."""
+def devices(*wanted, first=101, capabilities=ALL):
+    """Return devices, each by its items, as `bus_plan` takes them."""
     table = read_device_table(TABLE.format(capabilities=capabilities))
     line = Line(1_000_000, 0, 500_000, protocol2)
     found, column = [], 0
     for index, names in enumerate(wanted):
         blocks = device_blocks(line, table, {name: table.items[name] for name in names}, column)
         column += len(names)
-        own = [device_command(name, table.items[name], place) for place, name in enumerate(commands)]
-        plan = DevicePlan(
-            f"device_{index}", first + index, table.model, 1060, index, blocks, () if index else tuple(own)
-        )
+        plan = DevicePlan(f"device_{index}", first + index, table.model, 1060, index, blocks)
         found.append((plan, table))
     return found
 
 
-def started(*wanted, period_ns=20_000_000, fast=True, **change):
+def commands_of_first(*names):
+    """Return the plan of the commands of the first device."""
+    items = read_device_table(TABLE.format(capabilities=ALL)).items
+    own = [DeviceCommand.build(name, items[name], place) for place, name in enumerate(names)]
+    return msgspec.json.encode({"device_0": own})
+
+
+def started(*wanted, period_ns=20_000_000, fast=True, commands=(), **change):
     given = devices(*wanted, **change)
     plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given, fast=fast)
-    rig = make_rig(plan)
+    rig = make_rig(plan, commands=commands_of_first(*commands))
     rig.period_ns = period_ns
     rig.hardware.start()
     rig.packets.list.clear()
@@ -285,9 +291,9 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe():
 @pytest.mark.parametrize("silent", [False, True])
 def test_release_disarms_watchdogs_before_they_can_wait_for_a_device(silent):
     """An owed acknowledgement, or silence, of the device must not outlast the watchdogs, 200 ms."""
-    given = devices(("pwm",), commands=["led"])
+    given = devices(("pwm",))
     plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given)
-    rig = make_rig(replace(plan, watchdog_ticks=10))
+    rig = make_rig(replace(plan, watchdog_ticks=10), commands=commands_of_first("led"))
     rig.hardware.start()
     rig.cycles(5)
     (bus,) = rig.hardware._lines.buses

@@ -35,6 +35,7 @@ from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.features import FEATURES
+from dxlrun.features.devices.plan import decode_devices
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -277,8 +278,12 @@ def make_rig(
     extra: Sequence[ServoConfig] = (),
     position: float | None = None,
     firmware: int | None = None,
+    commands: bytes = b"",
 ) -> Rig:
-    """Return hardware that is not started, on the servos of some plans; eight AX-12 where none is given."""
+    """Return hardware that is not started, on the servos of some plans; eight AX-12 where none is given.
+
+    `commands`: of the devices, as their feature compiles them.
+    """
     plans = plans or (make_plan(),)
     ledger = Ledger()
     clock = VirtualClock(1_000_000_000)
@@ -299,18 +304,18 @@ def make_rig(
     devices = [device for plan in plans for device in plan.devices]
     fields = [one for device in devices for block in device.blocks for one in block.fields]
     sources = SourceStates.empty(len(devices), len(fields))
-    commands = np.full(sum(len(device.commands) for device in devices), np.nan)
+    commanded = np.full(sum(map(len, decode_devices(commands).values())), np.nan)
     beats: list[int] = []
     hardware = DynamixelHardware(
         Lines(plans, ports, clock, packets, lambda: beats.append(clock.now_ns())),
         packets,
         ServoArrays(states, goals, sources),
         events,
-        parts=FeatureParts(FEATURES, (), commands, {}),
+        parts=FeatureParts(FEATURES, (), commanded, {"devices": commands}),
         take_over=take_over,
     )
     rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
-    rig.sources, rig.device_commands = sources, commands
+    rig.sources, rig.device_commands = sources, commanded
     return rig
 
 

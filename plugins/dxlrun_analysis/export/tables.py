@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dxlrun import Log, LogError, LogReader
-from dxlrun.tooling.records import Severity, Torque
+from dxlrun.tooling.records import SOURCE_COMMAND, Severity, Torque
 from dxlrun.tooling.topics import Codec, LoggedTopic, LogTopic, bus_topic, message_struct
 from dxlwire import Mode, PacketKind
 
@@ -153,7 +153,7 @@ def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> 
         columns[state] = _known(cycles["source_state"][:, row])
     for row, command in enumerate(layout.source_commands):
         device, _, name = command.partition("/")
-        columns[f"{device}/command.{name}"] = _known(cycles["device_command"][:, row])
+        columns[f"{device}/command.{name}"] = _known(cycles[SOURCE_COMMAND][:, row])
     return _table(log, columns)
 
 

@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from dxlrun.channels.ring import RING_SECONDS, record_size
+from dxlrun.description.source_names import SOURCE_COMMAND
 from dxlwire.modes import COMMAND_INTERFACES
 
 Floats = NDArray[np.float64]
@@ -68,7 +69,7 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("reference", "float64", "references"),
     ("torque", "uint8", "joints"),
     ("source_state", "float64", "source_states"),
-    ("device_command", "float64", "source_commands"),
+    (SOURCE_COMMAND, "float64", "source_commands"),
     ("source_age_ns", "int64", "sources"),
     ("source_valid", "bool", "sources"),
 )
@@ -361,7 +362,7 @@ class CycleRecord(_Scalars):
     Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
     """
 
-    COMPUTED: ClassVar = {"source_state": "state", "reference": "reference", "device_command": "command"}
+    COMPUTED: ClassVar = {"source_state": "state", "reference": "reference", SOURCE_COMMAND: "command"}
     """Sequences of float64 that belong to no joint, as a cycle computes them, with the word for one."""
 
     cycle: int
@@ -430,7 +431,7 @@ class CycleRecord(_Scalars):
             age_ns=array["source_age_ns"][0],
         )
         """States of devices, sensors and controllers."""
-        self.source_commands: Floats = _row(array, "device_command")
+        self.source_commands: Floats = _row(array, SOURCE_COMMAND)
         """Commands of sources, one element a name of the layout's source_commands; NaN = not commanded."""
         self.computed: tuple[Floats, ...] = tuple(_row(array, name) for name in self.COMPUTED)
         """The sequences of COMPUTED."""

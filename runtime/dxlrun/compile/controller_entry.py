@@ -189,7 +189,7 @@ def compile_entry(
         reference=interfaces.reference,
         reads=interfaces.reads,
         provides=interfaces.provides,
-        source_commands=interfaces.device_commands,
+        source_commands=interfaces.source_commands,
         takeovers=interfaces.takeovers,
         partial=interfaces.partial,
         topics=tuple(f"/{plan.name}/{topic}" for topic in topics),

@@ -81,6 +81,11 @@ class Interfaces(msgspec.Struct, frozen=True):
     asked_by: Mapping[CommandName, tuple[str | int, ...]] = msgspec.field(default_factory=dict)
     partial: bool = False
 
+    @property
+    def source_commands(self) -> tuple[str, ...]:
+        """The same as `device_commands`: commands of devices and other sources."""
+        return self.device_commands
+
 
 class JointLimits(msgspec.Struct, frozen=True):
     """Limits of the controller's joints, shape (joints,): positions are infinite, others NaN where there is
@@ -293,9 +298,9 @@ class Context(msgspec.Struct, frozen=True):
     provided: Floats = msgspec.field(default_factory=_none)
     """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
     which it is updated and all of them are finite; all NaN: nothing new, what is shown grows older."""
-    device_commands: Floats = msgspec.field(default_factory=_none)
-    """Its commands of devices, shape (device_commands,), to be written by update, NaN = not commanded: the
-    device keeps what it has."""
+    source_commands: Floats = msgspec.field(default_factory=_none)
+    """Its commands of devices and other sources, shape (device_commands,), to be written by update, NaN = not
+    commanded: the source keeps what it has."""
     kept: bytes = b""
     """What the controller kept last, in this run or an earlier one; empty where there is nothing, or where it
     was made with other servos, with other controllers below, or in simulation instead of on servos."""
@@ -311,6 +316,11 @@ class Context(msgspec.Struct, frozen=True):
     is active already stays as it is. An event says what was done, or why it was refused."""
     end_run: Callable[[str], None] = _end_nothing
     """Request that the run ends behind this cycle, by the policy `on_fault`, and why, in words."""
+
+    @property
+    def device_commands(self) -> Floats:
+        """The same as `source_commands`: devices were the first sources with commands."""
+        return self.source_commands
 
 
 class Controller(ABC, Generic[P]):

@@ -17,6 +17,7 @@ import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 from dxlrun.description.frames.tree import FramesPlan
+from dxlrun.description.source_names import SOURCE_COMMAND, SOURCE_COMMANDS
 from dxlrun.messages import Header, JointState, Quaternion, String, Time, Vector3
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import RULE, MessageType
@@ -159,8 +160,8 @@ def _cycle_text() -> str:
         "# hardware_error: of the model's error item, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
         "# reference: in the order of the metadata's references. torque: 0 not known, 1 on, 2 in doubt,",
-        "# 3 off, 4 switched off on request, 5 lost, 6 reboots on request. source_state, device_command:",
-        "# in the order of the metadata's sources and device_commands, SI units.",
+        f"# 3 off, 4 switched off on request, 5 lost, 6 reboots on request. source_state, {SOURCE_COMMAND}:",
+        f"# in the order of the metadata's sources and {SOURCE_COMMANDS}, SI units.",
         "# Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
@@ -285,8 +286,8 @@ class LogHeader(msgspec.Struct, frozen=True):
     """Names of the cycles' references: `arm_pid/shoulder/position`."""
     sources: dict[str, tuple[str, ...]] = {}
     """Devices, sensors and controllers that provide states, each with the names of its states."""
-    device_commands: tuple[str, ...] = ()
-    """Names of the cycles' commands of devices: `light/led`."""
+    source_commands: tuple[str, ...] = msgspec.field(default=(), name=SOURCE_COMMANDS)
+    """Names of the cycles' commands of sources: `light/led`."""
     source_units: dict[str, str] = {}
     """SI units of the states of sources, by `imu/angular_velocity.x`; logs of earlier versions have none."""
     attachments: dict[str, bytes] = {}
@@ -314,7 +315,7 @@ class LogHeader(msgspec.Struct, frozen=True):
             epoch_offset_ns=epoch_offset_ns,
             references=loop.references,
             sources=loop.source_states,
-            device_commands=loop.source_commands,
+            source_commands=loop.source_commands,
             source_units=loop.source_units,
             robot_description=plan.urdf,
             frames=plan.frames,
@@ -324,7 +325,7 @@ class LogHeader(msgspec.Struct, frozen=True):
     def layout(self) -> CycleLayout:
         """Of the cycles' records."""
         names = [controller.name for controller in self.controllers]
-        return CycleLayout(self.joints, names, self.references, self.sources, self.device_commands)
+        return CycleLayout(self.joints, names, self.references, self.sources, self.source_commands)
 
 
 _SPAN = struct.Struct("=qq")
@@ -405,18 +406,18 @@ class LogClosed(msgspec.Struct, frozen=True, tag=True):
 
 
 _TEXTS = {
-    one.name: one.type
+    one.encode_name: one
     for one in msgspec.structs.fields(LogHeader)
     if one.name not in {"attachments", "metadata", "robot_description", "frames"}
 }
-"""What the metadata have of the header, and its types: JSON, but texts as they are."""
+"""Fields of the header in the metadata, by the metadata's names: JSON, but texts as they are."""
 _ADDED = frozenset({"source_units"})
 """Names that logs of the same format did not always have."""
 
 
 def to_metadata(header: LogHeader) -> dict[str, str]:
     """Return the header as text for the metadata, without attachments, metadata, URDF and frames."""
-    values = {name: getattr(header, name) for name in _TEXTS}
+    values = {name: getattr(header, field.name) for name, field in _TEXTS.items()}
     return {"format": FORMAT} | {
         name: value if isinstance(value, str) else msgspec.json.encode(value).decode()
         for name, value in values.items()
@@ -432,8 +433,8 @@ def from_metadata(text: dict[str, str]) -> LogHeader:
         )
     try:
         values = {
-            name: text[name] if kind is str else msgspec.json.decode(text[name])
-            for name, kind in _TEXTS.items()
+            name: text[name] if field.type is str else msgspec.json.decode(text[name])
+            for name, field in _TEXTS.items()
             if name in text or name not in _ADDED
         }
         return msgspec.convert(values, LogHeader)

@@ -11,6 +11,7 @@ import msgspec
 
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
+from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.features import FEATURES
 from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import SLOW_SPEEDS, PolicyPlan
@@ -323,7 +324,7 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
     topics: tuple[str, ...] = ()  # Its own topics: `/arm/state`
     provides: tuple[str, ...] = ()  # States that it provides to others: `orientation.x`
-    source_commands: tuple[str, ...] = msgspec.field(default=(), name="device_commands")
+    source_commands: tuple[str, ...] = msgspec.field(default=(), name=SOURCE_COMMANDS)
     """Commands of sources that it claims: `light/led`; logs have the name of the first kind of source."""
     takeovers: tuple[str, ...] = ()  # Controllers that it may let take over
     partial: bool = False  # It goes on with its other joints while some have no torque

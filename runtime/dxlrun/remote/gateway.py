@@ -42,6 +42,7 @@ from dxlrun.channels.loop_requests import (
 )
 from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import parse_motion
+from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan, JointValues
@@ -63,7 +64,7 @@ from dxlrun.remote.named.joints import (
     require_reboots,
     states_of,
 )
-from dxlrun.remote.named.named_commands import INTERFACES, SOURCE_VALUES, joint_command, source_command
+from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source_command
 from dxlrun.remote.named.parameters import Change, changed, parameters_of
 from dxlrun.remote.network.commander import Commander
 from dxlrun.remote.network.openapi import openapi
@@ -447,7 +448,7 @@ class GatewayApp:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         kind, content = asked.part("kind"), asked.body
         query, source = asked.http.query_params, self._commanded.get(asked.part())
-        if source is not None and kind == SOURCE_VALUES:
+        if source is not None and kind == SOURCE_COMMANDS:
             name, content = source_command(
                 source, content, self._plans(), self._active, self._preparation.takes
             )
@@ -552,7 +553,7 @@ class GatewayApp:
         plan, joint, states = self._link.plan, asked.part(), self._states()
         if (source := states.source(joint)) is not None:
             return {"source": joint, "cycle": states.cycle, **source}
-        joint_row(plan, joint, (*states.sources, *states.source_states, *states.device_commands))
+        joint_row(plan, joint, states.source_names)
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
         return {"joint": joint, "cycle": states.cycle, **states.joint(joint), **units}
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from dxlrun.channels.packets import LoggedPacket as LoggedPacket
     from dxlrun.channels.ring import RING_SECONDS as RING_SECONDS
     from dxlrun.control.steering import Play as Play
+    from dxlrun.description.source_names import SOURCE_COMMAND as SOURCE_COMMAND
     from dxlrun.log.machine import load_sample as load_sample
     from dxlrun.plan.machine_load import LoadMeter as LoadMeter
     from dxlrun.plan.machine_load import LoadSample as LoadSample

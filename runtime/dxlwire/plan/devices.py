@@ -1,14 +1,13 @@
-"""Devices: which bytes of a device are read each cycle, by how many reads, and where its commands stand."""
+"""Devices: which bytes of a device are read each cycle and by how many reads."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dxlwire.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
+from dxlwire.bus_plan import DeviceBlock, DeviceField, Field
 from dxlwire.control_table.device_table import DeviceItem, DeviceTable
 from dxlwire.plan.line import MOST_SPARE, Line
 
-HIGHEST_FLOAT32 = 3.4028234663852886e38
 MOST_BYTES = 120  # The longest block of one read: a device has a small buffer [i]
 
 
@@ -30,28 +29,6 @@ def device_blocks(
         else:
             runs.append([(name, item)])
     return tuple(_block(table, run, columns) for run in runs)
-
-
-def device_command(name: str, item: DeviceItem, column: int) -> DeviceCommand:
-    """Return a command by its item."""
-    most = HIGHEST_FLOAT32 * abs(item.scale)
-    ends = (item.offset - most, item.offset + most)
-    if item.encoding != "float32":
-        values = [tick * item.scale + item.offset for tick in (item.minimum, item.maximum)]
-        ends = (min(values), max(values))
-    return DeviceCommand(
-        name=name,
-        item=item.name,
-        address=item.address,
-        size=item.size,
-        encoding=item.encoding,
-        scale=item.scale,
-        offset=item.offset,
-        lowest=ends[0],
-        highest=ends[1],
-        column=column,
-        safe=None if item.safe is None else item.safe * item.scale + item.offset,
-    )
 
 
 def _together(line: Line, table: DeviceTable, run: Sequence[DeviceItem], item: DeviceItem) -> bool:

@@ -63,11 +63,12 @@ def send(
     """
     from dxlrun.channels.answers import Code
     from dxlrun.cli.steering.written import Written
+    from dxlrun.description.source_names import SOURCE_COMMANDS
     from dxlrun.description.units import duration
 
     for_device = "=" in kind
     if for_device:
-        words, kind = (kind, *words), "device_commands"
+        words, kind = (kind, *words), SOURCE_COMMANDS
     written = Written.read(words, file)
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.contribution import BusDevice, Compilation, CompileStage, Contribution
@@ -18,12 +20,13 @@ from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.devices import form
 from dxlrun.features.devices.form import Device
+from dxlrun.features.devices.plan import DeviceCommand
 from dxlrun.features.devices.simulate import simulated_states
 from dxlrun.plan.loop_plan import SourcePlan
-from dxlwire.bus_plan import DeviceCommand, DevicePlan
+from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import DeviceItem, DeviceTable, read_device_table
 from dxlwire.control_table.devices import device_table, perhaps_meant_device
-from dxlwire.plan.devices import device_blocks, device_command
+from dxlwire.plan.devices import device_blocks
 from dxlwire.plan.line import Line
 from dxlwire.wire.dialect import dialect_of
 
@@ -38,7 +41,9 @@ def compile_devices(compilation: Compilation) -> Contribution:
     sources: list[SourcePlan] = []
     devices: list[BusDevice] = []
     texts: dict[str, str] = {}
-    states = commands = 0
+    by_device: dict[str, tuple[DeviceCommand, ...]] = {}
+    commands: list[DeviceCommand] = []
+    states = 0
     for name, device in described.items():
         _check_place(file, name, device)
         table = _table(file, name, device)
@@ -56,22 +61,18 @@ def compile_devices(compilation: Compilation) -> Contribution:
             model_number=table.model_number,
             source=len(sources),
             blocks=device_blocks(_line(bus), table, read, states),
-            commands=_with_safe_values(
-                file,
-                name,
-                {
-                    each: device_command(each, item, commands + index)
-                    for index, (each, item) in enumerate(written.items())
-                },
-            ),
         )
+        columns = count(len(commands))
+        own = {each: DeviceCommand.build(each, item, next(columns)) for each, item in written.items()}
+        by_device[name] = _with_safe_values(file, name, own)
+        commands += by_device[name]
         sources.append(
             SourcePlan(
                 name=name,
                 kind="device",
                 states=tuple(read),
                 commands=tuple(written),
-                ranges=tuple((command.lowest, command.highest) for command in plan.commands),
+                ranges=tuple((command.lowest, command.highest) for command in by_device[name]),
                 label=f"{name} (ID {device.id} on bus {device.bus})",
                 commandable=True,
                 units=_units(read),
@@ -84,7 +85,6 @@ def compile_devices(compilation: Compilation) -> Contribution:
         if (path := _file(file.description, name, device)) is not None:
             texts[str(path)] = table.text
         states += len(read)
-        commands += len(written)
     return Contribution(
         names=tuple(described),
         buses=frozenset(device.bus for device in described.values()),
@@ -92,6 +92,7 @@ def compile_devices(compilation: Compilation) -> Contribution:
         devices=tuple(devices),
         links={name: each.simulation.link for name, each in described.items() if each.simulation.link},
         texts=texts,
+        plan=msgspec.json.encode(by_device) if commands else b"",
     )
 
 

@@ -15,7 +15,8 @@ from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.bus_part import BusContext, BusStage
 from dxlrun.features.devices.checks import inspect_device, survey_devices
-from dxlwire.bus_plan import DeviceCommand, DevicePlan
+from dxlrun.features.devices.plan import DeviceCommand, decode_devices
+from dxlwire.bus_plan import DevicePlan
 from dxlwire.exchange.cyclic_reads import MOST_BROKEN
 from dxlwire.exchange.idle import Urgency
 from dxlwire.plan.line import Line
@@ -68,7 +69,11 @@ class Devices:
         self._turns = [0] * len(plan.devices)  # how often each was probed
         self._flaps = [0] * len(plan.devices)  # losses in a row right after a return
         self._errors = [0] * len(plan.devices)  # error byte of each, as reported
-        self._written = [[_Written() for _ in device.commands] for device in plan.devices]
+        commands = decode_devices(context.plan)
+        self._written = [
+            [(command, _Written()) for command in commands.get(device.name, ())] for device in plan.devices
+        ]
+        """Commands of each device, and what was written of them."""
 
     # The cyclic reads
 
@@ -176,7 +181,7 @@ class Devices:
         self._joined_ns[index] = self._idle.now_ns()
         for member in self._members[index]:
             self._reads.join(member)
-        for written in self._written[index]:
+        for _, written in self._written[index]:
             written.data = b""  # it may have started anew
         if loss.reported:
             self._report(EventCode.DEVICE_BACK, Severity.INFO, index, "is in order and is read again")
@@ -191,7 +196,7 @@ class Devices:
 
         One that nothing commands any more becomes its safe value.
         """
-        for command, written in zip(self._plan.devices[index].commands, self._written[index], strict=True):
+        for command, written in self._written[index]:
             value = float(self._commands[command.column])
             if math.isnan(value):
                 if command.safe is None or not written.commanded:

@@ -74,6 +74,11 @@ class RobotStates(msgspec.Struct, frozen=True):
     command_units: dict[str, str] = {}
     """SI units of the commands of sources that have one, by `board/fan`."""
 
+    @property
+    def source_names(self) -> tuple[str, ...]:
+        """Names of sources, of their states and of their commands."""
+        return (*self.sources, *self.source_states, *self.device_commands)
+
     def joint(self, name: str) -> dict[str, object]:
         """Return the row of a joint by names of fields, `age` in s; None: not known. Raises ValueError."""
         row = self.joints.index(name)

@@ -12,6 +12,7 @@ from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.loop_requests import Register, RegisterReading
 from dxlrun.compile.joints.register_values import UnfitRegister, steered_value
 from dxlrun.description.joints.groups import ALL
+from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -43,7 +44,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         "controller_ns": record.controller_ns[[*timed.values()]],
     }
     return RobotStates(
-        **arrays | special,
+        **arrays | special | {SOURCE_COMMANDS: layout.source_commands},
         time_ns=record.woken_ns,
         late_ns=record.woken_ns - record.scheduled_ns,
         joints=layout.joints,
@@ -52,7 +53,6 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         references=layout.references,
         source_states=layout.source_states,
         sources=layout.sources,
-        device_commands=layout.source_commands,
         controllers=tuple(timed),
         source_units=plan.loop.source_units,
         command_units=plan.loop.command_units,

@@ -19,12 +19,11 @@ from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
+from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
-SOURCE_VALUES = "device_commands"
-"""Command of controllers that take values for sources, such as devices: `{"values": {"board/led": 1}}`."""
 POINT_SPEED = 0.5
 """rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
 _SHORTEST_S = 0.1
@@ -237,9 +236,9 @@ def _commander(
     """Return the active controller that takes values for a command of a source; raises RefusedRequest."""
     claiming = [plan for plan in controllers if name in plan.source_commands]
     now = [plan for plan in claiming if active(plan)]
-    if now and SOURCE_VALUES in takes(now[0]):
+    if now and SOURCE_COMMANDS in takes(now[0]):
         return now[0].name
-    able = [plan.name for plan in claiming if SOURCE_VALUES in takes(plan)]
+    able = [plan.name for plan in claiming if SOURCE_COMMANDS in takes(plan)]
     if able:
         hint = f"`dxlrun switch --activate {able[0]}"
         hint += f" --deactivate {now[0].name}`" if now else "`"

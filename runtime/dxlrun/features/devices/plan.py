@@ -1,0 +1,74 @@
+"""Plan of the devices: the items of each device that controllers command."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import msgspec
+
+from dxlwire.bus_plan import SIGN
+
+if TYPE_CHECKING:  # the guardian reads no control tables
+    from dxlwire.control_table.device_table import DeviceItem
+
+HIGHEST_FLOAT32 = 3.4028234663852886e38
+
+
+class DeviceCommand(msgspec.Struct, frozen=True):
+    """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
+
+    name: str  # `led`
+    item: str  # As the control table has it
+    address: int
+    size: int
+    encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
+    scale: float
+    offset: float
+    lowest: float  # SI units
+    highest: float
+    column: int  # Of the command among the commands of sources in the cycle's record
+    safe: float | None = None
+    """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
+
+    @classmethod
+    def build(cls, name: str, item: DeviceItem, column: int) -> DeviceCommand:
+        """Return a command by its item."""
+        most = HIGHEST_FLOAT32 * abs(item.scale)
+        ends = (item.offset - most, item.offset + most)
+        if item.encoding != "float32":
+            values = [tick * item.scale + item.offset for tick in (item.minimum, item.maximum)]
+            ends = (min(values), max(values))
+        return cls(
+            name=name,
+            item=item.name,
+            address=item.address,
+            size=item.size,
+            encoding=item.encoding,
+            scale=item.scale,
+            offset=item.offset,
+            lowest=ends[0],
+            highest=ends[1],
+            column=column,
+            safe=None if item.safe is None else item.safe * item.scale + item.offset,
+        )
+
+    def data(self, value: float) -> bytes:
+        """Return what is written for a value, SI units, inside of its range; little-endian."""
+        exact = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
+        if self.encoding == "float32":
+            return struct.pack("<f", exact)
+        number = round(exact)
+        if self.encoding == "sign_magnitude":
+            number = abs(number) | (SIGN if number < 0 else 0)
+        return number.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
+
+
+DevicesPlan: TypeAlias = Mapping[str, tuple[DeviceCommand, ...]]
+"""Commands of each device, in the order of the record, by the device's name."""
+
+
+def decode_devices(plan: bytes) -> DevicesPlan:
+    """Return the commands of `Contribution.plan` by device; none for an empty one."""
+    return msgspec.json.decode(plan, type=dict[str, tuple[DeviceCommand, ...]]) if plan else {}
