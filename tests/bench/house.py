@@ -19,6 +19,9 @@ feature commits, the imported names, the files and the functions.
 - **A mention** is a match of a feature's pattern (`MENTIONS`) in code: not in a docstring, a comment or a
   text with blanks, such as a message. A feature's own folder is not counted, nor are tests.
 - **A function without an object** is a public function or method whose name is one of `BARE_VERBS`.
+- **A parameter** is one of a function or method, without `self` and those of protocols, or a field of
+  a dataclass that its constructor takes. It is **only handed on** if each use is an argument of a call, or
+  an assignment to an attribute of `self` of which each use in the class is an argument of a call.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 CODE = (".py", ".pyi", ".c", ".h")
 LAST = 40
+MOST_PARAMETERS = 8
+"""Constructors with more of them are listed."""
 NO_FEATURES = ("packages: describe what belongs in each folder and what does not",)
 """Subjects of commits that add as many lines as a feature, but only docstrings."""
 LIBRARIES = ("dxlrun", "dxlwire", "dxlsim")
@@ -209,6 +214,101 @@ def bare_functions(texts: dict[str, str]) -> Iterator[tuple[str, str]]:
                     yield path, node.name
 
 
+class Parameter(NamedTuple):
+    """One parameter of a function, a method or a constructor."""
+
+    path: str
+    owner: str
+    """Name of the function; of a constructor that of the class."""
+    is_built: bool
+    """True for a constructor."""
+    handed_on: bool
+
+
+def parameters(texts: dict[str, str]) -> Iterator[Parameter]:
+    """Yield each parameter of the functions and the dataclasses."""
+    for path, text in texts.items():
+        tree = ast.parse(text if path.endswith(".py") else "")
+        parents = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
+        for node in ast.walk(tree):
+            holder = parents.get(node)
+            owner = holder if isinstance(holder, ast.ClassDef) else None
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                if owner is not None and "Protocol" in "".join(map(ast.unparse, owner.bases)):
+                    continue
+                built = owner is not None and node.name == "__init__"
+                for name in _names_of(node, method=owner is not None):
+                    handed_on = _is_handed_on(node, name, owner, parents)
+                    yield Parameter(path, owner.name if built and owner else node.name, built, handed_on)
+            elif isinstance(node, ast.ClassDef):
+                for name in _fields_of(node):
+                    handed_on = name.startswith("_") and _is_attribute_handed_on(node, name, parents)
+                    yield Parameter(path, node.name, True, handed_on)
+
+
+def _names_of(node: ast.FunctionDef | ast.AsyncFunctionDef, *, method: bool) -> list[str]:
+    given = node.args
+    names = [one.arg for one in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    is_static = any(ast.unparse(one) == "staticmethod" for one in node.decorator_list)
+    return names[1:] if method and not is_static else names
+
+
+def _fields_of(node: ast.ClassDef) -> Iterator[str]:
+    """Yield the fields of a dataclass that its constructor takes."""
+    if not any(ast.unparse(one).startswith("dataclass") for one in node.decorator_list):
+        return
+    for line in node.body:
+        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+            text = ast.unparse(line)
+            if "ClassVar" not in text and "init=False" not in text:
+                yield line.target.id
+
+
+def _is_argument(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> bool:
+    while isinstance(parents[node], ast.keyword | ast.Starred):
+        node = parents[node]
+    call = parents[node]
+    return isinstance(call, ast.Call) and node is not call.func
+
+
+def _is_handed_on(
+    function: ast.AST, name: str, owner: ast.ClassDef | None, parents: dict[ast.AST, ast.AST]
+) -> bool:
+    uses = [one for one in ast.walk(function) if isinstance(one, ast.Name) and one.id == name]
+    return bool(uses) and all(
+        _is_argument(one, parents) or _is_attribute_handed_on(owner, _kept_as(parents[one], one), parents)
+        for one in uses
+    )
+
+
+def _kept_as(statement: ast.AST, value: ast.AST) -> str:
+    """Return the attribute in `self.attribute = value`; empty: it is another statement."""
+    if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is value:
+        targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+        holder, _, attribute = ast.unparse(targets[0]).partition(".")
+        return attribute if holder == "self" and len(targets) == 1 else ""
+    return ""
+
+
+def _is_attribute_handed_on(owner: ast.ClassDef | None, name: str, parents: dict[ast.AST, ast.AST]) -> bool:
+    nodes = ast.walk(owner) if owner is not None and name else ()
+    uses = [
+        one
+        for one in nodes
+        if isinstance(one, ast.Attribute)
+        and isinstance(one.ctx, ast.Load)
+        and ast.unparse(one) == f"self.{name}"
+    ]
+    return bool(uses) and all(_is_argument(one, parents) for one in uses)
+
+
+def large_constructors(found: Iterable[Parameter]) -> list[tuple[int, str, str]]:
+    """Return parameters, path and name of the constructors of more than MOST_PARAMETERS, largest first."""
+    counts = Counter((one.path, one.owner) for one in found if one.is_built)
+    large = [(count, path, owner) for (path, owner), count in counts.items() if count > MOST_PARAMETERS]
+    return sorted(large, reverse=True)
+
+
 def print_rows(title: str, heads: Iterable[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: a title, the heads of its columns of numbers, and its rows."""
     print(f"\n{title:40}" + "".join(f"{head:>14}" for head in heads))
@@ -281,11 +381,23 @@ def main() -> None:
     print_rows("Public functions without an object", ("functions",), [("in all", len(bare)), *often])
     listed(f"{path}: {name}" for path, name in bare)
 
+    found = [*parameters(product)]
+    large = large_constructors(found)
+    handed_on = Counter(room_of(one.path) for one in found if one.handed_on)
+    given = Counter(room_of(one.path) for one in found)
+    share = f"{100 * handed_on.total() / given.total():.1f} %"
+    whole_share = ("in all", given.total(), handed_on.total(), share)
+    print_rows("Parameters", ("parameters", "handed on", "share"), [whole_share])
+    print_rows("Constructors", (f"of over {MOST_PARAMETERS}",), [("in all", len(large))])
+    listed(f"{path}: {owner} {count}" for count, path, owner in large)
+
     lines: Counter[str] = Counter()
     in_room = Counter(room_of(path) for path in product)
     for path, text in product.items():
         lines[room_of(path)] += text.count("\n")
-    print_rows("Rooms", ("lines", "files"), [(room, lines[room], in_room[room]) for room in sorted(in_room)])
+    heads = ("lines", "files", "parameters", "handed on")
+    rooms = [(room, lines[room], in_room[room], given[room], handed_on[room]) for room in sorted(in_room)]
+    print_rows("Rooms", heads, rooms)
     tests = [text.count("\n") for path, text in texts.items() if path not in product]
     whole = [("product", lines.total(), len(product)), ("tests", sum(tests), len(tests))]
     print_rows("The whole", ("lines", "files"), whole)
