@@ -126,14 +126,16 @@ class LoggedPlan(msgspec.Struct):
     def movers(self) -> dict[str, tuple[Mover, ...]]:
         """The servos that move each joint, by its name."""
         servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
-        coupled = {row for one in self.mechanics.couplings for row in one.servos}
+        # by name, as the plan of a damaged log may lack the joints
         found: dict[str, tuple[Mover, ...]] = {
             servo.joint: (Mover(bus, servo, servo.ratio),)
             for bus in self.buses
             for servo in bus.servos
-            if servo.row not in coupled
+            if not servo.name
         }
-        for one in self.mechanics.couplings:
+        for one in self.mechanics.mechanisms(len(self.loop.joints)):
+            if not servos.keys() >= {*one.servos}:
+                continue
             for joint, factors in zip(one.joints, one.matrix, strict=True):
                 found[self.loop.joints[joint].name] = tuple(
                     Mover(*servos[row], abs(factor) * servos[row][1].ratio)

@@ -57,7 +57,7 @@ def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -
         ]
     pair = [servo(0, JOINTS[0], name="hip/1"), servo(1, JOINTS[0], name="hip/2"), servo(2, JOINTS[1])]
     one = structs.asdict(CouplingPlan("hip", (0,), (0, 1), ((0.5, 0.5),), ()))
-    movers = msgspec.convert(plan(pair, couplings=[one]), LoggedPlan).movers
+    movers = msgspec.convert(plan(pair, couplings=[one], direct=[(1, 2)]), LoggedPlan).movers
     assert sum(each.share for each in movers[JOINTS[0]]) == pytest.approx(1.0)
     assert [each.servo.own_name for each in movers[JOINTS[0]]] == ["hip/1", "hip/2"]
     assert [each.servo.servo_id for each in movers[JOINTS[1]]] == [3]

@@ -127,9 +127,8 @@ def _look(result: Compiled, packets: BusesLog) -> Found:
             f"every bus of {result.plan.robot} is simulated, so there are no servos to read; "
             "give it a port, such as port:=/dev/ttyUSB0"
         )
-    mechanics, joints = result.plan.mechanics, result.plan.loop.joints
-    alone = mechanics.direct if mechanics.coupled else [(row, row) for row in range(len(joints))]
-    moved = {servo: joints[joint] for joint, servo in alone}
+    joints = result.plan.loop.joints
+    moved = {servo: joints[joint] for joint, servo in result.plan.mechanics.own_servos(len(joints))}
     return look(buses, packets.of(result.plan.buses), moved)
 
 

@@ -23,7 +23,7 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import report_speed
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import SpeedPeak
-from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
+from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.graph import below, rate_divider, rate_fits
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.controllers.single_files import file_of, is_of_file
@@ -342,7 +342,7 @@ def _check(
     if not controller.plan.command or controller.plan.into:
         return
     mode = mode_of(controller.plan.command)
-    if (parted := parted_couplings(controller.plan, [joint.plan for joint in joints.values()])) is not None:
+    if (parted := controller.plan.split_group(joint.plan for joint in joints.values())) is not None:
         at, rest = parted
         file.error(
             joint_mark(file.description, name, at),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -17,7 +17,7 @@ from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import SLOW_SPEEDS, PolicyPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
-from dxlwire.modes import Mode
+from dxlwire.modes import Mode, mode_of
 
 if TYPE_CHECKING:
     from dxlrun.channels.cycle import CycleLayout
@@ -333,6 +333,20 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     def commands_servos(self) -> bool:
         """True when its claims are the servos' and not references of other controllers."""
         return bool(self.command) and not self.into
+
+    def split_group(self, joints: Iterable[JointPlan]) -> tuple[str, tuple[str, ...]] | None:
+        """Return a joint that it would bring into a mode without the others that the same servos move.
+
+        Those stay in the mode in which they rest, and a servo has one mode. None: there is no such joint.
+        """
+        if not self.commands_servos:
+            return None
+        mode = mode_of(self.command)
+        for joint in joints:
+            others = tuple(name for name in joint.coupled if name not in self.joints)
+            if others and joint.name in self.joints and mode is not joint.rest:
+                return joint.name, others
+        return None
 
     @property
     def references(self) -> tuple[str, ...]:

@@ -39,9 +39,24 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
         """True when there are joints that one servo alone does not move."""
         return bool(self.couplings)
 
+    def mechanisms(self, joints: int) -> tuple[CouplingPlan, ...]:
+        """Return all servos with what they move, by the number of joints: a servo's own joint is 1 x 1."""
+        alone = tuple(
+            CouplingPlan("", (joint,), (servo,), ((1.0,),), ((1.0,),))
+            for joint, servo in self.own_servos(joints)
+        )
+        return alone + self.couplings
+
+    def own_servos(self, joints: int) -> tuple[tuple[int, int], ...]:
+        """Return the rows of each joint with a servo of its own and of that servo."""
+        return self.direct if self.coupled else tuple((row, row) for row in range(joints))
+
+    def moving(self, joint: int) -> list[CouplingPlan]:
+        """Return what moves a joint that has no servo of its own, by its row; empty: it has one."""
+        return [one for one in self.couplings if joint in one.joints]
+
     def servo_rows(self, joint: int) -> tuple[int, ...]:
         """Return the rows of the servos that move a joint, which is the servo's own row in an empty plan."""
-        for coupling in self.couplings:
-            if joint in coupling.joints:
-                return coupling.servos
+        for one in self.moving(joint):
+            return one.servos
         return tuple(servo for row, servo in self.direct if row == joint) or (joint,)

@@ -72,7 +72,7 @@ def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
         if len(mine) == 1:
             found[joint.name] = _facts(plan, joint, *mine[0])
             continue
-        facts = {"mechanics": _short([each for each in plan.mechanics.couplings if row in each.joints])}
+        facts = {"mechanics": _short(plan.mechanics.moving(row))}
         for bus, servo in mine:
             of_one = _facts(plan, joint, bus, servo)
             facts |= {f"{key} of {servo.own_name}": value for key, value in of_one.items()}

@@ -94,24 +94,6 @@ def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
     }
 
 
-def parted_couplings(
-    controller: ControllerPlan, joints: Iterable[JointPlan]
-) -> tuple[str, tuple[str, ...]] | None:
-    """Return a joint that a controller would bring into a mode without the others that its servos move.
-
-    Those stay in the mode in which they rest, and a servo has one mode. None: it parts none.
-    """
-    if not controller.commands_servos:
-        return None
-    mode = mode_of(controller.command)
-    for joint in joints:
-        if joint.coupled and joint.name in controller.joints and mode is not joint.rest:
-            others = tuple(name for name in joint.coupled if name not in controller.joints)
-            if others:
-                return joint.name, others
-    return None
-
-
 def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPlan]) -> dict[str, Mode]:
     """Return the mode in which each joint begins a run, by its name: what the controllers need that are
     active from the start, else its rest mode."""

@@ -17,7 +17,7 @@ from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.claims import conflicts, parted_couplings
+from dxlrun.control.controllers.claims import conflicts
 from dxlrun.control.controllers.goals import Commanded, Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import Plans, commander, rate_divider, rate_fits, update_order
 from dxlrun.control.controllers.keeping import Keeping
@@ -448,7 +448,7 @@ class Manager:
             yield Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
         if unknown := tuple(joint for joint in plan.joints if joint not in layout.joints):
             yield Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
-        if (parted := parted_couplings(plan, self._plan.joints)) is not None:
+        if (parted := plan.split_group(self._plan.joints)) is not None:
             joint, others = parted[0], " and ".join(parted[1])
             problem = f"it commands another mode of {joint} without {others}, which the same servos move"
             yield Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
