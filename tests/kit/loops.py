@@ -325,8 +325,7 @@ class Robot:
         missing = {"broken_one": "plug-in broken_one of x 1 cannot be imported"}
         plugins = PlugIns(self._offers, missing, after_each=self._after_each)
         self.manager = Manager(context, plugins, activity=activity)
-        self.gate = Gate(self.plan, self.record, self.events)
-        self.loop = Loop(context, self.manager, self.gate, self.sink, overrun_hooks=overrun_hooks)
+        self.loop = Loop(context, self.manager, self.sink, overrun_hooks=overrun_hooks)
         self.manager.configure()
         self.hardware.start()
         return self

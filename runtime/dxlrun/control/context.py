@@ -61,7 +61,7 @@ class Unsupervised:
 class ControlContext:
     """One robot under control, from its assembly to the end of its loop.
 
-    Built once a run. What a cycle reads of it is bound by its users when they are built.
+    Built once a run. Its users bind what a cycle reads when they are built.
     """
 
     plan: LoopPlan

@@ -74,25 +74,23 @@ class Loop:
         self,
         context: ControlContext,
         manager: Manager,
-        gate: Gate,
         sink: CycleSink,
         *,
         overrun_hooks: tuple[OverrunHook, ...] = (),
         sensors: Sensors | None = None,
     ) -> None:
-        """Build everything of the control side but the controllers and the gate.
+        """Build everything of the control side but the controllers.
 
         Args:
             context: The run.
             manager: Its controllers, whether they are configured by now or not.
-            gate: Limits of its goals.
             sink: Takes its cycles.
             overrun_hooks: Plug-ins that decide what becomes of a late cycle.
             sensors: None: the robot has none, or a replay's record has them already.
         """
         self.context = context
         self.manager = manager
-        self.gate = gate
+        self.gate = Gate(context.plan, context.record, context.events)
         self.sink = sink
         self.sensors = sensors
         # read in each cycle
@@ -110,9 +108,9 @@ class Loop:
         self._all_valid = bytes([True]) * joints
         self._skipped = 0
         self._late = False
-        self._actions = PolicyActions(context, manager, gate)
+        self._actions = PolicyActions(context, manager, self.gate)
         self._monitors = build_monitors(context.plan, context.record, self._actions)
-        self.steering = Steering(context, manager, gate, self._actions)
+        self.steering = Steering(context, manager, self.gate, self._actions)
         self._anchoring = self.steering.anchoring
         self._motion: SafeMotion | None = None
         self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}

@@ -27,7 +27,6 @@ from dxlrun.control.context import ControlContext, StopFlag, Unsupervised
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult
 from dxlrun.errors import LogError, PortError
 from dxlrun.features import find_installed
@@ -378,9 +377,7 @@ class RecordedRun:
             LogError: The log is damaged.
             ControllerFault: A controller cannot be configured.
         """
-        context = self._context
-        gate = Gate(context.plan, context.record, context.events)
-        loop = Loop(context, self._manager, gate, _ComparingSink(self._hardware, compare))
+        loop = Loop(self._context, self._manager, _ComparingSink(self._hardware, compare))
         self._row(0)  # what is published before the first cycle finds its messages
         self._manager.configure()
         self._hardware.start()

@@ -19,7 +19,6 @@ from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.dynamixel.bus_part import FeatureParts
@@ -163,8 +162,7 @@ def assemble(
     )
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(context, plugins, activity=host.activity, topics=topics, kept=kept)
-    gate = Gate(plan.loop, record, sinks.events)
     sensors = Readings(plan.loop, host.slots, record, host.clock.now_ns, sinks.events) if host.slots else None
-    loop = Loop(context, manager, gate, sinks, overrun_hooks=plugins.overrun_hooks, sensors=sensors)
+    loop = Loop(context, manager, sinks, overrun_hooks=plugins.overrun_hooks, sensors=sensors)
     manager.configure()
     return AssembledRobot(context.hardware, manager, loop, record)
