@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dxlrun.channels import slot
-from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
+from dxlrun.channels.commands import CommandRing, Inbox, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
 from dxlrun.channels.messages import MessageRing, MessageSink
@@ -51,8 +51,9 @@ class VirtualRobot:
 
     `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
     for one in memory; it is closed with the log. `watch` is called with each record, in the cycle that leaves
-    it, as a recorder would get it. `kept`: directory of what controllers keep, None: it is forgotten. Every
-    bus of the plan is simulated, whatever its port.
+    it, as a recorder would get it. `kept`: directory of what controllers keep, None: it is forgotten.
+    `inbox`: commands for the loop in place of those in `self.inbox`. Every bus of the plan is simulated,
+    whatever its port.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
@@ -65,6 +66,7 @@ class VirtualRobot:
         ledger: Ledger | None = None,
         watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
         kept: Path | None = None,
+        inbox: Inbox | None = None,
     ) -> None:
         require_simulated(plan)
         self.plan = plan
@@ -115,7 +117,7 @@ class VirtualRobot:
             clock=self.clock,
             sinks=self.sinks,
             supervision=Unsupervised(self.stop),
-            inbox=self.inbox,
+            inbox=self.inbox if inbox is None else inbox,
             slots=slots,
         )
         self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)

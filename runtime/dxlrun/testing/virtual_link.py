@@ -79,8 +79,8 @@ class VirtualLink:
         messages = RingWriter(memory.messages)
         self._cycle_ring = RingWriter(memory.cycles)
         self._rings = {Event: RingWriter(memory.events), OpenedTopic: messages, TopicMessage: messages}
-        self.simulated = VirtualRobot(plan, log=log, watch=self._watch)
-        self.simulated.robot.loop.steering.inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
+        inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
+        self.simulated = VirtualRobot(plan, log=log, watch=self._watch, inbox=inbox)
         self.gateways_link = Link(plan, memory)
         for descriptor in astuple(memory):
             os.close(descriptor)
