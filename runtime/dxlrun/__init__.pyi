@@ -39,6 +39,7 @@ from dxlrun.description.units import LinearJerk as LinearJerk
 from dxlrun.description.units import LinearVelocity as LinearVelocity
 from dxlrun.description.units import Mass as Mass
 from dxlrun.description.units import RestSpeed as RestSpeed
+from dxlrun.description.units import Temperature as Temperature
 from dxlrun.description.units import Time as Time
 from dxlrun.description.units import Tolerance as Tolerance
 from dxlrun.description.units import Voltage as Voltage

@@ -11,7 +11,6 @@ from tests.kit.robots import compile_text
 
 from dxlrun.channels.events import EventCode
 from dxlrun.compile.buses import slowest_period_ns
-from dxlrun.compile.report import policy_rows
 from dxlrun.testing import read_log, simulated_robot
 
 ROBOT = """\
@@ -82,8 +81,8 @@ def test_slow_registers_and_who_gets_torque_back() -> None:
 
 def test_check_shows_the_policies_of_groups_and_of_returned_servos() -> None:
     pair = "pair: {joints: [pan, tilt], on_lost_servo: limp, on_returned_servo: hold}"
-    plan = compile_text(text(policies=f"groups: {{{pair}}}")).plan
-    shown = {row.name: row.does for row in policy_rows(plan)}
+    compiled = compile_text(text(policies=f"groups: {{{pair}}}"))
+    shown = {row.name: row.does for row in compiled.report["policies"]}
     assert shown["on_lost_servo of pair"] == "the group goes limp, the others go on"
     assert shown["on_returned_servo"] == "hold pan, tilt where they stand, the others limp"
 

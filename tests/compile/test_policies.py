@@ -10,7 +10,6 @@ import pytest
 from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
 
 from dxlrun.compile.policies import MARGIN_NS
-from dxlrun.compile.report import policy_rows
 from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
 from dxlwire.plan import planning as plan
 
@@ -60,8 +59,7 @@ def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second(
 
 
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop() -> None:
-    plan = compile_text(PAIR + POLICIES).plan
-    rows = {row.name: row for row in policy_rows(plan)}
+    rows = {row.name: row for row in compile_text(PAIR + POLICIES).report["policies"]}
     assert rows["on_exit"].does == (
         "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
     )

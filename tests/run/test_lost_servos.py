@@ -15,7 +15,7 @@ from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.control.monitors.lost_servos import LostServos, MissedReplies
+from dxlrun.features.lost_servos.monitor import LostServos, MissedReplies
 from dxlrun.plan.policy_plan import LIMP, GroupPolicy, PolicyPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
@@ -283,7 +283,7 @@ class NotedActions:
     def make_limp(self, rows: frozenset[int]) -> None:
         self.done.append(("limp", set(rows)))
 
-    def hold_controllers(self, lost: frozenset[int]) -> None:
+    def hold_controllers(self, lost: frozenset[int], until: str) -> None:
         self.done.append(("hold", set(lost)))
 
     def report(self, severity: Severity, text: str) -> None:

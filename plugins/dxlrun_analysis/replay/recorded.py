@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dxlrun import CONTRACT_VERSION, Log, LogError
 from dxlrun.tooling.logs import IDENTITY_NAME, UNREADABLE, changed_code
-from dxlrun.tooling.plans import LoopPlan, PolicyName, PolicyPlan, decode_plan
+from dxlrun.tooling.plans import LoopPlan, PolicyPlan, decode_plan
 from dxlrun.tooling.records import EventCode
 from dxlrun.tooling.robots import PlugIns
 from dxlrun.tooling.runs import RunInputs, kept_states_of
@@ -26,7 +26,7 @@ _LIBRARIES = ("dxlrun", "numpy")  # A different version of these may change a co
 class _Begun(msgspec.Struct):
     """Data of the command that marks the begin of a policy."""
 
-    policy: PolicyName
+    policy: str
 
 
 class RecordedPlan(msgspec.Struct, frozen=True):
@@ -326,7 +326,7 @@ def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
     if begun is None:
         return policies
     try:
-        name = msgspec.json.decode(begun.data, type=_Begun).policy
-    except UNREADABLE as error:
+        policy = policies.named(msgspec.json.decode(begun.data, type=_Begun).policy)
+    except (*UNREADABLE, KeyError) as error:
         raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
-    return replace(policies, on_exit=policies.named(name))
+    return replace(policies, on_exit=policy)

@@ -220,6 +220,7 @@ def _floor(rate: float) -> str:
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
     """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
     bus, joints = file.robot.buses[plan.name], first_joints(file.description)
+    policies = file.robot.policies
     items = bus.slow_registers.items
     return replace(
         plan,
@@ -229,7 +230,7 @@ def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
             replace(
                 servo,
                 slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
-                torque_on_return=_on_returned_servo(file.description, joints[servo.own_name]) == "hold",
+                torque_on_return=policies.of_joint("on_returned_servo", joints[servo.own_name]) == "hold",
                 torque_at_start=file.robot.joints[joints[servo.own_name]].torque,
             )
             for servo in plan.servos
@@ -252,14 +253,6 @@ def slowest_period_ns(buses: Sequence[BusPlan]) -> int:
     """Return the longest period in which no Bus Watchdog stops its servos, ns; 0: any."""
     armed = [bus.watchdog_ticks for bus in buses if any(has_one(bus, servo) for servo in bus.servos)]
     return min(armed) * UNIT_NS // LEAST_PERIODS if armed else 0
-
-
-def _on_returned_servo(description: Description, joint: str) -> str:
-    policies = description.robot.policies
-    for group in policies.groups.values():
-        if joint in group.joints and group.on_returned_servo is not None:
-            return group.on_returned_servo
-    return policies.on_returned_servo
 
 
 def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:

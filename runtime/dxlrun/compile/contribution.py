@@ -12,8 +12,10 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.description.robot import WrittenPolicy
 from dxlrun.plan.loop_plan import ControllerPlan, SensorPlan, SourcePlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlrun.plan.policy_plan import GroupPolicy
 from dxlsim.simulation_plan import Shown
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import DeviceTable
@@ -41,6 +43,17 @@ class BusDevice(msgspec.Struct, frozen=True):
     """Its states when the bus is simulated."""
 
 
+class PolicyEntry(msgspec.Struct, frozen=True):
+    """Policy of a feature."""
+
+    name: str
+    """Its key, or the key and a group: `on_lost_servo of wheels`."""
+    does: str
+    """Its action while the run continues, as `dxlrun check` shows it."""
+    steps: WrittenPolicy | None = None
+    """Steps by which it ends the run, as the file has them, where they are not `hold`; None: it has none."""
+
+
 class Contribution(msgspec.Struct, frozen=True):
     """The share of one feature in a plan."""
 
@@ -63,6 +76,10 @@ class Contribution(msgspec.Struct, frozen=True):
     """Processes that sample its sources."""
     mechanics: MechanicsPlan | None = None
     """Which servos move which joints, of the feature that knows."""
+    policies: tuple[PolicyEntry, ...] = ()
+    """Its policies, as `dxlrun check` shows them."""
+    group_policies: tuple[GroupPolicy, ...] = ()
+    """Groups of joints with a policy of their own for lost servos."""
 
 
 @dataclass(frozen=True)

@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
-from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
 from dxlrun.errors import suggestion
 from dxlrun.plan.policy_plan import (
     HOLD,
     LIMP,
-    POLICIES,
-    GroupPolicy,
     Last,
     Policy,
-    PolicyName,
     PolicyPlan,
     Step,
     longest_pose_ns,
@@ -34,29 +32,31 @@ _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
 
 def compile_policies(
-    file: RobotFile, joints: Mapping[str, CompiledJoint], buses: Sequence[BusPlan]
+    file: RobotFile,
+    joints: Mapping[str, CompiledJoint],
+    buses: Sequence[BusPlan],
+    contributions: Sequence[Contribution],
 ) -> PolicyPlan:
     """Return the policies of a file; add problems where they do not fit the robot or `exit_timeout`."""
     _check_poses(file, joints)
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
-    found: dict[PolicyName, Policy] = {}
-    for name in POLICIES:
-        found[name] = _policy(file, name, joints)
+    written = {"on_exit": robot.policies.on_exit, "on_fault": robot.policies.on_fault}
+    for entry in (entry for each in contributions for entry in each.policies):
+        if entry.steps is not None:
+            written[entry.name] = entry.steps
+    found: dict[str, Policy] = {}
+    for name, steps in written.items():
+        found[name] = _policy(file, name, steps, joints)
         if any(step.levels for step in found[name].steps):
-            _check_torque(file, name, buses)
+            _check_torque(file, name, steps, buses)
         if found[name].steps and found[name].longest_ns > limit_ns:
             _too_long(file, found[name], name, limit_ns)
         if found[name].last == "hold" and (name in ("on_exit", "on_fault") or not found[name].goes_on):
             _check_stopping(file, name, joints, limit_ns - found[name].longest_ns)
-    return PolicyPlan(
-        on_exit=found["on_exit"],
-        on_fault=found["on_fault"],
-        on_lost_servo=found["on_lost_servo"],
-        on_stale_command=found["on_stale_command"],
-        groups=_group_policies(file, joints),
-        limit_ns=max(0, limit_ns),
-    )
+    _check_groups(file, joints)
+    groups = tuple(group for each in contributions for group in each.group_policies)
+    return PolicyPlan.collect(found, groups, max(0, limit_ns))
 
 
 def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
@@ -78,8 +78,9 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
                     file.error(mark, what, f"it can go to {allowed}")
 
 
-def _policy(file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoint]) -> Policy:
-    written = getattr(file.robot.policies, name)
+def _policy(
+    file: RobotFile, name: str, written: WrittenPolicy, joints: Mapping[str, CompiledJoint]
+) -> Policy:
     if isinstance(written, str):
         return HOLD if written == "hold" else LIMP
     last: Last = "limp"
@@ -134,8 +135,7 @@ def _less_torque(step: TorqueStep) -> Step:
     return Step(text=text, longest_ns=step.over, fraction=step.reduce_torque, levels=step.steps)
 
 
-def _check_torque(file: RobotFile, name: PolicyName, buses: Sequence[BusPlan]) -> None:
-    steps = getattr(file.robot.policies, name)
+def _check_torque(file: RobotFile, name: str, steps: WrittenPolicy, buses: Sequence[BusPlan]) -> None:
     index = next(index for index, step in enumerate(steps) if isinstance(step, TorqueStep))
     for servo in (servo for bus in buses for servo in bus.servos):
         if servo.torque_limit is None:
@@ -146,9 +146,7 @@ def _check_torque(file: RobotFile, name: PolicyName, buses: Sequence[BusPlan]) -
             )
 
 
-def _check_stopping(
-    file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoint], left_ns: int
-) -> None:
+def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoint], left_ns: int) -> None:
     """Refuse joints that brake longer than a policy lasts that leaves them holding."""
     for joint in (joint.plan for joint in joints.values()):
         stop_s = 0.0 if joint.acceleration is None else joint.highest_speed / joint.acceleration
@@ -161,12 +159,10 @@ def _check_stopping(
             )
 
 
-def _group_policies(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tuple[GroupPolicy, ...]:
-    """Return the groups of joints with a policy of their own for lost servos."""
-    rows = {name: row for row, name in enumerate(joints)}
+def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
+    """Check that each joint is in one group at most, with all joints that the same servos move."""
     known = tuple(file.robot.joints)
     owner: dict[str, str] = {}
-    found = []
     for name, group in file.robot.policies.groups.items():
         at: KeyPath = ("policies", "groups", name)
         own = group.joints
@@ -194,10 +190,6 @@ def _group_policies(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tup
                 "the same servos move",
                 f"add {' and '.join(sorted(parted))}",
             )
-        members = frozenset(rows[joint] for joint in own if joint in rows)
-        if group.on_lost_servo is not None:
-            found.append(GroupPolicy(name, members, group.on_lost_servo))
-    return tuple(found)
 
 
 def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
@@ -205,7 +197,7 @@ def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
     return max(map(torque_off_ns, buses), default=0) + round(2e9 / rate) + MARGIN_NS
 
 
-def _too_long(file: RobotFile, policy: Policy, name: PolicyName, limit_ns: int) -> None:
+def _too_long(file: RobotFile, policy: Policy, name: str, limit_ns: int) -> None:
     timeout_ns = file.robot.policies.exit_timeout
     needed_s = (policy.longest_ns + timeout_ns - limit_ns) * 1e-9
     slowest = max(policy.steps, key=lambda step: step.longest_ns)

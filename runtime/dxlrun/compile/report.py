@@ -12,18 +12,17 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from dxlrun.compile.contribution import PolicyEntry
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.control.monitors import list_monitors
 from dxlrun.description.joints.joints import joint_keys, units_of_key
 from dxlrun.description.joints.mechanics import Limits
 from dxlrun.features import stages
 from dxlrun.features.feature import JointKey
 from dxlrun.output.table import Table
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, JointProperty, LoopPlan
-from dxlrun.plan.policy_plan import POLICIES
 from dxlrun.plan.robot_plan import MotionPart, Plan
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.joint_unit import LINEAR, ROTARY
@@ -46,7 +45,11 @@ class TableStage:
 
 
 def check_report(
-    plan: Plan, rate: float, joints: Sequence[CompiledJoint], parts: Sequence[MotionPart]
+    plan: Plan,
+    rate: float,
+    joints: Sequence[CompiledJoint],
+    parts: Sequence[MotionPart],
+    policies: Sequence[PolicyEntry],
 ) -> Row:
     """Return everything that was decided for a robot before a port opens, as JSON has it."""
     loop, buses = plan.loop, plan.buses
@@ -59,7 +62,7 @@ def check_report(
         **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage, plan.features)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],
-        "policies": policy_rows(plan),
+        "policies": policy_rows(plan, policies),
         "motions": [_motion(part) for part in parts],
         "graph": _graph(graph_of(loop)),
         "duration": None if loop.end_ns is None else loop.end_ns * 1e-9,
@@ -196,12 +199,6 @@ def _motion(part: MotionPart) -> Row:
     }
 
 
-_HELD = {
-    "on_lost_servo": "hold its controllers until it answers, the others go on",
-    "on_stale_command": "hold its joints until the next command",
-}
-
-
 class PolicyRow(msgspec.Struct, frozen=True):
     """What happens when something does not go on as planned."""
 
@@ -211,19 +208,16 @@ class PolicyRow(msgspec.Struct, frozen=True):
     without_loop: str  # What of it is left when the loop is gone: what the guardian does
 
 
-def policy_rows(plan: Plan) -> list[PolicyRow]:
-    """Return what happens when something does not go on as planned."""
-    policies = plan.loop.policies
-    found: list[tuple[str, str, float]] = []
-    for name in POLICIES:
-        policy = policies.named(name)
-        does = _HELD.get(name, policy.text) if policy.goes_on else policy.text
-        found.append((name, does, policy.longest_ns * 1e-9))
-    for monitor in list_monitors(plan.features):
-        found += ((name, does, 0.0) for name, does in monitor.rows(policies))
-    found.append(("on_returned_servo", _on_returned_servo(plan.buses), 0.0))
-    alone = policies.on_fault.last
-    return [PolicyRow(name, does, longest, alone) for name, does, longest in found]
+def policy_rows(plan: Plan, entries: Sequence[PolicyEntry]) -> list[PolicyRow]:
+    """Return what happens when something does not go on as planned: policies with steps are the first."""
+    policies = plan.loop.policies.by_name
+    found = {name: (policy.text, policy.longest_ns * 1e-9) for name, policy in policies.items()}
+    for entry in entries:
+        if entry.name not in policies or policies[entry.name].goes_on:
+            found[entry.name] = entry.does, 0.0
+    found["on_returned_servo"] = _on_returned_servo(plan.buses), 0.0
+    alone = policies["on_fault"].last
+    return [PolicyRow(name, does, longest, alone) for name, (does, longest) in found.items()]
 
 
 def _on_returned_servo(buses: Sequence[BusPlan]) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
-from dxlrun.compile.contribution import Compilation, CompileStage, check_source_names
+from dxlrun.compile.contribution import Compilation, CompileStage, PolicyEntry, check_source_names
 from dxlrun.compile.controllers import (
     check_motions,
     check_robot,
@@ -35,6 +35,7 @@ from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
+from dxlrun.description.document import KeyPath
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
@@ -66,13 +67,14 @@ class Compiled(msgspec.Struct, frozen=True):
     rate: float  # Of the loop, Hz, as the file has it
     joints: tuple[CompiledJoint, ...]
     parts: tuple[MotionPart, ...]
+    policies: tuple[PolicyEntry, ...]
 
     @property
     def report(self) -> Row:
         """Everything that was decided, as JSON has it."""
         from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
 
-        return check_report(self.plan, self.rate, self.joints, self.parts)
+        return check_report(self.plan, self.rate, self.joints, self.parts, self.policies)
 
     @property
     def drawing(self) -> Graph:
@@ -178,7 +180,7 @@ def compile_robot(
     check_motions(file, joints, controllers)
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, contributions, modes)
-    policies = compile_policies(file, joints, buses)
+    policies = compile_policies(file, joints, buses, contributions)
     recording = compile_recording(file)
     parts: list[MotionPart] = []
     if motions:
@@ -235,7 +237,8 @@ def compile_robot(
         | _packages(features),
         mechanics=next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan()),
     )
-    return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
+    shown = tuple(entry for each in contributions for entry in each.policies)
+    return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts), shown)
 
 
 def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
@@ -245,12 +248,18 @@ def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
 
 
 def _used_features(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tuple[Feature, ...]:
-    """Return our features, and those of plug-ins whose sections or joint keys the file has."""
+    """Return our features, and those of plug-ins whose sections, joint keys or policies the file has."""
     keys = {key for joint in joints.values() for key in joint.plan.keys}
+    policies: list[KeyPath] = [
+        ("policies",),
+        *(("policies", "groups", name) for name in file.robot.policies.groups),
+    ]
     return tuple(
         each
         for each in installed_features()
-        if not each.distribution or each.name in keys or file.marks.has((each.name,))
+        if not each.distribution
+        or each.name in keys
+        or any(file.marks.has((*path, each.name)) for path in ((), *policies))
     )
 
 

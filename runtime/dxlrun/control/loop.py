@@ -24,7 +24,7 @@ from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
-from dxlrun.plan.policy_plan import Last, PolicyName
+from dxlrun.plan.policy_plan import Last
 
 
 class Sensors(Protocol):
@@ -134,7 +134,7 @@ class Loop:
             self.steering.end()
         if reason != "fault" and self.manager.switching.fault is not None:
             reason, detail = "fault", self.manager.switching.fault
-        policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
+        policy = "on_fault" if reason == "fault" else "on_exit"
         if self._actions.ending:
             policy, sentence = self._actions.ending
             reason, detail = "fault", detail or sentence
@@ -244,7 +244,7 @@ class Loop:
         if manager.switching.ended:
             steering.answer_late()
 
-    def _wind_up(self, name: PolicyName) -> Last:
+    def _wind_up(self, name: str) -> Last:
         """Go through the steps of a policy in more cycles; return how it leaves the robot."""
         policy = self.plan.policies.named(name)
         motion = SafeMotion(policy, self.context)
@@ -266,7 +266,7 @@ class Loop:
             self.context.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
         return policy.last
 
-    def _log_policy(self, name: PolicyName, text: str) -> None:
+    def _log_policy(self, name: str, text: str) -> None:
         self.context.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
         data = f'{{"policy":"{name}"}}'.encode()
         begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)

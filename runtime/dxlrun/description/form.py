@@ -130,7 +130,7 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
 
     Args:
         form: The form without them.
-        keys: The keys.
+        keys: The keys; one that the form has takes its place.
         replaced: Other types of keys that the form has.
     """
     added = [*keys]
@@ -143,7 +143,8 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
     made = create_model(form.__name__, __base__=form, __doc__=form.__doc__, **definitions)
     order = [*form.model_fields]
     for each in added:
-        order.insert(order.index(each.before) if each.before else len(order), each.name)
+        if each.name not in order:
+            order.insert(order.index(each.before) if each.before else len(order), each.name)
     # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
     made.__pydantic_fields__ = {name: made.model_fields[name] for name in order}
     return made

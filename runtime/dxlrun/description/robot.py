@@ -31,7 +31,7 @@ from dxlrun.description.units import (
     SizeOrDuration,
 )
 from dxlrun.features import installed_features, stages
-from dxlrun.features.feature import Section
+from dxlrun.features.feature import PolicyKey, Section
 
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
@@ -123,7 +123,7 @@ PolicyStep = Annotated[
     | Annotated[TorqueStep, Tag("<torque>")],
     Discriminator(_kind_of_step),
 ]
-Policy = Annotated[
+WrittenPolicy = Annotated[
     Annotated[Word, Tag("<word>")]
     | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
     Discriminator(_kind_of_policy),
@@ -147,27 +147,19 @@ class GroupPolicies(Form):
         "[left_wheel, right_wheel]",
         (),
     )
-    on_lost_servo: Literal["hold", "limp", "stop"] | None = key(
-        "hold: its controllers wait; limp: the group loses its torque; stop: the run ends by on_fault.",
-        "limp",
-        None,
-    )
     on_returned_servo: Word | None = key("As the policy of that name, for this group.", "hold", None)
 
 
 class Policies(Form):
     """What happens at the end of a run, and on faults."""
 
-    on_exit: Policy = key(
+    on_exit: WrittenPolicy = key(
         "At Ctrl-C, SIGTERM, `dxlrun stop` and the end of the motions.",
         "[{pose: home, speed: 60 deg/s}, limp]",
         "limp",
     )
-    on_fault: Policy = key(
+    on_fault: WrittenPolicy = key(
         "When a controller failed without a fallback, a bus is gone, or by `overrun: stop`.", "limp", "limp"
-    )
-    on_lost_servo: Policy = key(
-        "When a servo missed 3 replies in a row, and 50 ms; hold: its controllers wait.", "hold", "hold"
     )
     on_returned_servo: Word = key(
         "When a servo answers again that has rebooted; hold: it gets torque where it stands.", "hold", "limp"
@@ -177,10 +169,20 @@ class Policies(Form):
         "{wheels: {joints: [left_wheel, right_wheel], on_lost_servo: limp}}",
         {},
     )
-    on_stale_command: Policy = key(
-        "When a stream of commands stopped; hold: its joints stay, the run goes on.", "hold", "hold"
-    )
     exit_timeout: Duration = key("Longest orderly end of a run.", "2 s", 2_000_000_000, gt=0)
+
+    def of_joint(self, name: str, joint: str) -> object:
+        """Return the value of a key for a joint: its group's, or the robot's where the group has none."""
+        groups = (group for group in self.groups.values() if joint in group.joints)
+        values = (getattr(owner, name, None) for owner in (*groups, self))
+        return next((value for value in values if value is not None), None)
+
+
+def policies_form() -> type[Policies]:
+    """Return the form of the section with the keys of all features."""
+    keys = [each for _, each in stages(PolicyKey, installed_features())]
+    group = with_keys(GroupPolicies, [each.group for each in keys if each.group is not None])
+    return with_keys(Policies, keys, groups=dict[Name, group])  # type: ignore[valid-type]  # made at run time
 
 
 _ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "items": {"type": "string"}}]}
@@ -259,6 +261,9 @@ class Simulation(Form):
     )
 
 
+_POLICIES = ("What happens on faults and at the end.", "{exit_timeout: 2 s}")
+
+
 class Robot(Form):
     """A robot file, without its arguments: the sections that are not features.
 
@@ -285,7 +290,7 @@ class Robot(Form):
     poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = key(
         "Positions of some or all joints, by name, for policies.", "{home: {head_joint: 0 deg}}", {}
     )
-    policies: Policies = key("What happens on faults and at the end.", "{exit_timeout: 2 s}", Policies())
+    policies: Policies = key(*_POLICIES, Policies())
     recording: Recording = key("The log.", "{directory: logs}", Recording())
     processes: Processes = key("Processes beside the loop.", "{gateway: {enabled: false}}", Processes())
     model: RobotModel | None = key("The robot's body.", "{urdf: torso.urdf}", None)
@@ -297,5 +302,10 @@ class Robot(Form):
 @cache
 def robot_form() -> type[Robot]:
     """Return the form of a robot file with the sections of all features."""
+    policies = policies_form()
     sections = [section for _, section in stages(Section, installed_features())]
-    return with_keys(Robot, sections, joints=dict[Name, joint_form()])  # type: ignore[misc]  # made at run time
+    return with_keys(
+        Robot,
+        [Section("policies", policies, key(*_POLICIES, policies())), *sections],
+        joints=dict[Name, joint_form()],  # type: ignore[misc]  # made at run time
+    )

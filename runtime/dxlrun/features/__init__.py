@@ -11,11 +11,13 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 
-from dxlrun.features.feature import Feature, JointKey, S, Section, ServoKey
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, S, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 FEATURES = (
     Feature("devices", "dxlrun.features.devices"),
+    Feature("on_lost_servo", "dxlrun.features.lost_servos"),
+    Feature("on_stale_command", "dxlrun.features.stale_commands"),
     Feature("sensors", "dxlrun.features.sensors"),
     Feature("transmissions", "dxlrun.features.mechanics"),
     Feature("registers", "dxlrun.features.registers"),
@@ -59,7 +61,7 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
             features += _features_of(plugin)
         for feature in features:
             try:
-                keys = feature.stage(Section), feature.stage(JointKey), feature.stage(ServoKey)
+                keys = [feature.stage(kind) for kind in (Section, JointKey, ServoKey, PolicyKey)]
             except (Exception, SystemExit) as error:
                 broken[feature.name] = (
                     f"the section {feature.name} of {feature.distribution} cannot be used "

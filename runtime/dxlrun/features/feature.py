@@ -1,10 +1,10 @@
 """Feature: a section or a key of the robot file with everything that belongs to it, in a folder of its own.
 
 A feature is a package whose files have fixed names, one for each stage in which it takes part: `form.py` has
-its section, `joint_key.py` or `servo_key.py` its key of joints or servos, `compile.py` its share of the plan,
-and so on. Such a file has one object `STAGE`. Its class belongs to the room that asks for it, and documents
-when that happens. A feature has as many of these files as it needs. The stage that asks for a file imports
-it, so `dxlrun check` imports nothing of the run.
+its section, `joint_key.py`, `servo_key.py` or `policy_key.py` its key of joints, servos or `policies`,
+`compile.py` its share of the plan, and so on. Such a file has one object `STAGE`. Its class belongs to the
+room that asks for it, and documents when that happens. A feature has as many of these files as it needs. The
+stage that asks for a file imports it, so `dxlrun check` imports nothing of the run.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import ClassVar, Generic, Protocol, TypeVar, cast
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 from dxlwire.joint_unit import JointUnit
 
@@ -135,11 +135,34 @@ class ServoKey(Generic[T]):
 
 
 @dataclass(frozen=True)
+class PolicyKey(Generic[T]):
+    """Key of the section `policies`: `STAGE` of `policy_key.py`, asked for before a file is read."""
+
+    FILE: ClassVar[str] = "policy_key"
+
+    name: str
+    """The key, such as `on_lost_servo`; that of the feature."""
+    form: object
+    """Type of the value, for pydantic: `Literal["stop", "limp"] | None`."""
+    field: T
+    """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    before: str = ""
+    """Key of the section that follows it in lists of all keys; empty: it is the last."""
+    group: PolicyKey[Any] | None = None
+    """The same key of `policies.groups.NAME`; None: groups do not have it."""
+
+    def of(self, policies: object) -> T:
+        """Return the value in the section, or in one of its groups, that was read."""
+        value: T = getattr(policies, self.name)
+        return value
+
+
+@dataclass(frozen=True)
 class Feature:
     """A feature by its name and the package that has its files."""
 
     name: str
-    """Key of the robot file or of a joint, such as `devices`."""
+    """Its key in the robot file, of a joint or of `policies`, such as `devices`."""
     package: str
     """Package with its files, such as `dxlrun.features.devices`."""
     distribution: str = ""

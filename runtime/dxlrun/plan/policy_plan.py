@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
-PolicyName = Literal["on_exit", "on_fault", "on_lost_servo", "on_stale_command"]
-POLICIES: tuple[PolicyName, ...] = ("on_exit", "on_fault", "on_lost_servo", "on_stale_command")
 Last = Literal["limp", "hold"]  # How a robot is left: torque off, or torque on where it stands
 TORQUE_STAYS = (
     "torque stays on, as the policy says: the robot holds until its power is off; "
@@ -107,7 +106,7 @@ class GroupPolicy(msgspec.Struct, frozen=True):
 
 
 class PolicyPlan(msgspec.Struct, frozen=True):
-    """The four policies of a robot."""
+    """The policies of a robot whose steps may end a run."""
 
     on_exit: Policy = LIMP  # When a run was asked to stop, or came to its end
     on_fault: Policy = LIMP  # When the loop or a bus failed, or a controller whose fallback did not take over
@@ -116,6 +115,28 @@ class PolicyPlan(msgspec.Struct, frozen=True):
     groups: tuple[GroupPolicy, ...] = ()  # For joints that stand in one of them, in place of `on_lost_servo`
     limit_ns: int = 1_500_000_000
     """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
+    others: dict[str, Policy] = {}
+    """Policies of features that have no field above."""
+
+    @classmethod
+    def collect(
+        cls, policies: Mapping[str, Policy], groups: tuple[GroupPolicy, ...], limit_ns: int
+    ) -> PolicyPlan:
+        """Return the plan of these policies by their names."""
+        own = {name: policies[name] for name in cls().by_name if name in policies}
+        others = {name: policy for name, policy in policies.items() if name not in own}
+        return replace(cls(groups=groups, limit_ns=limit_ns, others=others), **own)
+
+    @property
+    def by_name(self) -> dict[str, Policy]:
+        """All policies by their names."""
+        return {
+            "on_exit": self.on_exit,
+            "on_fault": self.on_fault,
+            "on_lost_servo": self.on_lost_servo,
+            "on_stale_command": self.on_stale_command,
+            **self.others,
+        }
 
     def slowest_period_ns(self, planned_ns: int) -> int:
         """Return the longest period in which a run ends within its exit timeout; `planned_ns` is the plan's.
@@ -123,15 +144,10 @@ class PolicyPlan(msgspec.Struct, frozen=True):
         A request to stop is seen a period later, and the first step begins one after that; two planned
         periods are kept free for it beside the limit.
         """
-        longest_ns = max(self.named(name).longest_ns for name in POLICIES)
+        longest_ns = max(policy.longest_ns for policy in self.by_name.values())
         left_ns = max(0, self.limit_ns - longest_ns)
         return planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
 
-    def of_lost(self, row: int) -> GroupPolicy | None:
-        """Return the group whose policy counts when this joint is lost; None: `on_lost_servo` does."""
-        return next((group for group in self.groups if row in group.rows), None)
-
-    def named(self, name: PolicyName) -> Policy:
-        """Return one of the four."""
-        found: Policy = getattr(self, name)
-        return found
+    def named(self, name: str) -> Policy:
+        """Return one policy; raises KeyError if there is none of this name."""
+        return self.by_name[name]

@@ -1,10 +1,10 @@
-"""Features: the names for a section or a key of joints that a package adds to the robot file.
+"""Features: the names for a section or a key, of joints or policies, that a package adds to the robot file.
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
-`Section` in `form.py`, `JointKey` in `joint_key.py`, `CompileStage` in `compile.py`, `LayerStage` in
-`layer.py`, `BusStage` in `runtime.py`, `SafeStage` in `safe.py`, `TableStage` in `table.py`. One of the first
-two is required. Forms are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers
-the feature:
+`Section` in `form.py`, `JointKey` in `joint_key.py`, `PolicyKey` in `policy_key.py`, `CompileStage` in
+`compile.py`, `LayerStage` in `layer.py`, `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`,
+`SafeStage` in `safe.py`, `TableStage` in `table.py`. One of the first three is required. Forms are made of
+the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature
@@ -28,10 +28,15 @@ if TYPE_CHECKING:
     from dxlrun.compile.contribution import Compilation as Compilation
     from dxlrun.compile.contribution import CompileStage as CompileStage
     from dxlrun.compile.contribution import Contribution as Contribution
+    from dxlrun.compile.contribution import PolicyEntry as PolicyEntry
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.compile.report import Row as Row
     from dxlrun.compile.report import TableStage as TableStage
     from dxlrun.contract.hardware import Hardware as Hardware
+    from dxlrun.control.monitors.monitor import Monitor as Monitor
+    from dxlrun.control.monitors.monitor import MonitorStage as MonitorStage
+    from dxlrun.control.monitors.policy_actions import PolicyActions as PolicyActions
+    from dxlrun.description.robot import WrittenPolicy as WrittenPolicy
     from dxlrun.dynamixel.bus_part import BusContext as BusContext
     from dxlrun.dynamixel.bus_part import BusPart as BusPart
     from dxlrun.dynamixel.bus_part import BusStage as BusStage
@@ -42,6 +47,7 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.hardware_layer import PreparedLayer as PreparedLayer
     from dxlrun.features.feature import Feature as Feature
     from dxlrun.features.feature import JointKey as JointKey
+    from dxlrun.features.feature import PolicyKey as PolicyKey
     from dxlrun.features.feature import Section as Section
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
     from dxlwire.exchange.bus import Lines as Lines

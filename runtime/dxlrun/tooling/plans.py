@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from dxlrun.plan.played_goals import find_unreached_goals as find_unreached_goals
     from dxlrun.plan.played_goals import motion_name as motion_name
     from dxlrun.plan.played_goals import played_name as played_name
-    from dxlrun.plan.policy_plan import PolicyName as PolicyName
     from dxlrun.plan.policy_plan import PolicyPlan as PolicyPlan
     from dxlrun.plan.recording_plan import RecordingPlan as RecordingPlan
     from dxlrun.plan.robot_plan import Plan as Plan

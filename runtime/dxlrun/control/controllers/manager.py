@@ -302,11 +302,11 @@ class Manager:
         if (managed := self._named.get(controller)) is not None:
             self._attempt(managed, managed.hold_joints)
 
-    def hold_lost(self, lost: Collection[int]) -> tuple[int, ...]:
+    def hold_lost(self, lost: Collection[int], until: str = "all its joints answer again") -> tuple[int, ...]:
         """Hold the controllers that command a lost joint, of these rows, and those above them.
 
         They are updated, and their other joints stay where they are. So does one that is activated while a
-        joint is lost. Nothing is commanded to the lost joints themselves.
+        joint is lost. Nothing is commanded to the lost joints themselves. A policy may hold others, `until`.
 
         Returns:
             The rows of the controllers that are not held any more.
@@ -316,9 +316,9 @@ class Manager:
         for managed in reversed(self._order):  # those below first
             if not managed.hold_lost(self._lost, below=self._holds_below(managed)):
                 continue
-            text, severity = "resumes: all its joints answer again", Severity.INFO
+            text, severity = f"resumes: {until}", Severity.INFO
             if managed.held:
-                text, severity = "is held until all its joints answer again", Severity.WARNING
+                text, severity = f"is held until {until}", Severity.WARNING
             else:
                 resumed += managed.rows.tolist()
             self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, Self
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import LoopPlan
-from dxlrun.plan.policy_plan import PolicyPlan
 
 
 class Monitor(Protocol):
@@ -30,14 +28,10 @@ class Monitor(Protocol):
             time_ns: The controllers' time.
         """
 
-    @staticmethod
-    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
-        """Return its rows in the policies of `check`: the name of a policy, and what it does."""
-
 
 @dataclass(frozen=True)
 class MonitorStage:
-    """`STAGE` of `monitor.py`: asked when a loop is built, and when `check` shows the policies."""
+    """`STAGE` of `monitor.py`: asked when a loop is built."""
 
     FILE: ClassVar[str] = "monitor"
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
+from dxlrun.plan.policy_plan import PolicyPlan
 
 if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
     from dxlrun.control.context import ControlContext
@@ -19,13 +19,15 @@ class PolicyActions:
 
     def __init__(self, context: ControlContext, manager: Manager, gate: Gate) -> None:
         self.policies: PolicyPlan = context.plan.policies
-        self.ending: tuple[PolicyName, str] | None = None
+        self.ending: tuple[str, str] | None = None
         """The policy by which the run ends after this cycle, and a sentence; None: it goes on."""
         self._context = context
         self._manager = manager
         self._gate = gate
+        self._held: dict[str, Collection[int]] = {}
+        """Rows of the joints whose controllers are held, by what ends that."""
 
-    def end_run(self, policy: PolicyName, why: str) -> None:
+    def end_run(self, policy: str, why: str) -> None:
         """End the run after this cycle, by another policy than on_exit; the first reason counts."""
         if self.ending is None:
             self.ending = policy, f"{why}; {policy}: {self.policies.named(policy).text}"
@@ -35,9 +37,15 @@ class PolicyActions:
         for row in sorted(rows):
             self._context.hardware.switch_torque(row, False, _ignore_answer)
 
-    def hold_controllers(self, lost: Collection[int]) -> None:
-        """Hold the controllers of lost joints, and let those go on slowly whose joints are back."""
-        self._gate.ease_in(self._manager.hold_lost(lost))
+    def hold_controllers(self, rows: Collection[int], until: str) -> None:
+        """Hold the controllers of these joints, and let those go on slowly that no policy holds any more.
+
+        Args:
+            rows: Rows of all joints that the policy holds now; the other joints are free of it.
+            until: What ends that, as a clause of all joints of a controller: `all its joints answer again`.
+        """
+        self._held[until] = rows
+        self._gate.ease_in(self._manager.hold_lost(frozenset().union(*self._held.values()), until))
 
     def report(
         self, severity: Severity, text: str, *, source: str = "loop", code: EventCode = EventCode.POLICY

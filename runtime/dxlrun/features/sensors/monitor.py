@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Self
 
@@ -10,7 +9,6 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
-from dxlrun.plan.policy_plan import PolicyPlan
 
 
 @dataclass(slots=True)
@@ -38,11 +36,6 @@ class NeededSensors:
             if (age_ns if age_ns >= 0 else time_ns) > sensor.timeout_ns:
                 nothing = f"sensor {sensor.name} brought nothing for {sensor.timeout_ns / 1e6:g} ms"
                 self.actions.end_run("on_fault", nothing)
-
-    @staticmethod
-    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
-        """Return nothing: the table of sensors shows what happens when one is lost."""
-        return ()
 
 
 STAGE = MonitorStage(NeededSensors)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Self
 
 import numpy as np
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.channels.events import Severity
+from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import LoopPlan
-from dxlrun.plan.policy_plan import GroupPolicy, PolicyName, PolicyPlan
-
-_GROUP_ACTIONS = {
-    "hold": "hold their controllers until it answers, the others go on",
-    "limp": "the group goes limp, the others go on",
-    "stop": "end the run by on_fault",
-}
+from dxlrun.plan.policy_plan import GroupPolicy, PolicyPlan
 
 
 class LostServos:
@@ -54,14 +48,14 @@ class LostServos:
             names = ", ".join(self._joints[row] for row in ending_rows)
             actions.end_run(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
         if not ending:
-            actions.hold_controllers(rows)
+            actions.hold_controllers(rows, "all its joints answer again")
 
-    def _judge(self, policies: PolicyPlan) -> tuple[dict[PolicyName, list[int]], list[GroupPolicy]]:
+    def _judge(self, policies: PolicyPlan) -> tuple[dict[str, list[int]], list[GroupPolicy]]:
         """Return which policies end the run, for which lost rows, and which groups become limp by now."""
-        ending: dict[PolicyName, list[int]] = {}
+        ending: dict[str, list[int]] = {}
         limp: list[GroupPolicy] = []
         for row in sorted(self._missed.lost):
-            group = policies.of_lost(row)
+            group = next((one for one in policies.groups if row in one.rows), None)
             if group is None:
                 if not policies.on_lost_servo.goes_on:
                     ending.setdefault("on_lost_servo", []).append(row)
@@ -71,14 +65,6 @@ class LostServos:
                 self._limp.add(group.name)
                 limp.append(group)
         return ending, limp
-
-    @staticmethod
-    def rows(policies: PolicyPlan) -> Iterable[tuple[str, str]]:
-        """Return the policies of groups; that of the robot is one of its four."""
-        return (
-            (f"on_lost_servo of {group.name}", _GROUP_ACTIONS[group.on_lost_servo])
-            for group in policies.groups
-        )
 
 
 class MissedReplies:
@@ -105,3 +91,6 @@ class MissedReplies:
         changed = rows != self.lost
         self.lost = rows
         return changed
+
+
+STAGE = MonitorStage(LostServos)

@@ -1,0 +1,1 @@
+"""Policy for hot servos: the example of a policy of a package."""

@@ -1,0 +1,45 @@
+"""Monitor of hot servos: acts once when one becomes hot, and holds controllers until it is cool."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import msgspec
+import numpy as np
+
+from dxlrun.tooling.features import MonitorStage, PolicyActions
+from dxlrun.tooling.plans import LoopPlan
+from dxlrun.tooling.records import CycleRecord, Severity
+
+
+class HotServos:
+    def __init__(self, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> None:
+        own = msgspec.json.decode(plan.feature_plans["on_hot_servo"])
+        self._joints = [joint.name for joint in plan.joints]
+        self._above = np.array([own.get(name, (np.inf, ""))[0] for name in self._joints])
+        self._do = [own.get(name, (np.inf, ""))[1] for name in self._joints]
+        self._states, self._actions = record.states, actions
+        self._hot: frozenset[int] = frozenset()
+
+    @classmethod
+    def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
+        return cls(plan, record, actions)
+
+    def check(self, time_ns: int) -> None:
+        hot = frozenset(np.flatnonzero(self._states.temperature > self._above).tolist())
+        if hot == self._hot:
+            return
+        for row in sorted(hot - self._hot):
+            self._actions.report(
+                Severity.WARNING, f"is hot; on_hot_servo: {self._do[row]}", source=self._joints[row]
+            )
+            if self._do[row] == "stop":
+                self._actions.end_run("on_fault", f"{self._joints[row]} is hot")
+            if self._do[row] == "limp":
+                self._actions.make_limp([row])
+        held = [row for row in hot if self._do[row] == "hold"]
+        self._actions.hold_controllers(held, "all its joints are cool")
+        self._hot = hot
+
+
+STAGE = MonitorStage(HotServos)
