@@ -35,7 +35,6 @@ from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
-from dxlrun.description.document import KeyPath
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
@@ -157,7 +156,7 @@ def compile_robot(
     check_twins(file, {name: joint.table for name, joint in joints.items()})
     body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
-    features = _used_features(file, joints)
+    features = _used_features(file)
     compilation = Compilation(file, plugins, joints, body)
     by_feature = {
         feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage, features)
@@ -247,20 +246,11 @@ def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
     return frozenset(servos | {device.model for bus in buses for device in bus.devices})
 
 
-def _used_features(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tuple[Feature, ...]:
-    """Return our features, and those of plug-ins whose sections, joint keys or policies the file has."""
-    keys = {key for joint in joints.values() for key in joint.plan.keys}
-    policies: list[KeyPath] = [
-        ("policies",),
-        *(("policies", "groups", name) for name in file.robot.policies.groups),
-    ]
-    return tuple(
-        each
-        for each in installed_features()
-        if not each.distribution
-        or each.name in keys
-        or any(file.marks.has((*path, each.name)) for path in ((), *policies))
-    )
+def _used_features(file: RobotFile) -> tuple[Feature, ...]:
+    """Return our features, and those of plug-ins whose sections or keys the file has."""
+    paths = (path for path in file.marks.keys if len(path) != 2 or path[0] == "policies")
+    written = {path[-1] for path in paths}  # without the names of joints and other entries
+    return tuple(each for each in installed_features() if not each.distribution or each.name in written)
 
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:

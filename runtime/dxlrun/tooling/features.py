@@ -1,10 +1,11 @@
-"""Features: the names for a section or a key, of joints or policies, that a package adds to the robot file.
+"""Features: the names for a section or a key that a package adds to the robot file.
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
-`Section` in `form.py`, `JointKey` in `joint_key.py`, `PolicyKey` in `policy_key.py`, `CompileStage` in
-`compile.py`, `LayerStage` in `layer.py`, `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`,
-`SafeStage` in `safe.py`, `TableStage` in `table.py`. One of the first three is required. Forms are made of
-the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
+`Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
+`policy_key.py`, `CompileStage` in `compile.py`, `SettingsStage` in `settings.py`, `LayerStage` in `layer.py`,
+`BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `TableStage` in
+`table.py`. One of the first four is required. Forms are made of the names of `dxlrun.tooling.files`.
+The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from dxlrun.compile.contribution import CompileStage as CompileStage
     from dxlrun.compile.contribution import Contribution as Contribution
     from dxlrun.compile.contribution import PolicyEntry as PolicyEntry
+    from dxlrun.compile.joints.described_servos import DescribedServo as DescribedServo
+    from dxlrun.compile.joints.servos import SettingsStage as SettingsStage
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.compile.report import Row as Row
     from dxlrun.compile.report import TableStage as TableStage
@@ -49,7 +52,9 @@ if TYPE_CHECKING:
     from dxlrun.features.feature import JointKey as JointKey
     from dxlrun.features.feature import PolicyKey as PolicyKey
     from dxlrun.features.feature import Section as Section
+    from dxlrun.features.feature import ServoKey as ServoKey
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
+    from dxlwire.bus_plan import RegisterValue as RegisterValue
     from dxlwire.exchange.bus import Lines as Lines
     from dxlwire.exchange.idle import Urgency as Urgency
     from dxlwire.plan.planning import plan_line as plan_line

@@ -97,8 +97,9 @@ class SettingsStage:
     FILE: ClassVar[str] = "settings"
 
     compile: Callable[[RobotFile, DescribedServo, ControlTable], Iterable[RegisterValue]]
-    """Returns the values for one servo in the order in which they are written, EEPROM first."""
-    check: Callable[[RobotFile, BusPlan], None]
+    """Returns the values for one servo in the order in which they are written, EEPROM first. Where two
+    features give an item, the later one counts."""
+    check: Callable[[RobotFile, BusPlan], None] = lambda file, plan: None
     """Compares the values with the plan of a bus."""
 
 
@@ -124,11 +125,12 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
         certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
         found = file if certain else RobotFile(file.description)
-        registers = tuple(
-            register
+        settings = {
+            register.name: register
             for _, stage in stages(SettingsStage, installed_features())
             for register in stage.compile(found, servo, table)
-        )
+        }
+        registers = tuple(settings.values())
         motor = compile_motor(found, servo, table, registers, motors.of_servo(servo.name))
         compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus, certain)
     return compiled

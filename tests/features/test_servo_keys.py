@@ -1,0 +1,150 @@
+"""A key of servos of a foreign package: in every form of a servo, written at the start and after a reboot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dxlrun import InputError
+from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.description.json_schema import robot_schema
+from dxlrun.testing import installed, simulated_robot
+from dxlsim.servo.protocol2_servo import Protocol2Servo
+
+SERVO_KEY = """
+from dxlrun.tooling.features import ServoKey
+from dxlrun.tooling.files import key
+
+STAGE = ServoKey(
+    "glow",
+    bool,
+    field=key("Its servos glow.", "true", False),
+    of_one=key("It glows; none: as the joint.", "true", None),
+    of_section=key("It glows.", "true", False),
+    before="motor",
+)
+"""
+SETTINGS = """
+from dxlrun.tooling.features import RegisterValue, SettingsStage
+from dxlrun_glow.servo_key import STAGE as GLOW
+
+
+def glow(file, servo, table):
+    if not GLOW.of(servo):
+        return
+    led = table.items.get("led")
+    if led is None:
+        file.error(servo.mark(file.marks, "glow"), f"an {table.model} cannot glow", "take it out")
+        return
+    yield RegisterValue(led.address, led.size, 1, led.name)
+
+
+STAGE = SettingsStage(glow)
+"""
+PLUGIN = """
+from dxlrun.tooling.features import Feature
+
+
+def dxlrun_features():
+    return [Feature("glow", "dxlrun_glow")]
+"""
+ROBOT = """name: lamps
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 500 us}
+loop: {rate: 50}
+policies: {on_returned_servo: hold}
+joint_defaults: {bus: main, model: XL430-W250, reference: 180 deg, direction: 1}
+joints:
+  bright: {id: 1, glow: true, registers: {position_p_gain: 700}}
+  dark: {id: 2}
+  both: {servos: [{id: 3}, {id: 4, glow: false}], glow: true}
+  roll: {}
+  pitch: {}
+transmissions:
+  wrist:
+    type: differential
+    joints: [roll, pitch]
+    servos:
+      left: {bus: main, id: 5, model: XL430-W250, reference: 180 deg, direction: 1, glow: true}
+      right: {bus: main, id: 6, model: XL430-W250, reference: 180 deg, direction: -1}
+"""
+GLOWING = {1, 3, 5}
+
+
+@pytest.fixture(autouse=True)
+def with_glow(tmp_path: Path) -> Iterator[None]:
+    """Install the package."""
+    package = tmp_path / "project" / "src" / "dxlrun_glow"
+    package.mkdir(parents=True)
+    files = {"__init__": "", "servo_key": SERVO_KEY, "settings": SETTINGS, "plugin": PLUGIN}
+    for name, text in files.items():
+        (package / f"{name}.py").write_text(text)
+    (tmp_path / "project" / "pyproject.toml").write_text(
+        '[project]\nname = "dxlrun-glow"\nversion = "1.0"\n'
+        '[project.entry-points.dxlrun]\nglow = "dxlrun_glow.plugin"\n'
+    )
+    with installed(tmp_path / "project"):
+        yield
+
+
+def compiled(tmp_path: Path, text: str) -> Compiled:
+    """Compile the text of a robot file."""
+    (tmp_path / "robot.yaml").write_text(text)
+    return compile_files(tmp_path / "robot.yaml", {}, [])
+
+
+def test_each_servo_has_the_value_of_its_own_or_of_its_joint(tmp_path: Path) -> None:
+    plan = compiled(tmp_path, ROBOT).plan
+    assert {servo.servo_id for servo in plan.buses[0].servos if "led" in servo.declared} == GLOWING
+    assert plan.buses[0].servos[0].declared == {"position_p_gain": 700, "led": 1}
+    assert plan.packages["dxlrun_glow"] == "dxlrun-glow"
+
+
+def test_key_of_a_later_feature_counts(tmp_path: Path) -> None:
+    text = ROBOT.replace("registers: {position_p_gain: 700}", "registers: {led: 0}")
+    assert compiled(tmp_path, text).plan.buses[0].servos[0].declared == {"led": 1}
+
+
+def test_mistake_has_the_place_of_the_key(tmp_path: Path) -> None:
+    text = ROBOT.replace("id: 4, glow: false", "id: 4, glow: maybe")
+    with pytest.raises(
+        InputError, match=r"robot.yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"
+    ):
+        compiled(tmp_path, text)
+
+
+def test_setting_that_the_model_does_not_have_is_refused(tmp_path: Path) -> None:
+    text = ROBOT.replace("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}")
+    with pytest.raises(InputError, match="cannot glow"):
+        compiled(tmp_path, text)
+
+
+def test_joint_of_a_transmission_does_not_have_the_key(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="roll"):
+        compiled(tmp_path, ROBOT.replace("roll: {}", "roll: {glow: true}"))
+
+
+def test_every_form_of_a_servo_is_in_the_schema() -> None:
+    forms = robot_schema({}, {})["$defs"]
+    having = {name for name, form in forms.items() if "glow" in form.get("properties", {})}
+    assert having == {"Joint", "SharedJoint", "OneOfServos", "TransmissionServo", "Group"}
+
+
+def test_start_and_return_write_the_setting(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    robot = simulated_robot(tmp_path / "robot.yaml", duration_s=3.0)
+    servos, leds = robot.buses[0].servos, list[set[int]]()
+
+    def look() -> None:
+        leds.append({servo.servo_id for servo in servos if servo.registers["led"]})
+
+    robot.buses[0].at(500_000_000, look)
+    first = robot.buses[0].servo(1)
+    assert isinstance(first, Protocol2Servo)
+    robot.buses[0].at(600_000_000, first.reboot)
+    robot.buses[0].at(610_000_000, look)
+    robot.buses[0].at(2_800_000_000, look)
+    robot.run()
+    assert leds == [GLOWING, GLOWING - {1}, GLOWING]
