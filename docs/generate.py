@@ -6,6 +6,9 @@ A page has marks, and the text between them is generated:
     <!-- commands -->        every command with its options, from its help
     <!-- api: NAME ... -->   signatures and docstrings of names of `dxlrun` and `dxlrun.testing`
     <!-- page: NAME -->      table of the names of a module of `dxlrun.tooling`
+    <!-- requests -->        every HTTP request of a running robot
+    <!-- codes -->           every code of a refusal with its sentence
+    <!-- rules -->           every rule of the verdict
     <!-- end -->
 
 `--check` writes nothing and exits with 1 when a page is out of date. The text depends on this repository
@@ -38,7 +41,8 @@ PACKAGES = (ROOT, ROOT / "plugins/dxlrun_view")
 """Folders of the distributions whose commands and keys belong to the reference."""
 SOURCES = ("runtime", "plugins", "plugins/dxlrun_view/src")
 MARK = re.compile(
-    r"^(<!-- (keys|commands|api|page):? ?(.*?) ?-->)\n.*?^<!-- end -->$", re.MULTILINE | re.DOTALL
+    r"^(<!-- (keys|commands|api|page|requests|codes|rules):? ?(.*?) ?-->)\n.*?^<!-- end -->$",
+    re.MULTILINE | re.DOTALL,
 )
 
 
@@ -207,11 +211,49 @@ def tooling_page(name: str) -> str:
     return "\n\n".join([f"### `dxlrun.tooling.{name}`", inspect.getdoc(page) or "", "\n".join(rows)])
 
 
+def requests(_: str = "") -> str:
+    """Return the table of HTTP requests: their fields, and the first line about their handlers."""
+    from dxlrun.remote.gateway import _HANDLERS
+    from dxlrun.remote.requests.table import REQUESTS
+
+    rows = ["| request | fields of the body | about |", "|---|---|---|"]
+    for each in REQUESTS:
+        query = "?" + "&".join(f"{name}=..." for name in each.query) if each.query else ""
+        path = re.sub(
+            r"\{(\w+)(:path)?\}", lambda name: "N" if name[1] == "number" else name[1].upper(), each.path
+        )
+        fields = ", ".join(f"`{name}`" for name in getattr(each.body, "__struct_fields__", ()))
+        about = (inspect.getdoc(_HANDLERS[each]) or "").partition("\n\n")[0]
+        rows.append(f"| `{each.method} {path}{query}` | {fields} | {' '.join(about.split())} |")
+    return "\n".join(rows)
+
+
+def codes(_: str = "") -> str:
+    """Return the table of codes of refusals; words in braces are fields."""
+    from dxlrun.channels.answers import Code
+
+    return "\n".join(["| code | sentence |", "|---|---|", *(f"| `{code}` | {code.text} |" for code in Code)])
+
+
+def rules(_: str = "") -> str:
+    """Return the table of the rules of the verdict."""
+    from dxlrun_analysis.finding import ROBOT
+    from dxlrun_analysis.rules import RULES
+
+    found = [(ROBOT, "", "the first line: what the robot did", "always")]
+    found += [(code, rule.accuses, rule.signal, rule.bound) for code, rule in RULES.items()]
+    rows = [f"| `{code}` | {' | '.join(cells)} |".replace("|  |", "| |") for code, *cells in found]
+    return "\n".join(["| code | accuses | signal | bound |", "|---|---|---|---|", *rows])
+
+
 MAKERS: dict[str, Callable[[str], str]] = {
     "keys": keys,
     "commands": commands,
     "api": api,
     "page": tooling_page,
+    "requests": requests,
+    "codes": codes,
+    "rules": rules,
 }
 
 

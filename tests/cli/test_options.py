@@ -1,4 +1,4 @@
-"""Options have one name and one meaning in all commands: those of the table of commands.md."""
+"""Options have one name and one meaning in all commands: those of options.txt."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any, NamedTuple, get_args
 
 import pytest
 from cyclopts import App
-from tests.kit.pages import page_text
 
 from dxlrun.cli import verbs
 from dxlrun.cli.app import build
 
 ROOT = Path(__file__).parents[2]
+TABLE = Path(__file__).with_name("options.txt")
 VIEW = ROOT / "plugins" / "dxlrun_view" / "src" / "dxlrun_view" / "view.py"
 VALUES = {bool: "", int: "NUMBER", float: "NUMBER", Path: "PATH", str: "TEXT"}
 PAGE = dict[str, tuple[str, str]]
@@ -66,15 +66,14 @@ def every_option() -> list[Option]:
 
 @pytest.fixture(scope="module")
 def page() -> PAGE:
-    """The table of the page: value and meaning of each option that several commands have."""
-    table = page_text("commands.md").partition("## Options")[2].partition("\n## ")[0]
+    """Value and meaning of each option that several commands have."""
     rows = re.findall(
-        r"^\| `(--[a-z-]+)(?:`, `--no-[a-z-]+)?(?: ([A-Z]+))?` \| (.+) \|$", table, re.MULTILINE
+        r"^(--[a-z-]+)(?:, --no-[a-z-]+)?(?: ([A-Z]+))?: (.+)$", TABLE.read_text(), re.MULTILINE
     )
     return {name: (value, meaning.removesuffix(" …")) for name, value, meaning in rows}
 
 
-def test_page_lists_the_options_that_several_commands_have(every_option: list[Option], page: PAGE) -> None:
+def test_table_lists_the_options_that_several_commands_have(every_option: list[Option], page: PAGE) -> None:
     found: dict[str, set[str]] = {}
     for option in every_option:
         found.setdefault(option.names[0], set()).add(option.verb)

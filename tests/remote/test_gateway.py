@@ -593,11 +593,6 @@ def test_events_of_both_processes_are_returned_whole_and_once(desk):
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}
 
 
-def test_the_page_has_every_code_of_a_refusal():
-    page = page_text("steering.md")
-    assert [code for code in Code if f"`{code}`" not in page] == []
-
-
 @pytest.mark.parametrize("code", Code)
 def test_every_refusal_has_a_sentence_of_its_fields(code):
     names = [name for _, name, _, _ in Formatter().parse(code.text) if name]
