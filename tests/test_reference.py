@@ -43,7 +43,9 @@ def test_stale_page_is_reported_with_the_command(tmp_path: Path) -> None:
 def test_every_mark_has_its_end() -> None:
     for name in PATHS:
         text = page_text(name)
-        marks = re.findall(r"^<!-- (keys|commands|api|page|requests|codes|rules|end)\b.*-->$", text, re.MULTILINE)
+        marks = re.findall(
+            r"^<!-- (keys|commands|api|page|requests|codes|rules|end)\b.*-->$", text, re.MULTILINE
+        )
         assert all(mark == "end" for mark in marks[1::2]), name
         assert "end" not in marks[::2], name
         assert len(marks) % 2 == 0, name
