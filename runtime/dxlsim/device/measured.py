@@ -19,7 +19,7 @@ from dxlsim.geometry.transform import (
     turn,
 )
 from dxlsim.simulation_plan import Shown
-from dxlwire.control_table.device_table import DeviceItem
+from dxlwire.control_table.table import ControlItem
 
 STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
 ROOM_CELSIUS = 25.0
@@ -67,7 +67,7 @@ class Measured(msgspec.Struct):
 
 
 def shown(
-    items: Mapping[str, DeviceItem], config: Shown, world: Measured, random: Random
+    items: Mapping[str, ControlItem], config: Shown, world: Measured, random: Random
 ) -> dict[str, Callable[[], int]]:
     """Return for each item that measures something what its integer on the wire is now.
 
@@ -114,7 +114,9 @@ def _moving(world: Measured, show: Callable[[], float]) -> Callable[[], float]:
     return value
 
 
-def _reading(item: DeviceItem, value: Callable[[], float], noise: float, random: Random) -> Callable[[], int]:
+def _reading(
+    item: ControlItem, value: Callable[[], float], noise: float, random: Random
+) -> Callable[[], int]:
     def read() -> int:
         measured = value()
         if noise:
@@ -124,7 +126,7 @@ def _reading(item: DeviceItem, value: Callable[[], float], noise: float, random:
     return read
 
 
-def on_the_wire(item: DeviceItem, value: float) -> int:
+def on_the_wire(item: ControlItem, value: float) -> int:
     """Return the integer that means a value, SI units, within the item's range."""
     if item.bit is not None:
         return int(value != 0)

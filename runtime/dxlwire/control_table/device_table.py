@@ -13,7 +13,6 @@ number, firmware version and ID stand where servos have them, unless the file sa
 from __future__ import annotations
 
 import re
-import struct
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
@@ -31,7 +30,7 @@ from dxlwire.control_table.sources import (
     words,
 )
 from dxlwire.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
-from dxlwire.control_table.table import ControlItem, Encoding, Table
+from dxlwire.control_table.table import ControlItem, Table
 
 WAITS = "waits_in_chain"
 """Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
@@ -66,30 +65,10 @@ STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 """Of a state: `angular_velocity.x`."""
 
 
-class DeviceItem(ControlItem, frozen=True):
-    """One control item of a device, or one bit of one; its value is ticks * scale + offset.
-
-    A float32 has no range: its `minimum` and `maximum` are those of the integer of its bytes.
-    """
-
-    offset: float = 0.0  # SI units at tick 0
-    state: str = ""  # Name of the state that it makes: `angular_velocity.x`
-    safe: int | None = None
-    """Number on the wire that is written at the end of a run; None: nothing is."""
-    bit: int | None = None
-    """Of the item's integer, which other items share; None: all of them. A bit cannot be written alone."""
-
-    def value(self, data: bytes | memoryview) -> float:
-        """Return the value, SI units, of the item's own bytes."""
-        if self.bit is not None:
-            return float(int.from_bytes(data, "little") >> self.bit & 1)
-        return decoded(data, self.encoding) * self.scale + self.offset
+_KEYS = {*ControlItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
 
 
-_KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
-
-
-class DeviceTable(Table[DeviceItem], frozen=True, kw_only=True):
+class DeviceTable(Table, frozen=True, kw_only=True):
     """The control items of one model of devices."""
 
     model_number: int | None
@@ -98,17 +77,6 @@ class DeviceTable(Table[DeviceItem], frozen=True, kw_only=True):
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
     text: str = ""  # The data file, for processes that do not read it; empty: one of dxlrun's own
-
-
-def decoded(data: bytes | memoryview, encoding: Encoding) -> float:
-    """Return the number on the wire; an integer where it is no float32."""
-    if encoding == "float32":
-        number: float = struct.unpack("<f", data)[0]
-        return number
-    if encoding == "sign_magnitude":  # bit 10 is the sign, as of servos (e-Manual AX-12A, Present Speed (38))
-        raw = int.from_bytes(data, "little")
-        return -(raw & 0x3FF) if raw & 0x400 else raw & 0x3FF
-    return int.from_bytes(data, "little", signed=encoding == "twos_complement")
 
 
 def is_device_table(text: str) -> bool:
@@ -173,7 +141,7 @@ def _with_identity(entries: Entry, protocol: float) -> Entry:
     return {**{name: entry for name, entry in places.items() if name not in entries}, **entries}
 
 
-def _check_places(items: Sequence[DeviceItem]) -> None:
+def _check_places(items: Sequence[ControlItem]) -> None:
     """Refuse items that overlap, but for different bits of one place; they are in the order of addresses."""
     for before, item in pairwise(items):
         if item.address >= before.address + before.size:
@@ -188,17 +156,17 @@ def _check_places(items: Sequence[DeviceItem]) -> None:
             )
 
 
-def _place(item: DeviceItem) -> tuple[int, int]:
+def _place(item: ControlItem) -> tuple[int, int]:
     return item.address, item.size
 
 
-def _item(name: str, entry: Entry, units: Collection[str]) -> DeviceItem:
+def _item(name: str, entry: Entry, units: Collection[str]) -> ControlItem:
     if wrong := entry.keys() - _KEYS:
         raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
     unit, offset = measure(name, entry, "offset", units) if "offset" in entry else ("", 0.0)
     defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
     ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
-    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, DeviceItem, units)
+    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, units)
     if item.size not in _SIZES or (item.encoding == "float32" and item.size != 4):
         raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {item.size}")
     if item.encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
@@ -217,7 +185,7 @@ def _item(name: str, entry: Entry, units: Collection[str]) -> DeviceItem:
     return item
 
 
-def _check_item(item: DeviceItem) -> None:
+def _check_item(item: ControlItem) -> None:
     if not 0 <= item.address <= _HIGHEST_ADDRESS:
         raise ValueError(f"{item.name}: address {item.address} is none; they are 0..{_HIGHEST_ADDRESS}")
     for key, value in (("initial value", item.initial), ("safe value", item.safe)):

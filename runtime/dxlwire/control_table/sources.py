@@ -22,7 +22,6 @@ from dxlwire.control_table.table import (
     ControlItem,
     ControlTable,
     EffortUnit,
-    Item,
     derived_capabilities,
 )
 
@@ -269,25 +268,26 @@ def _items(entries: Entry) -> Iterator[ControlItem]:
         if entry.get("access") == "RW":
             entry = {"deviation": deviation_of(name), **entry}
         if "repeat" not in entry:
-            yield read_item(name, entry, ControlItem)
+            yield read_item(name, entry)
             continue
         stem, _, first = name.rpartition("_")
         for step in range(whole(entry, "repeat")):
             one = {**entry, "address": whole(entry, "address") + step * whole(entry, "size")}
             if "initial_from" in entry:
                 one["initial"] = whole(entry, "initial_from") + step
-            yield read_item(f"{stem}_{int(first) + step}", one, ControlItem)
+            yield read_item(f"{stem}_{int(first) + step}", one)
 
 
-def read_item(name: str, entry: Entry, kind: type[Item], own: Collection[str] = ()) -> Item:
+def read_item(name: str, entry: Entry, own: Collection[str] = ()) -> ControlItem:
     """Return an item by its entry, where a tick is a quantity; raises ValueError when something is wrong."""
     unit, scale = measure(name, entry, "tick", own) if "tick" in entry else ("", 1.0)
     try:
-        return msgspec.convert({"initial": None, **entry, "name": name, "unit": unit, "scale": scale}, kind)
+        entry = {"initial": None, **entry, "name": name, "unit": unit, "scale": scale}
+        return msgspec.convert(entry, ControlItem)
     except msgspec.ValidationError as error:
         what, _, key = str(error).removeprefix("Object ").partition(" - at `$.")
         key = key.rstrip("`")
-        known = get_args(get_type_hints(kind)[key]) if what.startswith("Invalid enum") else ()
+        known = get_args(get_type_hints(ControlItem)[key]) if what.startswith("Invalid enum") else ()
         more = f"; known are {', '.join(known)}" if known else ""
         raise ValueError(f"{name}: {key}{': ' if key else ''}{what}{more}") from None
 

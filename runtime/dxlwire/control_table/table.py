@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -28,7 +29,10 @@ _HIGHEST_VOLTAGE = 4 / 3
 
 
 class ControlItem(msgspec.Struct, frozen=True):
-    """One control item: an integer of 1, 2 or 4 bytes, little-endian, and what it means."""
+    """One control item of a servo or a device: 1, 2 or 4 bytes, little-endian, and what they mean.
+
+    Its value is ticks * scale + offset. The fields from `offset` on are those of devices.
+    """
 
     name: str
     address: int
@@ -37,7 +41,7 @@ class ControlItem(msgspec.Struct, frozen=True):
     area: Area
     minimum: int
     """As the e-Manual gives it: of the integer on the wire, where a direction bit counts as a bit; with two's
-    complement of the signed number."""
+    complement, and of devices, of the signed number. A float32 has the range of the integer of its bytes."""
     maximum: int
     initial: int | None
     """Value of the integer on the wire after a factory reset or at power-up; None: the manual gives none."""
@@ -49,6 +53,12 @@ class ControlItem(msgspec.Struct, frozen=True):
     firmware: int = 0  # First firmware version that has the item; 0: every one
     deviation: Deviation | None = None
     """Judgement of other values than the factory's; None where the item can only be read."""
+    offset: float = 0.0  # SI units at tick 0
+    state: str = ""  # Name of the state that it makes: `angular_velocity.x`
+    safe: int | None = None
+    """Number on the wire that is written at the end of a run; None: nothing is."""
+    bit: int | None = None
+    """Of the item's integer, which other items share; None: all of them. A bit cannot be written alone."""
 
     def encode(self, raw: int) -> bytes:
         """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
@@ -74,14 +84,22 @@ class ControlItem(msgspec.Struct, frozen=True):
 
     def value(self, data: bytes | memoryview) -> float:
         """Return what the item's own bytes mean, SI units."""
-        return self.decode(data) * self.scale
+        if self.bit is not None:
+            return float(self.integer(data))
+        ticks: float = struct.unpack("<f", data)[0] if self.encoding == "float32" else self.decode(data)
+        return ticks * self.scale + self.offset
 
     def integer(self, data: bytes | memoryview) -> int:
-        """Return the integer on the wire that the item's own bytes are, signed where the item is."""
-        return int.from_bytes(data, "little", signed=self.signed)
+        """Return the integer that the item's own bytes are, signed where its range is; of a bit 0 or 1."""
+        if self.signed or self.minimum < 0:
+            return self.decode(data)
+        wire = int.from_bytes(data, "little")
+        return wire if self.bit is None else wire >> self.bit & 1
 
     def wire_bytes(self, value: int) -> bytes:
-        """Return the bytes of an integer on the wire, one below 0 in two's complement."""
+        """Return the bytes of such an integer; one below 0 is in two's complement, or has a direction bit."""
+        if self.encoding == "sign_magnitude" and value < 0:
+            return self.encode(value)
         return value.to_bytes(self.size, "little", signed=value < 0)
 
     @property
@@ -101,16 +119,13 @@ class ControlItem(msgspec.Struct, frozen=True):
         return self.encoding == "twos_complement"
 
 
-Item = TypeVar("Item", bound=ControlItem)
-
-
-class Table(msgspec.Struct, Generic[Item], frozen=True):
+class Table(msgspec.Struct, frozen=True):
     """What the control tables of servos and devices have alike."""
 
     model: str  # The model's own name, also where an alias was given
     aliases: tuple[str, ...]  # Names of models with the same table
     protocol: float
-    items: Mapping[str, Item]
+    items: Mapping[str, ControlItem]
     """By the e-Manual's name in snake_case, in the order of addresses."""
     baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
     capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
@@ -143,7 +158,7 @@ class Table(msgspec.Struct, Generic[Item], frozen=True):
         return next((count for count in range(most, 0, -1) if self.readable(end, end + count)), 0)
 
 
-class ControlTable(Table[ControlItem], frozen=True, kw_only=True):
+class ControlTable(Table, frozen=True, kw_only=True):
     """The control items of one model, and its exact units.
 
     The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from dxlwire.bus_plan import DeviceBlock, DeviceField, Field
-from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.control_table.table import ControlItem
 from dxlwire.plan.line import MOST_SPARE, Line
 
 MOST_BYTES = 120  # The longest block of one read: a device has a small buffer [i]
 
 
 def device_blocks(
-    line: Line, table: DeviceTable, states: Mapping[str, DeviceItem], first_column: int
+    line: Line, table: DeviceTable, states: Mapping[str, ControlItem], first_column: int
 ) -> tuple[DeviceBlock, ...]:
     """Return the reads that get the items of all states in the shortest time, in the order of addresses.
 
@@ -21,7 +22,7 @@ def device_blocks(
     """
     columns = {name: first_column + index for index, name in enumerate(states)}
     wanted = sorted(states.items(), key=lambda pair: pair[1].address)
-    runs: list[list[tuple[str, DeviceItem]]] = []
+    runs: list[list[tuple[str, ControlItem]]] = []
     for name, item in wanted:
         last = runs[-1] if runs else None
         if last is not None and _together(line, table, [one for _, one in last], item):
@@ -31,7 +32,7 @@ def device_blocks(
     return tuple(_block(table, run, columns) for run in runs)
 
 
-def _together(line: Line, table: DeviceTable, run: Sequence[DeviceItem], item: DeviceItem) -> bool:
+def _together(line: Line, table: DeviceTable, run: Sequence[ControlItem], item: ControlItem) -> bool:
     """Check whether one more item is read with those before it, or by a read of its own."""
     start, end = run[0].address, max(one.address + one.size for one in run)
     upto = max(end, item.address + item.size)
@@ -42,7 +43,7 @@ def _together(line: Line, table: DeviceTable, run: Sequence[DeviceItem], item: D
 
 
 def _block(
-    table: DeviceTable, run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]
+    table: DeviceTable, run: Sequence[tuple[str, ControlItem]], columns: Mapping[str, int]
 ) -> DeviceBlock:
     start = run[0][1].address
     end = max(item.address + item.size for _, item in run)

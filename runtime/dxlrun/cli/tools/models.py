@@ -18,7 +18,8 @@ from dxlrun.output.terminal import show, show_json
 if TYPE_CHECKING:
     from dxlsim.motion.motor import Motor
     from dxlwire.control_table import ControlItem, ControlTable
-    from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+    from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.control_table.table import ControlItem
 
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
@@ -184,7 +185,7 @@ def _device_facts(table: DeviceTable) -> Table:
 
 def _device_items(table: DeviceTable) -> Table:
     """Return one row an item of a device."""
-    columns: Columns[DeviceItem] = [
+    columns: Columns[ControlItem] = [
         (Column("item", "name"), "name"),
         (Column("address"), "address"),
         (Column("bit"), "bit"),
@@ -201,7 +202,7 @@ def _device_items(table: DeviceTable) -> Table:
     return Table.listing("Control table", columns, table.items.values())
 
 
-def _measure(item: DeviceItem) -> tuple[str, str]:
+def _measure(item: ControlItem) -> tuple[str, str]:
     """Return what a tick of a device's item is, and what tick 0 is; gyroscopes are in deg/s, not rpm."""
     unit, factor = (
         ("deg/s", 180 / math.pi) if item.unit == "rad/s" else _PER_SI.get(item.unit, (item.unit, 1.0))
@@ -211,7 +212,7 @@ def _measure(item: DeviceItem) -> tuple[str, str]:
     return f"{item.scale * factor:.4g} {unit}", f"{item.offset * factor:.4g}" if item.offset else ""
 
 
-def _device_range(item: DeviceItem) -> str:
+def _device_range(item: ControlItem) -> str:
     if item.encoding == "float32":
         return "float32"
     return f"{item.minimum}..{item.maximum}" if item.bit is None else "0..1"

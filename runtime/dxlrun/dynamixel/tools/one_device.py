@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault
-from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.control_table.devices import device_table
+from dxlwire.control_table.table import ControlItem
 from dxlwire.plan.line import MOST_SPARE
 from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
 from dxlwire.transaction import Outcome, Program, Result, Transaction
@@ -42,7 +43,7 @@ class OneDevice:
             found |= self._run(self._read(self.table.items[name], refused=refused))
         return found
 
-    def write(self, item: DeviceItem, value: int) -> str:
+    def write(self, item: ControlItem, value: int) -> str:
         """Write an item that can be written, and read it back; return what was done, if anything."""
         before = self.read([item.name])[item.name]
         if before == value:
@@ -53,11 +54,11 @@ class OneDevice:
     def _run(self, program: Program[Result]) -> Result:
         return self.tool.run(extend_timeouts(program))
 
-    def _reading(self, item: DeviceItem) -> Transaction:
+    def _reading(self, item: ControlItem) -> Transaction:
         spare = self.table.spare(item.address + item.size, MOST_SPARE)
         return self.tool.line.read(self.servo_id, item.address, item.size, spare)
 
-    def _read(self, item: DeviceItem, *, refused: bool) -> Program[dict[str, int]]:
+    def _read(self, item: ControlItem, *, refused: bool) -> Program[dict[str, int]]:
         reply = yield from retry(self._reading(item))
         if reply.answered:
             raw = item.decode(reply.parameters)
@@ -68,7 +69,7 @@ class OneDevice:
             return {}
         raise self.fail(f"refuses to read {item.title}: {self.tool.line.dialect.describe_error(reply.error)}")
 
-    def _write(self, item: DeviceItem, value: int) -> Program[bool]:
+    def _write(self, item: ControlItem, value: int) -> Program[bool]:
         found: int | None = None
         for _ in range(ATTEMPTS):
             written = yield self.tool.line.write(self.servo_id, item.address, item.encode(value))

@@ -24,8 +24,9 @@ from dxlrun.features.devices.plan import DeviceCommand
 from dxlrun.features.devices.simulate import simulated_states
 from dxlrun.plan.loop_plan import SourcePlan
 from dxlwire.bus_plan import DevicePlan
-from dxlwire.control_table.device_table import DeviceItem, DeviceTable, read_device_table
+from dxlwire.control_table.device_table import DeviceTable, read_device_table
 from dxlwire.control_table.devices import device_table, perhaps_meant_device
+from dxlwire.control_table.table import ControlItem
 from dxlwire.plan.devices import device_blocks
 from dxlwire.plan.line import Line
 from dxlwire.wire.dialect import dialect_of
@@ -158,11 +159,11 @@ def _read(path: Path) -> DeviceTable:
         raise ValueError(f"the entry {error} is missing") from None
 
 
-def _units(items: Mapping[str, DeviceItem]) -> dict[str, str]:
+def _units(items: Mapping[str, ControlItem]) -> dict[str, str]:
     return {name: item.unit for name, item in items.items() if item.unit}
 
 
-def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, DeviceItem]:
+def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, ControlItem]:
     """Return the items of the states, by the states' names."""
     if not device.states and not table.cyclic:
         what = f"{name} names no states, and the table of {table.model} has no items that are read by default"
@@ -172,7 +173,7 @@ def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) 
     return _named(file, ("devices", name, "states"), written, table)
 
 
-def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, DeviceItem]:
+def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, ControlItem]:
     """Return the items of the commands, by the commands' names."""
     found = _named(file, ("devices", name, "commands"), device.commands, table)
     for index, (command, item) in enumerate(found.items()):
@@ -210,9 +211,9 @@ def _with_safe_values(
 
 def _named(
     file: RobotFile, at: KeyPath, pairs: Sequence[tuple[str, str]], table: DeviceTable
-) -> dict[str, DeviceItem]:
+) -> dict[str, ControlItem]:
     """Return items by the names that the file or the table gives them; `at`: where the file names them."""
-    found: dict[str, DeviceItem] = {}
+    found: dict[str, ControlItem] = {}
     _, name, key = at
     for index, (given, item_name) in enumerate(pairs):
         mark = _item_mark(file.description, at, index, given)

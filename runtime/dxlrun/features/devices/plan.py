@@ -11,7 +11,7 @@ import msgspec
 from dxlwire.bus_plan import SIGN
 
 if TYPE_CHECKING:  # the guardian reads no control tables
-    from dxlwire.control_table.device_table import DeviceItem
+    from dxlwire.control_table.table import ControlItem
 
 HIGHEST_FLOAT32 = 3.4028234663852886e38
 
@@ -33,7 +33,7 @@ class DeviceCommand(msgspec.Struct, frozen=True):
     """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
 
     @classmethod
-    def build(cls, name: str, item: DeviceItem, column: int) -> DeviceCommand:
+    def build(cls, name: str, item: ControlItem, column: int) -> DeviceCommand:
         """Return a command by its item."""
         most = HIGHEST_FLOAT32 * abs(item.scale)
         ends = (item.offset - most, item.offset + most)

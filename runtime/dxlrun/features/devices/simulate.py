@@ -8,14 +8,15 @@ from dxlrun.compile.problems import RobotFile
 from dxlrun.errors import suggestion
 from dxlrun.features.devices import form
 from dxlsim.simulation_plan import Shown
-from dxlwire.control_table.device_table import DeviceItem, DeviceTable
+from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.control_table.table import ControlItem
 
 
 def simulated_states(
     file: RobotFile,
     name: str,
     table: DeviceTable,
-    read: Mapping[str, DeviceItem],
+    read: Mapping[str, ControlItem],
     links: Collection[str] | None,
 ) -> Shown:
     """Return the states of a simulated device, by its items; add problems of the keys of its simulation.
