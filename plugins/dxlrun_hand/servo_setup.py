@@ -12,8 +12,6 @@ from dxlrun.tooling.servos import (
     OneServo,
     Search,
     ToolLine,
-    change_id,
-    change_rate,
     compare_servos,
     scan,
     stored_registers,
@@ -142,12 +140,13 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
     if one.holds_torque():
         done += one.torque(False)
     if one.baud_rate != plan.baud_rate:
-        try:
-            done.append(change_rate(one, plan.baud_rate))
-        except LookupError as error:
-            raise ServoFault(f"{error}; correct the robot file") from None
+        if plan.baud_rate not in one.table.baud_rates.values():
+            raise ServoFault(
+                f"{one.table.model} has no rate of {plan.baud_rate} bit/s; correct the robot file"
+            )
+        done.append(one.change_rate(plan.baud_rate))
     if one.servo_id != servo.servo_id:
-        done.append(change_id(one, servo.servo_id))
+        done.append(one.change_id(servo.servo_id))
     desired = stored_registers(one.table, plan, servo)
     declared = {register.name for register in desired}
     refusing = (item for item in one.table.items.values() if item.deviation and item.deviation.may_refuse)

@@ -10,7 +10,7 @@ import pytest
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.description.reading import read_robot
-from dxlrun.dynamixel.tools.one_servo import OneServo, change_id
+from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.errors import InputError, PortError
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
@@ -176,12 +176,14 @@ def test_what_changed_again_is_found_at_the_end(bench: Bench) -> None:
 def test_a_servo_that_dies_in_the_middle_is_set_up_again(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    change_id = OneServo.change_id
+
     def dying(one: OneServo, new: int) -> str:
         bench.line.connect()
         monkeypatch.undo()
         return change_id(one, new)
 
-    monkeypatch.setattr("dxlrun_hand.servo_setup.change_id", dying)
+    monkeypatch.setattr(OneServo, "change_id", dying)
     script = bench.do(
         ("for elbow", bench.connect(0)), ("for elbow", bench.connect(0)), ("all", ""), joints=("elbow",)
     )
@@ -209,7 +211,7 @@ def test_after_ctrl_c_it_is_said_what_was_done(
 def test_ctrl_c_while_a_servo_is_written_to_is_said_so(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("dxlrun_hand.servo_setup.change_id", interrupt)
+    monkeypatch.setattr(OneServo, "change_id", interrupt)
     with pytest.raises(KeyboardInterrupt):
         bench.do(("for elbow", bench.connect(0)))
     assert "the one for elbow may have its new ID or rate already: set it up again" in capsys.readouterr().err

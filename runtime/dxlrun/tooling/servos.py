@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.inspection import compare_servos as compare_servos
     from dxlrun.dynamixel.tools.inspection import stored_registers as stored_registers
     from dxlrun.dynamixel.tools.one_servo import OneServo as OneServo
-    from dxlrun.dynamixel.tools.one_servo import change_id as change_id
-    from dxlrun.dynamixel.tools.one_servo import change_rate as change_rate
     from dxlrun.dynamixel.tools.scanning import FoundServo as FoundServo
     from dxlrun.dynamixel.tools.scanning import Search as Search
     from dxlrun.dynamixel.tools.scanning import find_servo as find_servo

@@ -24,6 +24,7 @@ from dxlwire.control_table.table import ControlTable as ControlTable
 from dxlwire.control_table.table import EffortUnit as EffortUnit
 from dxlwire.control_table.table import Encoding as Encoding
 from dxlwire.control_table.table import FoundDeviation as FoundDeviation
+from dxlwire.control_table.table import Table as Table
 from dxlwire.control_table.table import decoded as decoded
 from dxlwire.control_table.table import find_deviations as find_deviations
 from dxlwire.control_table.table import side_by_side as side_by_side

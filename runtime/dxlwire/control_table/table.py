@@ -129,6 +129,8 @@ class Table(msgspec.Struct, frozen=True):
     """By the e-Manual's name in snake_case, in the order of addresses."""
     baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
     capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
+    errors: HardwareErrors = HardwareErrors()
+    """Where the model reports hardware errors, and what they mean."""
 
     @property
     def size(self) -> int:
@@ -176,8 +178,6 @@ class ControlTable(Table, frozen=True, kw_only=True):
     rad_s_per_tick: float
     max_speed_tick: int  # Highest value of a goal speed without its direction
     effort_per_tick: float  # `effort_unit` per tick of `effort_item`
-    errors: HardwareErrors = HardwareErrors()
-    """Where the model reports hardware errors, and what they mean."""
     effort_unit: EffortUnit
     """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
     max_speed: float  # No-load speed, rad/s, at `nominal_voltage`

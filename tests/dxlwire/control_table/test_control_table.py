@@ -106,3 +106,15 @@ def test_a_broken_data_file_is_refused(old: str, new: str, complaint: str) -> No
     assert old in AX_TEXT
     with pytest.raises(ValueError, match=complaint):
         read_control_table(AX_TEXT.replace(old, new, 1))
+
+
+def test_items_of_devices_have_integers_bytes_and_values() -> None:
+    signed = ControlItem(
+        "x", 0, 2, "RW", "RAM", -1023, 1023, None, "sign_magnitude", "m", 0.5, "", offset=3.0
+    )
+    assert signed.wire_bytes(-5) == b"\x05\x04"
+    assert (signed.integer(b"\x05\x04"), signed.value(b"\x05\x04")) == (-5, 0.5)
+    button = ControlItem("b", 0, 1, "R", "RAM", 0, 255, None, "unsigned", "", 1.0, "", bit=2)
+    assert [(button.integer(data), button.value(data)) for data in (b"\x04", b"\xfb")] == [(1, 1.0), (0, 0.0)]
+    real = ControlItem("f", 0, 4, "RW", "RAM", 0, 2**32 - 1, None, "float32", "m", 2.0, "")
+    assert (real.integer(b"\0\0\x80\x3e"), real.value(b"\0\0\x80\x3e")) == (0x3E800000, 0.5)

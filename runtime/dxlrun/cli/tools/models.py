@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.control_table.table import ControlItem
 
+_DEVICES_ALONE = ("offset", "state", "safe", "bit")
+"""Fields of items that say nothing about servos."""
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
     "rad/s": ("rpm", 30 / math.pi),
@@ -116,17 +118,27 @@ def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
     about |= _known(table, "rad_s_per_tick max_speed_tick effort_per_tick effort_unit max_speed")
     rated = _known(table, "stall_torque stall_current nominal_voltage gear_ratio")
     about |= {name: value or None for name, value in rated.items()}
-    return {"kind": "servo", **about, "simulated_motor": _motor_json(table), **_ends(table, items=items)}
+    return {
+        "kind": "servo",
+        **about,
+        "simulated_motor": _motor_json(table),
+        **_ends(table, _DEVICES_ALONE, items=items),
+    }
 
 
 def _known(table: ControlTable | DeviceTable, names: str) -> dict[str, object]:
     return {name: getattr(table, name) for name in names.split()}
 
 
-def _ends(table: ControlTable | DeviceTable, *, items: bool) -> dict[str, object]:
-    """Return what the JSON of a table ends with."""
+def _ends(
+    table: ControlTable | DeviceTable, without: Collection[str] = (), *, items: bool
+) -> dict[str, object]:
+    """Return what the JSON of a table ends with; `without`: fields of items that it omits."""
     known = {"capabilities": sorted(table.capabilities), "baud_rates": dict(table.baud_rates)}
-    return {**known, "items": [asdict(item) for item in table.items.values()]} if items else {**known}
+    if not items:
+        return {**known}
+    shown = [asdict(item) for item in table.items.values()]
+    return {**known, "items": [{key: item[key] for key in item if key not in without} for item in shown]}
 
 
 # Tables

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -20,27 +19,15 @@ from dxlrun.output.target import check_target
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.tools.one_device import OneDevice
+    from dxlrun.dynamixel.tools.one_node import OneNode
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
     from dxlrun.output.table import Table
-    from dxlwire.bus_plan import RegisterValue
-    from dxlwire.control_table import ControlItem, ControlTable, FoundDeviation
-    from dxlwire.control_table.device_table import DeviceTable
+    from dxlwire.control_table import FoundDeviation
+    from dxlwire.control_table import Table as ControlTable
 
 Keep = Literal["nothing", "id", "id-and-baud"]
-_TORQUE_OFF = "its torque goes off, and what it holds falls"
-_ELSEWHERE: Mapping[str, str] = MappingProxyType(
-    {
-        "id": "`dxlrun servo PORT ID id NEW` changes it",
-        "baud_rate": "`dxlrun servo PORT ID baud RATE` changes it",
-        "baud_rate_bus": "`dxlrun servo PORT ID baud RATE` changes it",
-        "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
-        "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
-    }
-)
-"""What `set` does not do, as more than a write belongs to it."""
 NOTHING_CHANGED = "nothing was changed"
 
 
@@ -87,7 +74,7 @@ def servo(
     log
         Write a log to this new file, with every packet.
     """
-    from dxlrun.dynamixel.tools.one_device import OneDevice
+    from dxlrun.dynamixel.tools.one_node import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
@@ -101,13 +88,14 @@ def servo(
     ):
         tool = ToolLine(line, packets)
         found = _find(tool, servo_id, search)
-        one: OneServo | OneDevice
-        if found.device:
-            one = OneDevice(tool, found)
-            _of_device(one, verb, asked)
+        one = OneDevice(tool, found) if found.device else OneServo(tool, found)
+        if isinstance(one, OneServo):
+            done = VERBS[verb].do(one, asked)
+        elif verb in _OF_DEVICES:
+            done = _OF_DEVICES[verb](one, asked)
         else:
-            one = OneServo(tool, found)
-            VERBS[verb].do(one, asked)
+            raise InputError(f"{one.called} is no servo, so it cannot {verb}; it has get and set")
+        asked.done += filter(None, done)
     _show(one, verb, asked, as_json=as_json)
     return 1 if asked.declined else 0
 
@@ -147,7 +135,7 @@ def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     return found[0]
 
 
-def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) -> None:
+def _show(one: OneNode, verb: str, asked: Asked, *, as_json: bool) -> None:
     if as_json:
         identity = {
             "id": one.servo_id,
@@ -172,15 +160,9 @@ def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) 
         show(NOTHING_CHANGED)
 
 
-def _registers(
-    values: Mapping[str, int], table: ControlTable | DeviceTable, deviations: Sequence[FoundDeviation]
-) -> Table:
+def _registers(values: Mapping[str, int], table: ControlTable, deviations: Sequence[FoundDeviation]) -> Table:
     from dxlrun.dynamixel.servo.registers import meaning
     from dxlrun.output.table import Column, Table
-    from dxlwire.control_table import ControlTable
-
-    items: Mapping[str, ControlItem] = table.items
-    errors = table.errors if isinstance(table, ControlTable) else None
 
     columns = [
         Column("item", "name"),
@@ -200,15 +182,15 @@ def _registers(
         (
             name,
             *(item.address, item.area, item.access),
-            *(value, meaning(item, value, errors), judged.get(name, "")),
+            *(value, meaning(item, value, table.errors), judged.get(name, "")),
         )
         for name, value in values.items()
-        for item in (items[name],)
+        for item in (table.items[name],)
     ]
     return Table.of("", columns, rows)
 
 
-# The verbs: each reads its words, asks for confirmation where it must, and reports what was done
+# The verbs: each passes its words on, and returns what was done, one sentence each
 
 
 @dataclass(slots=True)
@@ -248,53 +230,12 @@ class Verb:
     """Its words."""
     fewest: int
     most: int
-    do: Callable[[OneServo, Asked], None]
+    do: Callable[[OneServo, Asked], Iterable[str]]
     check: Callable[[Asked], None] = lambda _: None
     """Looks at the words before the port is opened; raises InputError."""
 
 
-def _of_device(one: OneDevice, verb: str, asked: Asked) -> None:
-    """Do what can be done to a device that is no servo; raises InputError for the rest."""
-    if verb == "get":
-        _get(one, asked)
-        return
-    if verb != "set":
-        raise InputError(f"{one.called} is no servo, so it cannot {verb}; it has get and set")
-    name, text = asked.words
-    item = one.table.items.get(name)
-    if name in ("id", "baud_rate"):
-        raise InputError(f"{name} of a device is not set by dxlrun; use the maker's tool")
-    if item is not None and item.access == "R":
-        raise InputError(f"{item.title} can only be read; `get` shows it")
-    value = _device_value(one.table, name, text)
-    item = one.table.items[name]
-    if item.area == "EEPROM":
-        before = one.read([name])[name]
-        if before != value and not asked.confirmed(
-            f"{one.called}: {item.title} is {before} and becomes {value} (EEPROM)"
-        ):
-            return
-    asked.done.append(one.write(item, value))
-
-
-def _device_value(table: DeviceTable, name: str, text: str) -> int:
-    """Return the integer on the wire for a word of the command line; raises InputError."""
-    from dxlrun.compile.joints.register_values import any_value
-
-    item = table.items.get(name)
-    if item is not None and item.encoding == "float32":
-        try:
-            return int.from_bytes(struct.pack("<f", (float(text) - item.offset) / item.scale), "little")
-        except (ValueError, OverflowError):
-            raise InputError(f"{text!r} is no number; {item.title} is a float32") from None
-    try:
-        return any_value(table, name, _value(text)).value
-    except ValueError as error:  # also an UnfitRegister
-        raise InputError(str(error)) from None
-
-
-def _get(one: OneServo | OneDevice, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.one_servo import OneServo
+def _get(one: OneNode, asked: Asked) -> Iterable[str]:
     from dxlrun.errors import suggestion
 
     names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))
@@ -305,36 +246,23 @@ def _get(one: OneServo | OneDevice, asked: Asked) -> None:
             "\n".join(f"an {one.table.model} has no {name}; {suggestion(name, known)}" for name in wrong)
         )
     asked.registers |= one.read(names, refused=not asked.words)
-    if isinstance(one, OneServo):
-        asked.deviations = one.deviations(asked.registers)
+    asked.deviations = one.deviations(asked.registers)
+    return ()
 
 
-def _set(one: OneServo, asked: Asked) -> None:
+def _set(one: OneNode, asked: Asked) -> Iterable[str]:
     from dxlrun.compile.joints.register_values import any_value
-    from dxlrun.dynamixel.servo.registers import shown
 
     name, text = asked.words
-    if name in _ELSEWHERE:
-        raise InputError(f"{name} is not set like others; {_ELSEWHERE[name]}")
+    if name in one.NOT_SET:
+        raise InputError(one.NOT_SET[name])
     if name in one.table.items and one.table.items[name].access == "R":
         raise InputError(f"{one.table.items[name].title} can only be read; `get` shows it")
     try:
         target = any_value(one.table, name, _value(text))
     except ValueError as error:  # also an UnfitRegister
         raise InputError(str(error)) from None
-    item = one.table.items[name].title
-    (found,) = one.differences([target])
-    if found.found is None or not found.differs:
-        asked.done.append(f"{item} is {target.value} already")
-        if not target.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
-            asked.done += one.write([target])
-        return
-    change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {target.value}"
-    if target.eeprom:
-        one.writable([target])
-        if not asked.confirmed(f"{one.called}: {change} (EEPROM)"):
-            return
-    asked.done += one.write([target])
+    return one.set_register(target, asked.confirmed)
 
 
 def _value(text: str) -> int | str:
@@ -344,71 +272,17 @@ def _value(text: str) -> int | str:
         return text
 
 
-def _id(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.one_servo import change_id
-    from dxlwire.wire.dialect import dialect_of
-
-    new, highest = int(asked.words[0]), dialect_of(one.table.protocol).HIGHEST_ID
-    if new > highest:
-        raise InputError(f"{new} is no ID of Protocol {one.table.protocol}; they are 0..{highest}")
-    if new == one.servo_id:
-        asked.done.append(f"has ID {new} already")
-    elif asked.confirmed(f"{one.called}: its ID becomes {new} (EEPROM)"):
-        asked.done.append(change_id(one, new))
-
-
-def _baud(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.one_servo import change_rate
-
-    new, rates = int(asked.words[0]), sorted(one.table.baud_rates.values())
-    if new not in rates:
-        known = ", ".join(map(str, rates))
-        raise InputError(f"an {one.table.model} has no rate of {new} bit/s; it has {known}")
-    if new == one.baud_rate:
-        asked.done.append(f"talks at {new} bit/s already")
-    elif asked.confirmed(f"{one.called}: its baud rate becomes {new} bit/s (EEPROM)"):
-        asked.done.append(change_rate(one, new))
-
-
-def _reboot(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.one_servo import reboot
-
-    if not one.holds_torque() or asked.confirmed(f"{one.called} holds torque: {_TORQUE_OFF}"):
-        asked.done.append(reboot(one))
-
-
-def _factory_reset(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.one_servo import factory_reset
-    from dxlwire.wire.protocol2 import Reset
-
-    old = one.table.protocol == 1.0
-    if old and asked.keep not in (None, "nothing"):
-        raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --except nothing")
-    keep = asked.keep or ("nothing" if old else "id-and-baud")
-    kept = {
-        "nothing": "ID and baud rate too",
-        "id": "its baud rate too; its ID stays",
-        "id-and-baud": "its ID and its baud rate stay",
-    }
-    if asked.confirmed(f"{one.called}: its EEPROM gets the factory's values ({kept[keep]})"):
-        how = {"nothing": Reset.ALL, "id": Reset.KEEP_ID, "id-and-baud": Reset.KEEP_ID_AND_BAUD_RATE}
-        asked.done.append(factory_reset(one, how[keep]))
-
-
-def _backup(one: OneServo, asked: Asked) -> None:
+def _backup(one: OneServo, asked: Asked) -> Iterable[str]:
     from dxlrun.dynamixel.tools import servo_backup
-    from dxlrun.dynamixel.tools.one_servo import back_up
 
     if not asked.words:
-        if asked.confirmed(f"{one.called}: the backup that it keeps itself is overwritten"):
-            asked.done.append(back_up(one))
-        return
+        return (one.back_up(asked.confirmed),)
     asked.registers |= one.read(servo_backup.kept_items(one.table), refused=True)
     address = one.servo_id, one.baud_rate
     path = Path(asked.words[0])
     backup = servo_backup.stamped(one.table, one.found.firmware, address, asked.registers)
     servo_backup.write_backup(path, backup)
-    asked.done.append(f"{len(asked.registers)} registers are in {path}")
+    return (f"{len(asked.registers)} registers are in {path}",)
 
 
 def _new_file(asked: Asked) -> None:
@@ -416,39 +290,17 @@ def _new_file(asked: Asked) -> None:
         check_target(Path(asked.words[0]))
 
 
-def _restore(one: OneServo, asked: Asked) -> None:
+def _restore(one: OneServo, asked: Asked) -> Iterable[str]:
     from dxlrun.dynamixel.tools import servo_backup
-    from dxlrun.dynamixel.tools.one_servo import take_back
 
     if not asked.words:
-        if asked.confirmed(f"{one.called}: its EEPROM becomes that of the backup that it keeps itself"):
-            asked.done.append(take_back(one))
-        return
+        return (one.take_back(asked.confirmed),)
     path = Path(asked.words[0])
     backup = servo_backup.read_backup(path)
     target = servo_backup.registers_to_restore(path, backup, one.table)
     if backup.firmware != one.found.firmware:
         print_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
-    differing = [each.register for each in one.differences(target) if each.differs]
-    if not differing:
-        asked.done.append(f"has everything that {path} restores already")
-        return
-    one.writable(differing)
-    names = ", ".join(each.name for each in differing)
-    if not asked.confirmed(f"{one.called}: {names} become as in {path}; its ID and its rate stay"):
-        return
-    asked.done += _written_back(one, target)
-
-
-def _written_back(one: OneServo, target: Sequence[RegisterValue]) -> tuple[str, ...]:
-    """Write, and look at all of it again: a mode that comes back resets registers beside it."""
-    written = one.write(target)
-    left = [each.register.name for each in one.differences(target) if each.differs]
-    if left:
-        raise ServoFault(
-            f"{one.called}: {', '.join(left)} changed again while others were written; try again"
-        )
-    return written
+    return one.restore(target, path, asked.confirmed)
 
 
 def _old_file(asked: Asked) -> None:
@@ -458,12 +310,11 @@ def _old_file(asked: Asked) -> None:
         read_backup(Path(asked.words[0]))
 
 
-def _blink(one: OneServo, asked: Asked) -> None:
-    asked.done.append(one.blink(int(asked.words[0]) if asked.words else 5))
+def _factory_reset(one: OneServo, asked: Asked) -> Iterable[str]:
+    from dxlwire.wire.protocol2 import Reset
 
-
-def _torque(one: OneServo, asked: Asked) -> None:
-    asked.done += one.torque(asked.words[0] == "on")
+    keep = {"nothing": Reset.ALL, "id": Reset.KEEP_ID, "id-and-baud": Reset.KEEP_ID_AND_BAUD_RATE}
+    return (one.factory_reset(None if asked.keep is None else keep[asked.keep], asked.confirmed),)
 
 
 def _whole(what: str, lowest: int, highest: int) -> Callable[[Asked], None]:
@@ -480,17 +331,37 @@ def _on_or_off(asked: Asked) -> None:
         raise InputError(f"torque is switched on or off, not {asked.words[0]!r}")
 
 
+_OF_DEVICES: Mapping[str, Callable[[OneNode, Asked], Iterable[str]]] = {"get": _get, "set": _set}
+"""What can be done to a device that is not a servo, too."""
 VERBS: Mapping[str, Verb] = MappingProxyType(
     {
         "get": Verb("[ITEM...]", 0, 1000, _get),
         "set": Verb("ITEM VALUE", 2, 2, _set),
-        "id": Verb("NEW", 1, 1, _id, _whole("ID", 0, 253)),
-        "baud": Verb("RATE", 1, 1, _baud, _whole("baud rate", 9_600, 10_500_000)),
-        "reboot": Verb("", 0, 0, _reboot),
+        "id": Verb(
+            "NEW",
+            1,
+            1,
+            lambda one, asked: (one.change_id(int(asked.words[0]), asked.confirmed),),
+            _whole("ID", 0, 253),
+        ),
+        "baud": Verb(
+            "RATE",
+            1,
+            1,
+            lambda one, asked: (one.change_rate(int(asked.words[0]), asked.confirmed),),
+            _whole("baud rate", 9_600, 10_500_000),
+        ),
+        "reboot": Verb("", 0, 0, lambda one, asked: (one.reboot(asked.confirmed),)),
         "factory-reset": Verb("[--except nothing|id|id-and-baud]", 0, 0, _factory_reset),
         "backup": Verb("[FILE]", 0, 1, _backup, _new_file),
         "restore": Verb("[FILE]", 0, 1, _restore, _old_file),
-        "blink": Verb("[TIMES]", 0, 1, _blink, _whole("number of times", 1, 1000)),
-        "torque": Verb("on|off", 1, 1, _torque, _on_or_off),
+        "blink": Verb(
+            "[TIMES]",
+            0,
+            1,
+            lambda one, asked: (one.blink(*map(int, asked.words)),),
+            _whole("number of times", 1, 1000),
+        ),
+        "torque": Verb("on|off", 1, 1, lambda one, asked: one.torque(asked.words[0] == "on"), _on_or_off),
     }
 )

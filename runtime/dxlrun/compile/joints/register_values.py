@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 from types import MappingProxyType
 
 from dxlrun.description.units import quantity
 from dxlrun.errors import suggestion
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import ControlItem, ControlTable
-from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.control_table import ControlItem, ControlTable, Table
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
@@ -79,7 +79,7 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     return found
 
 
-def any_value(table: ControlTable | DeviceTable, name: str, value: int | str) -> RegisterValue:
+def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
     """Return what a tool writes into any item that can be written; raises UnfitRegister.
 
     `value` is what `register_value` takes.
@@ -142,6 +142,11 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
 
 
 def _raw(item: ControlItem, value: int | str) -> int:
+    if item.encoding == "float32":
+        try:
+            return int.from_bytes(struct.pack("<f", (float(value) - item.offset) / item.scale), "little")
+        except (ValueError, OverflowError):
+            raise UnfitRegister(f"{value!r} is no number", f"{item.title} is a float32") from None
     if isinstance(value, int):
         return value
     if not item.unit:

@@ -1,13 +1,12 @@
-"""Access: one servo on its line, whose control items programs read and write by name."""
+"""Access: a servo or a device on its line, whose control items programs read and write by name."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
-from typing import NamedTuple
 
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import ControlItem, ControlTable, control_table, decoded, side_by_side
+from dxlwire.control_table import ControlItem, ControlTable, Table, control_table, decoded, side_by_side
 from dxlwire.plan.line import MOST_SPARE, Line
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
@@ -17,35 +16,38 @@ NEAR = 16  # Bytes between two items for which another read would take longer th
 LONGEST_READ = 64  # Bytes; a longer reply would not fit between two cycles
 
 
-class Access(NamedTuple):
-    """One servo as programs reach it; as text it is what messages call it."""
+class ItemAccess:
+    """Something with an ID as programs reach it; as text it is what messages call it."""
 
-    plan: BusPlan
-    servo: ServoPlan
-    line: Line
-    """How long its replies may take: `reach` has the plan's, `first_reach` the longest."""
+    __slots__ = ("line", "name", "servo_id")
 
-    def __str__(self) -> str:
-        return self.plan.label(self.servo)
+    def __init__(self, line: Line, servo_id: int, name: str) -> None:
+        """`line` decides how long replies may take; `name` is that in events."""
+        self.line = line
+        self.servo_id = servo_id
+        self.name = name
 
     @property
-    def table(self) -> ControlTable:
+    def table(self) -> Table:
         """Its control table."""
-        return control_table(self.servo.model, self.plan.protocol)
+        raise NotImplementedError
 
     @property
     def items(self) -> Mapping[str, ControlItem]:
         """Its control items, by name."""
         return self.table.items
 
+    def spare(self, end: int) -> int:
+        """Return how many bytes behind an end can be read too."""
+        return self.table.spare(end, MOST_SPARE)
+
     def reading(self, address: int, size: int) -> Transaction:
         """Return the read of some bytes."""
-        spare = _spare(self.servo.model, self.plan.protocol, address + size)
-        return self.line.read(self.servo.servo_id, address, size, spare)
+        return self.line.read(self.servo_id, address, size, self.spare(address + size))
 
     def writing(self, address: int, data: bytes) -> Transaction:
         """Return the write of some bytes."""
-        return self.line.write(self.servo.servo_id, address, data)
+        return self.line.write(self.servo_id, address, data)
 
     def read_bytes(self, address: int, size: int) -> Program[Reply]:
         """Read bytes, up to three times."""
@@ -158,13 +160,44 @@ class Access(NamedTuple):
         if (yield from self.read_one("lock")):
             lock = self.items["lock"].title
             return f"has {lock} = 1, so {names} in its EEPROM was not written: switch its power off and on"
-        torque = yield from self.read_torque()
+        if (enable := self.items.get("torque_enable")) is None:
+            return ""
+        torque = yield from self.read_bytes(enable.address, enable.size)
         if not torque.answered:
             return unread or f"did not answer when its torque was read, so {names} was not written"
         if torque.parameters[0]:
             release = release or "switch its torque off first"
             return f"holds torque, so {names} in its EEPROM was not written: {release}"
         return ""
+
+    def reason(self, reply: Reply) -> str:
+        """Return why the write was refused, behind a colon; nothing where it was not."""
+        return (
+            f": {self.line.dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""
+        )
+
+
+class Access(ItemAccess):
+    """A servo of a bus: `reach` has the timeouts of the plan, `first_reach` the longest."""
+
+    __slots__ = ("plan", "servo")
+
+    def __init__(self, plan: BusPlan, servo: ServoPlan, line: Line) -> None:
+        super().__init__(line, servo.servo_id, servo.joint)
+        self.plan = plan
+        self.servo = servo
+
+    def __str__(self) -> str:
+        return self.plan.label(self.servo)
+
+    @property
+    def table(self) -> ControlTable:
+        """Its control table."""
+        return control_table(self.servo.model, self.plan.protocol)
+
+    def spare(self, end: int) -> int:
+        """Return how many bytes behind an end can be read too."""
+        return _spare(self.servo.model, self.plan.protocol, end)
 
     def read_torque(self) -> Program[Reply]:
         """Read torque enable."""
@@ -173,12 +206,6 @@ class Access(NamedTuple):
     def torque_off(self) -> Program[Reply]:
         """Write torque enable = 0."""
         return limit_patience(self.write_bytes(self.servo.torque_address, b"\0"))
-
-    def reason(self, reply: Reply) -> str:
-        """Return why the servo refused, behind a colon; nothing where it did not."""
-        return (
-            f": {self.line.dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""
-        )
 
 
 @lru_cache

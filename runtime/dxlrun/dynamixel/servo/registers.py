@@ -13,7 +13,7 @@ import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import Access, first_reach
+from dxlrun.dynamixel.servo.access import ItemAccess, first_reach
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlItem, HardwareErrors
 from dxlwire.transaction import Program
@@ -34,7 +34,7 @@ class RegisterDifference(msgspec.Struct, frozen=True):
         return self.found is not None and self.found != self.register.value
 
 
-def compare(one: Access, registers: Sequence[RegisterValue]) -> Program[tuple[RegisterDifference, ...]]:
+def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tuple[RegisterDifference, ...]]:
     """Read registers of one servo; writes nothing."""
     found = []
     for register in registers:
@@ -42,7 +42,7 @@ def compare(one: Access, registers: Sequence[RegisterValue]) -> Program[tuple[Re
     return tuple(found)
 
 
-def settle(one: Access, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
+def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
     """Write the registers that a servo has otherwise, and read them back; return what it had, by item.
 
     Nothing is written when one cannot be read, or when the EEPROM is closed to one of them.
@@ -63,7 +63,7 @@ def settle(one: Access, registers: Sequence[RegisterValue], found: Findings) -> 
         else:
             item = one.items[register.name]
             text = f"{item.title} was {shown(item, before[item.name])} and is {register.value}"
-            found.note(EventCode.REGISTER_WRITTEN, Severity.INFO, one.servo.joint, text)
+            found.note(EventCode.REGISTER_WRITTEN, Severity.INFO, one.name, text)
     return before
 
 
@@ -91,21 +91,17 @@ def shown(item: ControlItem, raw: int) -> str:
     return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
 
 
-def meaning(item: ControlItem, value: int, errors: HardwareErrors | None = None) -> str:
-    """Return a value of an item with its unit; empty for what has none.
-
-    Args:
-        errors: the model's hardware errors; None for a device.
-    """
+def meaning(item: ControlItem, value: int, errors: HardwareErrors) -> str:
+    """Return a value of an item with its unit, or the hardware errors that it means; empty without either."""
     if tripped(item, value):
         return "tripped"
-    if errors is not None and item.name == errors.item:
+    if item.name == errors.item:
         return errors.describe(value)
     return _quantity(item, value) if item.unit or item.encoding == "float32" else ""
 
 
 def _quantity(item: ControlItem, value: int) -> str:
-    quantity = item.value(value.to_bytes(item.size, "little", signed=item.signed))
+    quantity = item.value(item.wire_bytes(value))
     if not item.unit:
         return f"{quantity:.6g}"
     if item.unit == "s" and abs(quantity) < 1:
@@ -115,11 +111,11 @@ def _quantity(item: ControlItem, value: int) -> str:
     return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
 
 
-def _integer(one: Access, register: RegisterValue) -> Program[int | None]:
+def _integer(one: ItemAccess, register: RegisterValue) -> Program[int | None]:
     reply = yield from one.read_bytes(register.address, register.size)
     item = one.items[register.name]
     return item.integer(reply.parameters[: item.size]) if reply.answered else None
 
 
-def _names(one: Access, registers: Sequence[RegisterValue]) -> str:
+def _names(one: ItemAccess, registers: Sequence[RegisterValue]) -> str:
     return ", ".join(one.items[register.name].title for register in registers)

@@ -10,51 +10,65 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
 
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.checks import deviations
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
+from dxlrun.dynamixel.tools.one_node import Confirm, OneNode, agree
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.errors import ServoFault
+from dxlrun.errors import InputError, ServoFault
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import (
-    ControlItem,
     ControlTable,
     FoundDeviation,
     control_table,
-    side_by_side,
 )
 from dxlwire.modes import Mode
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlwire.plan.mode_plan import mode_in
 from dxlwire.plan.planning import Wiring, bus_plan
-from dxlwire.plan.retry import extend_timeouts, retry
-from dxlwire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlwire.plan.retry import retry
+from dxlwire.transaction import Outcome, Program, Reply, Transaction
 from dxlwire.wire import protocol1, protocol2
 from dxlwire.wire.protocol2 import Reset
 
-LONGEST_READ = 64  # Bytes of one read; neighbours are read together
 BLINK_NS = 300_000_000  # How long the LED is on, and then off
 BOOT_NS = 5_000_000_000  # How long a rebooting servo is awaited
 _PINGED_EVERY_NS = 100_000_000
 _STORED_NS = 50_000_000  # What a servo may take to write its EEPROM [i]
 _TICK_MODULUS = 32_768
 _TICK_SPARE_MS = 500
+_SET_BY: Mapping[str, str] = {
+    "id": "`dxlrun servo PORT ID id NEW` changes it",
+    "baud_rate": "`dxlrun servo PORT ID baud RATE` changes it",
+    "baud_rate_bus": "`dxlrun servo PORT ID baud RATE` changes it",
+    "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
+    "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
+}
+"""What is not set like other items, as more than a write belongs to it."""
+_KEPT: Mapping[Reset, str] = {
+    Reset.ALL: "ID and baud rate too",
+    Reset.KEEP_ID: "its baud rate too; its ID stays",
+    Reset.KEEP_ID_AND_BAUD_RATE: "its ID and its baud rate stay",
+}
 _LEDS = ("led", "led_red", "led_green", "led_blue")
 
 
-class OneServo:
+class OneServo(OneNode):
     """The servo that a tool works on; blocks, and raises ServoFault or PortError."""
+
+    NOT_SET = MappingProxyType({name: f"{name} is not set like others; {_SET_BY[name]}" for name in _SET_BY})
+    table: ControlTable
 
     def __init__(self, tool: ToolLine, found: FoundServo) -> None:
         if not found.model or found.garbled:
             raise ServoFault(f"ID {found.servo_id} at {found.baud_rate} bit/s {'; '.join(found.remarks)}")
-        self.tool = tool
-        self.found = found
-        self.table: ControlTable = control_table(found.model, found.protocol)
+        super().__init__(tool, found, control_table(found.model, found.protocol))
         self.move_to(found.servo_id, found.baud_rate)
 
     def move_to(self, servo_id: int, baud_rate: int) -> None:
@@ -64,52 +78,27 @@ class OneServo:
         self.plan = self._plan()
 
     @property
-    def called(self) -> str:
-        """How messages call it."""
-        return f"{self.table.model}, ID {self.servo_id} at {self.baud_rate} bit/s"
-
-    @property
     def _servo(self) -> ServoPlan:
         return self.plan.servos[0]
 
     @property
-    def _reach(self) -> Access:
+    def access(self) -> Access:
+        """Its items, as programs reach them."""
         return Access(self.plan, self._servo, self.tool.line)
-
-    def fail(self, text: str) -> ServoFault:
-        """Return an error about this servo."""
-        return ServoFault(f"{self.called}: {text}")
 
     # Registers
 
-    def read(self, names: Sequence[str], *, refused: bool = False) -> Mapping[str, int]:
-        """Return items by name: integers of the wire, signed where the item is.
-
-        `refused`: what the servo's firmware does not have is left out; without, that is an error.
-        """
-        found: dict[str, int] = {}
-        for block in side_by_side((self.table.items[name] for name in names), LONGEST_READ):
-            found |= self.run(self._read_block(block, refused=refused))
-        return {name: found[name] for name in names if name in found}
-
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
         """Return which of some values are not the factory's and matter to a run."""
-        return deviations(self._reach, values, mode_in(self._servo, values))
+        return deviations(self.access, values, mode_in(self._servo, values))
 
     def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
-        found = self.run(compare(self._reach, desired))
+        found = self.run(compare(self.access, desired))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]
         if silent:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
         return found
-
-    def writable(self, desired: Sequence[RegisterValue]) -> None:
-        """Make sure that registers can be written; raises ServoFault where the EEPROM is closed."""
-        stored = [self.table.items[one.name].title for one in desired if one.eeprom]
-        release = f"switch the torque off first: {self.command} torque off"
-        if stored and (problem := self.run(self._reach.closed_eeprom(stored[0], release=release))):
-            raise self.fail(problem)
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in order, and read each back; return what was written.
@@ -120,13 +109,7 @@ class OneServo:
         self.writable(desired)
         tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in desired)
         cleared = self.clear_watchdog(armed=False) if tripping else ()
-        found = Findings()
-        self.run(settle(self._reach, desired, found))
-        written = [text for _, _, _, text in found.events]
-        if found.problems:
-            before = [f"written before that: {text}" for text in written]
-            raise ServoFault("\n".join([*found.problems, *before]))
-        return (*cleared, *written)
+        return (*cleared, *self._settle(desired))
 
     def clear_watchdog(self, *, armed: bool) -> tuple[str, ...]:
         """Clear a Bus Watchdog that is tripped, `armed`: or would trip; return what was done, if anything.
@@ -175,12 +158,12 @@ class OneServo:
         mode = self._mode()
         held = self.run(modes.hold(reach(self.plan, self._servo), mode))
         if held.problem:
-            self.run(settle(self._reach, [self.register("torque_enable", 0)], Findings()))
+            self.run(settle(self.access, [self.register("torque_enable", 0)], Findings()))
             raise self.fail(f"{held.problem}; its torque is off")
         where = "" if held.goal is None else f" at tick {held.goal}, where it stood"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
-    def blink(self, times: int) -> str:
+    def blink(self, times: int = 5) -> str:
         """Let the LED blink, and leave it as it was; return what was done."""
         names = [name for name in _LEDS if name in self.table.items]
         if not names:
@@ -198,15 +181,6 @@ class OneServo:
 
     # Inside
 
-    def run(self, program: Program[Result]) -> Result:
-        """Run a program with longer timeouts: the servo is known to be there."""
-        return self.tool.run(extend_timeouts(program))
-
-    @property
-    def command(self) -> str:
-        """How a command line to it begins."""
-        return f"dxlrun servo {self.tool.port.name} {self.servo_id}"
-
     def _mode(self) -> Mode:
         """Find out in which mode it is, and prepare that; raises ServoFault for one that is not known."""
         for continuous in (False, True):
@@ -219,11 +193,6 @@ class OneServo:
                 return mode
         self.plan = self._plan()
         raise self.fail("is in a mode that dxlrun does not know, so its torque stays off")
-
-    def register(self, name: str, value: int) -> RegisterValue:
-        """Return an item with what it shall hold, the integer of the wire."""
-        item = self.table.items[name]
-        return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
 
     def _plan(self, continuous: bool = False) -> BusPlan:
         table, name = self.table, self.tool.port.name
@@ -249,192 +218,213 @@ class OneServo:
             protocol=table.protocol,
         )
 
-    def _read_block(self, block: Sequence[ControlItem], *, refused: bool) -> Program[dict[str, int]]:
-        start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield from self._reach.read_bytes(start, end - start)
-        if reply.answered:
-            places = ((item, item.address - start) for item in block)
-            return {item.name: item.integer(reply.parameters[at : at + item.size]) for item, at in places}
-        found: dict[str, int] = {}
-        for item in block:
-            reply = yield from self._reach.read_bytes(item.address, item.size)
-            if reply.answered:
-                found[item.name] = item.integer(reply.parameters)
-            elif reply.outcome is not Outcome.REFUSED:
-                raise self.fail(f"did not answer when {item.title} was read")
-            elif not refused:
-                why = self.tool.line.dialect.describe_error(reply.error)
-                raise self.fail(f"refuses to read {item.title}: {why}")
-        return found
+    # Verbs: each returns what was done, nothing where that was not confirmed
 
+    def change_id(self, new: int, confirm: Confirm = agree) -> str:
+        """Give it another ID. Raises ServoFault, also where the ID is taken, and InputError for one that the
+        protocol does not have.
+        """
+        if new > (highest := self.tool.line.dialect.HIGHEST_ID):
+            raise InputError(f"{new} is no ID of Protocol {self.table.protocol}; they are 0..{highest}")
+        if new == self.servo_id:
+            return f"has ID {new} already"
+        if not confirm(f"{self.called}: its ID becomes {new} (EEPROM)"):
+            return ""
+        self.writable([self.register("id", new)])
+        old, line = self.servo_id, self.tool.line
+        self._free(new)
+        item = self.table.items["id"]
+        self._written(line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
+        if self._there(old) is not Outcome.TIMEOUT and self._there(new) is Outcome.TIMEOUT:
+            raise self.fail(f"was given {item.title} = {new}, but still answers under its old one")
+        self.move_to(new, self.baud_rate)
+        self._same()
+        if self._there(old) is not Outcome.TIMEOUT:
+            raise self.fail(f"has its new ID, but a servo still answers under ID {old}: there were two")
+        return f"has ID {new}; it had {old}"
 
-def change_id(one: OneServo, new: int) -> str:
-    """Give a servo another ID; return what was done. Raises ServoFault, also where it is taken."""
-    one.writable([one.register("id", new)])
-    old, line = one.servo_id, one.tool.line
-    _free(one, new)
-    item = one.table.items["id"]
-    _written(one, line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
-    if _there(one, old) is not Outcome.TIMEOUT and _there(one, new) is Outcome.TIMEOUT:
-        raise one.fail(f"was given {item.title} = {new}, but still answers under its old one")
-    one.move_to(new, one.baud_rate)
-    _same(one)
-    if _there(one, old) is not Outcome.TIMEOUT:
-        raise one.fail(f"has its new ID, but a servo still answers under ID {old}: there were two")
-    return f"has ID {new}; it had {old}"
+    def change_rate(self, new: int, confirm: Confirm = agree) -> str:
+        """Let it talk at another rate, bit/s.
 
-
-def change_rate(one: OneServo, new: int) -> str:
-    """Let a servo talk at another rate, bit/s; return what was done.
-
-    Raises ServoFault, also where the adapter cannot, or another servo there has its ID; LookupError where the
-    model does not have the rate.
-    """
-    value = next((value for value, rate in one.table.baud_rates.items() if rate == new), None)
-    if value is None:
-        raise LookupError(f"{one.table.model} has no rate of {new} bit/s")
-    one.writable([one.register(rate_item(one), value)])
-    if not one.tool.can_run_at(new):
-        raise one.fail(f"the adapter at {one.tool.port.name} cannot run at {new} bit/s; nothing was changed")
-    old, item = one.baud_rate, one.table.items[rate_item(one)]
-    one.tool.speak(one.table.protocol, new)
-    try:
-        _free(one, one.servo_id)
-    finally:
-        one.tool.speak(one.table.protocol, old)
-    packet = one.tool.line.write(one.servo_id, item.address, value.to_bytes(item.size, "little"))
-    _written(one, packet, f"{item.title} = {value}")
-    one.move_to(one.servo_id, new)
-    if _there(one, one.servo_id) is Outcome.TIMEOUT:
-        one.move_to(one.servo_id, old)
-        if _there(one, one.servo_id) is Outcome.TIMEOUT:
-            port = one.tool.port.name
-            raise one.fail(
-                f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
+        Raises ServoFault, also where the adapter cannot, or another servo there has its ID; InputError where
+        the model does not have the rate.
+        """
+        value = next((value for value, rate in self.table.baud_rates.items() if rate == new), None)
+        if value is None:
+            known = ", ".join(map(str, sorted(self.table.baud_rates.values())))
+            raise InputError(f"an {self.table.model} has no rate of {new} bit/s; it has {known}")
+        if new == self.baud_rate:
+            return f"talks at {new} bit/s already"
+        if not confirm(f"{self.called}: its baud rate becomes {new} bit/s (EEPROM)"):
+            return ""
+        self.writable([self.register(self.rate_item(), value)])
+        if not self.tool.can_run_at(new):
+            raise self.fail(
+                f"the adapter at {self.tool.port.name} cannot run at {new} bit/s; nothing was changed"
             )
-        raise one.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
-    _same(one)
-    return f"talks at {new} bit/s; it did at {old}"
-
-
-def rate_item(one: OneServo) -> str:
-    """Return the name of the item that holds a servo's rate; the Y series has two."""
-    return "baud_rate" if "baud_rate" in one.table.items else "baud_rate_bus"
-
-
-def reboot(one: OneServo) -> str:
-    """Reboot a servo, and wait until it answers; return what was done."""
-    if "reboot" not in one.table.capabilities:
-        raise one.fail("this model knows no reboot instruction; switch its power off and on")
-    before_ns = one.tool.port.clock.now_ns()
-    _written(one, one.tool.line.instruct(one.servo_id, protocol2.reboot(one.servo_id)), "the reboot")
-    _await(one)
-    if "realtime_tick" in one.table.items:
-        tick = one.read(["realtime_tick"])["realtime_tick"]
-        passed_ms = (one.tool.port.clock.now_ns() - before_ns) // 1_000_000
-        if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
-            raise one.fail(
-                f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
-            )
-    return f"started anew, and {'holds torque' if one.holds_torque() else 'is limp'}"
-
-
-def factory_reset(one: OneServo, keep: Reset) -> str:
-    """Set a servo's control table to the factory's values; return what was done.
-
-    Protocol 1.0 keeps nothing. Where it gets the ID or the rate of the factory, these must be free.
-    """
-    items, table = one.table.items, one.table
-    one.writable([one.register("id", one.servo_id)])
-    servo_id, baud_rate = one.servo_id, one.baud_rate
-    if table.protocol == 1.0 or keep is Reset.ALL:
-        servo_id = items["id"].initial or 1
-    if table.protocol == 1.0 or keep is not Reset.KEEP_ID_AND_BAUD_RATE:
-        baud_rate = table.baud_rates[items[rate_item(one)].initial or 0]
-    if (servo_id, baud_rate) != (one.servo_id, one.baud_rate):
-        if not one.tool.can_run_at(baud_rate):
-            raise one.fail(f"the adapter cannot run at the factory's {baud_rate} bit/s; nothing was changed")
-        one.tool.speak(table.protocol, baud_rate)
+        old, item = self.baud_rate, self.table.items[self.rate_item()]
+        self.tool.speak(self.table.protocol, new)
         try:
-            _free(one, servo_id)
+            self._free(self.servo_id)
         finally:
-            one.tool.speak(table.protocol, one.baud_rate)
-    packet = (
-        protocol1.factory_reset(one.servo_id)
-        if table.protocol == 1.0
-        else protocol2.factory_reset(one.servo_id, keep)
-    )
-    _written(one, one.tool.line.instruct(one.servo_id, packet), "the factory reset")
-    one.move_to(servo_id, baud_rate)
-    _await(one)
-    _same(one)
-    return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
+            self.tool.speak(self.table.protocol, old)
+        packet = self.tool.line.write(self.servo_id, item.address, value.to_bytes(item.size, "little"))
+        self._written(packet, f"{item.title} = {value}")
+        self.move_to(self.servo_id, new)
+        if self._there(self.servo_id) is Outcome.TIMEOUT:
+            self.move_to(self.servo_id, old)
+            if self._there(self.servo_id) is Outcome.TIMEOUT:
+                port = self.tool.port.name
+                raise self.fail(
+                    f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
+                )
+            raise self.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
+        self._same()
+        return f"talks at {new} bit/s; it did at {old}"
 
+    def rate_item(self) -> str:
+        """Return the name of the item that holds its rate; the Y series has two."""
+        return "baud_rate" if "baud_rate" in self.table.items else "baud_rate_bus"
 
-def back_up(one: OneServo) -> str:
-    """Let a servo store its control table in its own backup; return what was done."""
-    _has_backup(one)
-    _written(one, one.tool.line.instruct(one.servo_id, protocol2.back_up(one.servo_id)), "the backup")
-    if "backup_ready" in one.table.items and not one.read(["backup_ready"])["backup_ready"]:
-        raise one.fail("acknowledged the backup, but Backup Ready is 0: there is none")
-    return "stored its control table in its own backup"
+    def reboot(self, confirm: Confirm = agree) -> str:
+        """Reboot it, and wait until it answers; it is asked for torque that goes off."""
+        if self.holds_torque() and not confirm(
+            f"{self.called} holds torque: its torque goes off, and what it holds falls"
+        ):
+            return ""
+        if "reboot" not in self.table.capabilities:
+            raise self.fail("this model knows no reboot instruction; switch its power off and on")
+        before_ns = self.tool.port.clock.now_ns()
+        self._written(self.tool.line.instruct(self.servo_id, protocol2.reboot(self.servo_id)), "the reboot")
+        self._await()
+        if "realtime_tick" in self.table.items:
+            tick = self.read(["realtime_tick"])["realtime_tick"]
+            passed_ms = (self.tool.port.clock.now_ns() - before_ns) // 1_000_000
+            if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
+                raise self.fail(
+                    f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
+                )
+        return f"started anew, and {'holds torque' if self.holds_torque() else 'is limp'}"
 
+    def factory_reset(self, keep: Reset | None = None, confirm: Confirm = agree) -> str:
+        """Set its control table to the factory's values; without `keep` Protocol 2.0 keeps ID and baud rate.
 
-def take_back(one: OneServo) -> str:
-    """Let a servo take its EEPROM back from its own backup and start anew; return what was done."""
-    _has_backup(one)
-    _written(one, one.tool.line.instruct(one.servo_id, protocol2.restore(one.servo_id)), "the restoring")
-    _await(one)
-    _same(one)
-    return "took its EEPROM back from its own backup, and started anew"
-
-
-def _has_backup(one: OneServo) -> None:
-    if one.table.protocol == 1.0:
-        raise one.fail("servos of Protocol 1.0 have no backup of their own; give a file")
-    if one.holds_torque():
-        raise one.fail(f"holds torque; switch it off first: {one.command} torque off")
-
-
-def _written(one: OneServo, transaction: Transaction, what: str) -> None:
-    """Send a change; a missing acknowledgement decides nothing, what is found afterwards does."""
-
-    def program() -> Program[Reply]:
-        reply = yield transaction
-        yield listen(_STORED_NS)
-        return reply
-
-    reply = one.run(program())
-    if reply.outcome is Outcome.REFUSED:
-        raise one.fail(f"refuses {what}: {one.tool.line.dialect.describe_error(reply.error)}")
-
-
-def _there(one: OneServo, servo_id: int) -> Outcome:
-    def program() -> Program[Outcome]:
-        reply = yield from retry(one.tool.line.ping(servo_id))
-        return reply.outcome
-
-    return one.tool.run(program())
-
-
-def _free(one: OneServo, servo_id: int) -> None:
-    if _there(one, servo_id) is not Outcome.TIMEOUT:
-        raise ServoFault(
-            f"{one.called}: another servo has ID {servo_id} at {one.tool.baud_rate} bit/s; nothing was "
-            "changed"
+        Protocol 1.0 keeps nothing. Where it gets the ID or the rate of the factory, these must be free.
+        """
+        old = self.table.protocol == 1.0
+        if old and keep not in (None, Reset.ALL):
+            raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --except nothing")
+        if keep is None:
+            keep = Reset.ALL if old else Reset.KEEP_ID_AND_BAUD_RATE
+        if not confirm(f"{self.called}: its EEPROM gets the factory's values ({_KEPT[keep]})"):
+            return ""
+        items, table = self.table.items, self.table
+        self.writable([self.register("id", self.servo_id)])
+        servo_id, baud_rate = self.servo_id, self.baud_rate
+        if keep is Reset.ALL:
+            servo_id = items["id"].initial or 1
+        if keep is not Reset.KEEP_ID_AND_BAUD_RATE:
+            baud_rate = table.baud_rates[items[self.rate_item()].initial or 0]
+        if (servo_id, baud_rate) != (self.servo_id, self.baud_rate):
+            if not self.tool.can_run_at(baud_rate):
+                raise self.fail(
+                    f"the adapter cannot run at the factory's {baud_rate} bit/s; nothing was changed"
+                )
+            self.tool.speak(table.protocol, baud_rate)
+            try:
+                self._free(servo_id)
+            finally:
+                self.tool.speak(table.protocol, self.baud_rate)
+        packet = (
+            protocol1.factory_reset(self.servo_id) if old else protocol2.factory_reset(self.servo_id, keep)
         )
+        self._written(self.tool.line.instruct(self.servo_id, packet), "the factory reset")
+        self.move_to(servo_id, baud_rate)
+        self._await()
+        self._same()
+        return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
 
+    def back_up(self, confirm: Confirm = agree) -> str:
+        """Let it store its control table in its own backup."""
+        if not confirm(f"{self.called}: the backup that it keeps itself is overwritten"):
+            return ""
+        self._has_backup()
+        self._written(self.tool.line.instruct(self.servo_id, protocol2.back_up(self.servo_id)), "the backup")
+        if "backup_ready" in self.table.items and not self.read(["backup_ready"])["backup_ready"]:
+            raise self.fail("acknowledged the backup, but Backup Ready is 0: there is none")
+        return "stored its control table in its own backup"
 
-def _same(one: OneServo) -> None:
-    number = one.read(["model_number"])["model_number"]
-    if number != one.table.model_number:
-        raise one.fail(f"the servo there is model number {number}, not {one.table.model_number}")
+    def take_back(self, confirm: Confirm = agree) -> str:
+        """Let it take its EEPROM back from its own backup and start anew."""
+        if not confirm(f"{self.called}: its EEPROM becomes that of the backup that it keeps itself"):
+            return ""
+        self._has_backup()
+        self._written(
+            self.tool.line.instruct(self.servo_id, protocol2.restore(self.servo_id)), "the restoring"
+        )
+        self._await()
+        self._same()
+        return "took its EEPROM back from its own backup, and started anew"
 
+    def restore(
+        self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree
+    ) -> tuple[str, ...]:
+        """Write what a file has back."""
+        if not (differing := [each.register for each in self.differences(desired) if each.differs]):
+            return (f"has everything that {path} restores already",)
+        self.writable(differing)
+        names = ", ".join(each.name for each in differing)
+        if not confirm(f"{self.called}: {names} become as in {path}; its ID and its rate stay"):
+            return ()
+        written = self.write(desired)
+        # a mode that comes back resets registers beside it
+        if left := [each.register.name for each in self.differences(desired) if each.differs]:
+            raise self.fail(f"{', '.join(left)} changed again while others were written; try again")
+        return written
 
-def _await(one: OneServo) -> None:
-    end_ns = one.tool.port.clock.now_ns() + BOOT_NS
-    while _there(one, one.servo_id) is not Outcome.OK:
-        if one.tool.port.clock.now_ns() > end_ns:
-            port = one.tool.port.name
-            raise one.fail(f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}")
-        one.tool.wait(_PINGED_EVERY_NS)
+    def _has_backup(self) -> None:
+        if self.table.protocol == 1.0:
+            raise self.fail("servos of Protocol 1.0 have no backup of their own; give a file")
+        if self.holds_torque():
+            raise self.fail(f"holds torque; switch it off first: {self.command} torque off")
+
+    def _written(self, transaction: Transaction, what: str) -> None:
+        """Send a change; a missing acknowledgement decides nothing, what is found afterwards does."""
+
+        def program() -> Program[Reply]:
+            reply = yield transaction
+            yield listen(_STORED_NS)
+            return reply
+
+        reply = self.run(program())
+        if reply.outcome is Outcome.REFUSED:
+            raise self.fail(f"refuses {what}: {self.tool.line.dialect.describe_error(reply.error)}")
+
+    def _there(self, servo_id: int) -> Outcome:
+        def program() -> Program[Outcome]:
+            reply = yield from retry(self.tool.line.ping(servo_id))
+            return reply.outcome
+
+        return self.tool.run(program())
+
+    def _free(self, servo_id: int) -> None:
+        if self._there(servo_id) is not Outcome.TIMEOUT:
+            raise ServoFault(
+                f"{self.called}: another servo has ID {servo_id} at {self.tool.baud_rate} bit/s; nothing was "
+                "changed"
+            )
+
+    def _same(self) -> None:
+        number = self.read(["model_number"])["model_number"]
+        if number != self.table.model_number:
+            raise self.fail(f"the servo there is model number {number}, not {self.table.model_number}")
+
+    def _await(self) -> None:
+        end_ns = self.tool.port.clock.now_ns() + BOOT_NS
+        while self._there(self.servo_id) is not Outcome.OK:
+            if self.tool.port.clock.now_ns() > end_ns:
+                port = self.tool.port.name
+                raise self.fail(
+                    f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}"
+                )
+            self.tool.wait(_PINGED_EVERY_NS)
