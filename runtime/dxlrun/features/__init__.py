@@ -61,7 +61,8 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
             features += _features_of(plugin)
         for feature in features:
             try:
-                keys = [feature.stage(kind) for kind in (Section, JointKey, ServoKey, PolicyKey)]
+                forms = feature.stage(Section), feature.stage(PolicyKey)
+                keys = *forms, feature.stage(JointKey), feature.stage(ServoKey)
             except (Exception, SystemExit) as error:
                 broken[feature.name] = (
                     f"the section {feature.name} of {feature.distribution} cannot be used "
