@@ -12,7 +12,7 @@ several servos share joints, each has a rotor of its own, and constraints hold t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -22,15 +22,14 @@ from numpy.typing import NDArray
 from dxlrun import InputError
 from dxlsim import (
     JAMMED_NM,
-    CoupledServo,
-    Coupling,
+    Mechanism,
+    MechanismServo,
     Motor,
     Part,
     Plant,
     PlantJoint,
     PlantMaker,
     UrdfBodies,
-    UrdfJoint,
     combine_plants,
     coupled_motion,
     coupled_projection,
@@ -55,7 +54,7 @@ _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Friction that holds: with MuJoCo's own values a joint creeps although its friction could hold it."""
 
 
-def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> PlantMaker:
+def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
     """Return what makes the plant of these bodies.
 
     Joints that the URDF lacks, or does not draw as hinges (those in m: as slides), move without it. Raises
@@ -67,13 +66,9 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
         # no DTD can be in it: the robot file's compiler refuses one
         root = ElementTree.fromstring(bodies.urdf)  # noqa: S314  it was checked when the robot was compiled
         kinds = {each.get("name", ""): each.get("type", "") for each in root.findall("joint")}
+        here = [one for one in bodies.mechanisms if all(kinds.get(name) in one.types for name in one.joints)]
         moved = _Moved(
-            {
-                row: joint
-                for row, joint in enumerate(bodies.joints)
-                if joint is not None and kinds.get(joint.name) in joint.types
-            },
-            tuple(one for one in couplings if all(kinds.get(name) in one.types for name in one.joints)),
+            tuple(one for one in here if one.is_single), tuple(one for one in here if not one.is_single)
         )
         _make_movable(root, moved.names)
         text = ElementTree.tostring(root, encoding="unicode")
@@ -92,37 +87,41 @@ def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> Plan
         others = [row for row in range(len(joints)) if row not in here.rows]
         parts: list[Part] = [(here.rows, MujocoBodies(text, here, joints))] if here.rows else []
         if others or not parts:
-            parts += parts_without_bodies(couplings, joints, others)
+            parts += parts_without_bodies(bodies.mechanisms, joints, others)
         return combine_plants(joints, parts)
 
     return make
 
 
 class _Moved(msgspec.Struct, frozen=True):
-    single: Mapping[int, UrdfJoint]  # By index of the servo
-    couplings: tuple[Coupling, ...]
+    single: tuple[Mechanism, ...]  # One servo each, which is the rotor of its joint
+    shared: tuple[Mechanism, ...]
 
     @property
     def names(self) -> set[str]:
         """Names of the URDF's joints."""
-        return {joint.name for joint in self.single.values()} | {
-            name for one in self.couplings for name in one.joints
-        }
+        return {name for one in (*self.single, *self.shared) for name in one.joints}
+
+    @property
+    def servos(self) -> list[MechanismServo]:
+        """All servos, first those that are rotors of their joints."""
+        return [servo for one in (*self.single, *self.shared) for servo in one.servos]
 
     @property
     def rows(self) -> list[int]:
         """Indices of the servos."""
-        return [*self.single, *(servo.index for one in self.couplings for servo in one.servos)]
+        return [servo.index for servo in self.servos]
 
     def of(self, count: int) -> _Moved:
-        """Return what so many servos move; a coupling waits for its last one."""
-        return _Moved(
-            {row: joint for row, joint in self.single.items() if row < count},
-            tuple(one for one in self.couplings if all(servo.index < count for servo in one.servos)),
+        """Return what so many servos move; a mechanism waits for its last one."""
+        parts = (
+            tuple(one for one in part if all(servo.index < count for servo in one.servos))
+            for part in (self.single, self.shared)
         )
+        return _Moved(*parts)
 
 
-_NOTHING_MOVED = _Moved({}, ())
+_NOTHING_MOVED = _Moved((), ())
 
 
 class MujocoBodies:
@@ -132,8 +131,7 @@ class MujocoBodies:
         import mujoco
 
         mine = [servos[row] for row in moved.rows]
-        coupled = [servo for one in moved.couplings for servo in one.servos]
-        both: list[UrdfJoint | CoupledServo] = [*moved.single.values(), *coupled]
+        both = moved.servos
         self.angle: Floats = np.array([each.angle for each in mine], dtype=np.float64)
         self.velocity: Floats = np.zeros(len(mine))
         self._reference = np.array([each.reference for each in both]) + [each.recounted for each in mine]
@@ -144,8 +142,8 @@ class MujocoBodies:
         # views that stay; all joints are hinges or slides: coordinate and speed have a joint's own number
         self._damping, self._force = model.dof_damping, data.qfrc_applied
         self._turn, self._speed = data.qpos, data.qvel
-        names = [joint.name for joint in moved.single.values()]
-        names += [_rotor(servo) for servo in coupled]
+        names = [name for one in moved.single for name in one.joints]
+        names += [_rotor(servo) for one in moved.shared for servo in one.servos]
         self._numbers = np.array([model.joint(name).id for name in names], dtype=np.intp)
         self._own_damping = model.dof_damping[self._numbers]
         self._friction, self._bias = model.dof_frictionloss, data.qfrc_bias
@@ -155,9 +153,9 @@ class MujocoBodies:
         self._armature = model.dof_armature[self._numbers]
         own = [each.motor.damping + each.motor.viscous_friction for each in mine]
         self._motor_damping = np.array(own) / self._per_rad**2
-        self._couplings = [
-            _CoupledBodies(one, moved.rows, np.array([model.joint(name).id for name in one.joints]))
-            for one in moved.couplings
+        self._shared = [
+            _SharedBodies(one, moved.rows, np.array([model.joint(name).id for name in one.joints]))
+            for one in moved.shared
         ]
         following = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
         self._mimics = list(
@@ -176,7 +174,7 @@ class MujocoBodies:
         torque = (drive - damping * self.velocity) / scale
         # what pulls at the joint is the bodies' as it was a step ago
         pull = self._bias[numbers]
-        for one in self._couplings:
+        for one in self._shared:
             pull[one.rows] = one.matrix.T @ self._bias[one.numbers]
         self._friction[numbers] = self._own_friction + self._load_friction * np.abs(torque + pull)
         self._turn[numbers] = scale * (self.angle - self._reference)
@@ -191,7 +189,7 @@ class MujocoBodies:
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle[index] = angle
         self.velocity[index] = 0.0
-        for one in self._couplings:
+        for one in self._shared:
             if index in one.rows:
                 moved = coupled_motion(one.together, one.rows.tolist().index(index))
                 self.angle[one.rows] += (moved * by - (one.rows == index) * by) / self._per_rad[one.rows]
@@ -208,10 +206,10 @@ class MujocoBodies:
         self._own_friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def _put_bodies(self) -> None:
-        """Put all bodies where the shafts are; those of couplings, and those that mimic, at rest."""
+        """Put all bodies where the shafts are; those that servos share, and those that mimic, at rest."""
         turned = self._per_rad * (self.angle - self._reference)
         self._turn[self._numbers] = turned
-        for one in self._couplings:
+        for one in self._shared:
             self._turn[one.numbers] = one.matrix @ turned[one.rows]
             self._speed[one.numbers] = 0.0
         for _ in self._mimics:  # one may mimic another
@@ -225,12 +223,12 @@ class MujocoBodies:
         self._model.dof_armature[self._numbers] = armature
 
 
-class _CoupledBodies:
-    def __init__(self, coupling: Coupling, indices: Sequence[int], numbers: Rows) -> None:
-        self.rows: Rows = np.array([indices.index(servo.index) for servo in coupling.servos], dtype=np.intp)
+class _SharedBodies:
+    def __init__(self, mechanism: Mechanism, indices: Sequence[int], numbers: Rows) -> None:
+        self.rows: Rows = np.array([indices.index(servo.index) for servo in mechanism.servos], dtype=np.intp)
         """Of its servos"""
         self.numbers = numbers  # Of its joints in MuJoCo
-        self.matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
+        self.matrix: Floats = np.array(mechanism.matrix, dtype=np.float64)
         self.together = coupled_projection(self.matrix)
 
 
@@ -270,10 +268,11 @@ def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel
     disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
     spec.option.disableflags |= int(disabled)
     joints = {joint.name: joint for joint in spec.joints}
-    for row, joint in moved.single.items():
+    for one in moved.single:
+        (name,), (servo,) = one.joints, one.servos
         # the load's friction is the shaft's already, as that of a servo that moves no body
-        _drive(joints[joint.name], servos[row].motor, joint.per_rad, servos[row].load.friction)
-    for one in moved.couplings:
+        _drive(joints[name], servos[servo.index].motor, servo.per_rad, servos[servo.index].load.friction)
+    for one in moved.shared:
         for name, load in zip(one.joints, one.loads, strict=True):
             _rub(joints[name], load.friction)
         shares = np.linalg.pinv(np.array(one.matrix))
@@ -304,5 +303,5 @@ def _rub(joint: MjsJoint, friction: float) -> None:
     joint.solimp_friction = _FRICTION_SOLIMP
 
 
-def _rotor(servo: CoupledServo) -> str:
+def _rotor(servo: MechanismServo) -> str:
     return f"rotor of servo {servo.index}"

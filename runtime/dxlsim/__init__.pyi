@@ -26,13 +26,12 @@ from dxlsim.serving.served_bus import ServedBus as ServedBus
 from dxlsim.serving.served_bus import serve_bus as serve_bus
 from dxlsim.simulation_plan import AdapterConfig as AdapterConfig
 from dxlsim.simulation_plan import BusConfig as BusConfig
-from dxlsim.simulation_plan import CoupledServo as CoupledServo
-from dxlsim.simulation_plan import Coupling as Coupling
 from dxlsim.simulation_plan import DeviceConfig as DeviceConfig
 from dxlsim.simulation_plan import Load as Load
+from dxlsim.simulation_plan import Mechanism as Mechanism
+from dxlsim.simulation_plan import MechanismServo as MechanismServo
 from dxlsim.simulation_plan import ServoConfig as ServoConfig
 from dxlsim.simulation_plan import ServoTimes as ServoTimes
 from dxlsim.simulation_plan import UrdfBodies as UrdfBodies
-from dxlsim.simulation_plan import UrdfJoint as UrdfJoint
 from dxlsim.texts.servo_words import bus_of_servos as bus_of_servos
 from dxlsim.virtual_ports import VirtualPorts as VirtualPorts

@@ -113,8 +113,8 @@ class BusConfig(msgspec.Struct, frozen=True):
     recorded: str = ""  # Path of the log whose bus of this name answers instead of servos; empty: none does
 
 
-class CoupledServo(msgspec.Struct, frozen=True):
-    """A servo that moves joints together with others, by its coordinate s = per_rad * (theta - reference)."""
+class MechanismServo(msgspec.Struct, frozen=True):
+    """A servo of a mechanism, by its coordinate s = per_rad * (theta - reference)."""
 
     index: int  # By the order in which the servos are added
     reference: float  # rad, of the servo from its raw 0
@@ -124,43 +124,37 @@ class CoupledServo(msgspec.Struct, frozen=True):
 HINGES = ("revolute", "continuous")  # Types of the joints of a URDF that turn
 
 
-class Coupling(msgspec.Struct, frozen=True):
-    """Servos and joints that move together: q = matrix @ s.
+class Mechanism(msgspec.Struct, frozen=True):
+    """Servos, and the joints that they move: q = matrix @ s.
 
-    Several servos on one joint, whose q is the mean of theirs; a differential; any matrix of full rank.
+    One servo with a joint of its own, several servos on one joint, whose q is the mean of theirs, a
+    differential, any matrix of full rank.
     """
 
-    servos: tuple[CoupledServo, ...]
+    servos: tuple[MechanismServo, ...]
     joints: tuple[str, ...]
-    matrix: tuple[tuple[float, ...], ...]  # A row for each joint, a column for each servo
-    loads: tuple[Load, ...]
-    """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's."""
+    matrix: tuple[tuple[float, ...], ...] = ((1.0,),)  # A row for each joint, a column for each servo
+    loads: tuple[Load, ...] = ()
+    """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's. Empty: one
+    servo with a joint of its own, which has the load itself (`ServoConfig`)."""
     types: tuple[str, ...] = HINGES  # Of the URDF's joints that it can move
 
-
-class UrdfJoint(msgspec.Struct, frozen=True):
-    """Which joint of a URDF a servo moves by itself: q = per_rad * (theta - reference)."""
-
-    name: str
-    reference: float  # rad, of the servo from its raw 0
-    per_rad: float  # rad or m of the joint for each rad of the servo, with the sign of its direction
-    types: tuple[str, ...] = HINGES  # Of the URDF's joints that it can move
+    @property
+    def is_single(self) -> bool:
+        """True when it is one servo that moves as if there were no other joint."""
+        return not self.loads
 
 
 class UrdfBodies(msgspec.Struct, frozen=True):
-    """A URDF, and how servos turn its joints."""
+    """A URDF, and how servos move its joints, whichever plant moves the servos."""
 
     urdf: str
-    joints: tuple[UrdfJoint | None, ...]
-    """In the order in which the servos are added; servos after them move by themselves. None: it is one of a
-    coupling."""
+    mechanisms: tuple[Mechanism, ...]  # Servos that are in none of them are added after all others
 
-
-class SensedBodies(msgspec.Struct, frozen=True):
-    """What simulated sensors on the links of a URDF sense, whichever plant moves the servos."""
-
-    bodies: UrdfBodies
-    couplings: tuple[Coupling, ...] = ()
+    @property
+    def servos(self) -> int:
+        """Number of the servos of all mechanisms."""
+        return sum(len(one.servos) for one in self.mechanisms)
 
 
 class SimulationConfig(msgspec.Struct, frozen=True):
@@ -172,5 +166,5 @@ class SimulationConfig(msgspec.Struct, frozen=True):
     links: dict[str, str] = {}
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
     bodies: UrdfBodies | None = None  # What the servos move together; None: each joint moves by itself
-    couplings: tuple[Coupling, ...] = ()  # Servos that share joints; all others move one each
-    sensed: SensedBodies | None = None  # The bodies with which devices move that are on a link; None: none is
+    mechanisms: tuple[Mechanism, ...] = ()  # A servo that is in none of them moves by itself
+    sensed: UrdfBodies | None = None  # The bodies with which devices move that are on a link; None: none is

@@ -17,12 +17,11 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
 from dxlsim.simulation_plan import (
     AdapterConfig,
-    CoupledServo,
-    Coupling,
     Load,
+    Mechanism,
+    MechanismServo,
     ServoTimes,
     UrdfBodies,
-    UrdfJoint,
 )
 
 SIMULATED = PAIR.replace("/dev/ttyUSB0", "sim")
@@ -93,20 +92,21 @@ def test_servos_that_share_joints_are_simulated_together() -> None:
     coupled = replace(plan, mechanics=MechanicsPlan((coupling,), servos=("left", "right")))
     simulation = simulation_of(coupled)
     left, right = plan.buses[0].servos
-    assert simulation.couplings == (
-        Coupling(
-            (CoupledServo(1, right.reference, 1.0), CoupledServo(0, left.reference, -1.0)),
+    assert simulation.mechanisms == (
+        Mechanism(
+            (MechanismServo(1, right.reference, 1.0), MechanismServo(0, left.reference, -1.0)),
             ("left_arm_joint", "right_arm_joint"),
             coupling.matrix,
             (Load(0.02), Load()),
         ),
     )
     assert simulation.bodies is not None
-    assert simulation.bodies.joints == (None, None)
+    assert simulation.bodies.mechanisms == simulation.mechanisms
     assert [servo.load for servo in simulation.buses[0].servos] == [Load(), Load()], "it is the joints'"
     real = replace(coupled, buses=(*plan.buses, replace(plan.buses[0], port="/dev/x", servos=(right,))))
     elsewhere = replace(real, buses=(replace(plan.buses[0], servos=(left,)), real.buses[1]))
-    assert simulation_of(elsewhere).couplings == (), "one of them is on a real port"
+    (alone,) = simulation_of(elsewhere).mechanisms
+    assert alone.is_single, "one of them is on a real port"
 
 
 def test_how_the_adapter_behaves_reaches_the_simulated_bus() -> None:
@@ -184,8 +184,8 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
     assert simulation_of(plan).bodies == UrdfBodies(
         URDF,
         (
-            UrdfJoint("right_arm_joint", pytest.approx(math.radians(240)), 1),
-            UrdfJoint("left_arm_joint", pytest.approx(math.radians(60)), -1),
+            Mechanism((MechanismServo(0, pytest.approx(math.radians(240)), 1),), ("right_arm_joint",)),
+            Mechanism((MechanismServo(1, pytest.approx(math.radians(60)), -1),), ("left_arm_joint",)),
         ),
     )
 

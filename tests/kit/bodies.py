@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import Plant
+from dxlsim.simulation_plan import HINGES, Mechanism, MechanismServo, UrdfBodies
 
 STEP_S = 0.002
 MASS, ARM = 0.5, 0.2
@@ -45,3 +47,22 @@ def run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damp
     count = len(plant.angle)
     for _ in range(round(seconds / STEP_S)):
         plant.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
+
+
+class Turned(NamedTuple):
+    """A joint of a URDF that one servo moves: q = per_rad * (theta - reference)."""
+
+    name: str
+    reference: float
+    per_rad: float
+    types: tuple[str, ...] = HINGES
+
+
+def bodies_of(urdf: str, joints: Sequence[Turned | None], shared: Sequence[Mechanism] = ()) -> UrdfBodies:
+    """Return bodies with the joints of the first servos; None: a shared mechanism has the servo."""
+    single = (
+        Mechanism((MechanismServo(index, one.reference, one.per_rad),), (one.name,), types=one.types)
+        for index, one in enumerate(joints)
+        if one is not None
+    )
+    return UrdfBodies(urdf, (*single, *shared))

@@ -327,7 +327,7 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, 
 def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypatch, moved, joint, problem):
     right = plan()
     # without what couples them, as where a horn has slipped
-    monkeypatch.setattr(virtual_run, "simulation_of", lambda _: replace(simulation_of(right), couplings=()))
+    monkeypatch.setattr(virtual_run, "simulation_of", lambda _: replace(simulation_of(right), mechanisms=()))
     robot = VirtualRobot(plan(duration_s=1.4))
     (bus,) = robot.buses
     ask_torque(robot, joint, (300, "false"), (1000, "true"))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.bodies import Turned, bodies_of
 
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
@@ -17,7 +17,7 @@ from dxlsim.motion.control_law import LIMP
 from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.mechanics import STEP_NS, Mechanics
 from dxlsim.motion.motor import Motor
-from dxlsim.simulation_plan import NO_LOAD, CoupledServo, Coupling, SensedBodies, UrdfBodies, UrdfJoint
+from dxlsim.simulation_plan import NO_LOAD, Mechanism, MechanismServo
 
 TORSO = (Path(__file__).parents[2] / "robots/urdf/bioloid_torso.urdf").read_text()
 LINK = (
@@ -40,10 +40,9 @@ G = 9.81
 ROTOR = Motor(stall_torque=1.0, damping=0.01, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
 
 
-def body_of(urdf: str, names: list[str], **couplings: Any) -> SimulatedBody:
+def body_of(urdf: str, names: list[str]) -> SimulatedBody:
     """Return a body whose shafts are the joints of these names themselves."""
-    joints = tuple(UrdfJoint(name, 0.0, 1.0) for name in names)
-    return SimulatedBody(SensedBodies(UrdfBodies(urdf, joints), **couplings))
+    return SimulatedBody(bodies_of(urdf, [Turned(name, 0.0, 1.0) for name in names]))
 
 
 @pytest.mark.parametrize("urdf", [TORSO, CRANE], ids=["torso", "crane"])
@@ -96,10 +95,10 @@ def test_gears_references_couplings_and_mimic_joints_move_links():
         '<axis xyz="0 0.6 0.8"/>',
         '<axis xyz="0 0.6 0.8"/><mimic joint="turn" multiplier="-0.5" offset="0.2"/>',
     )
-    turn = UrdfJoint("turn", 0.4, -0.25)
-    pair = (CoupledServo(1, 0.1, 0.01), CoupledServo(2, 0.2, -0.01))
-    coupling = Coupling(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), ("prismatic",))
-    geared = SimulatedBody(SensedBodies(UrdfBodies(urdf, (turn, None, None)), (coupling,)))
+    turn = Turned("turn", 0.4, -0.25)
+    pair = (MechanismServo(1, 0.1, 0.01), MechanismServo(2, 0.2, -0.01))
+    coupling = Mechanism(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), ("prismatic",))
+    geared = SimulatedBody(bodies_of(urdf, (turn, None, None), (coupling,)))
     shafts = [np.array(each) for each in ([1.2, 3.0, -2.0], [1.0, 2.0, 0.5], [0.3, 0.2, 0.1])]
     geared.move(Shafts(0, *shafts))
     plain = body_of(CRANE, ["turn", "slide", "swing"])
@@ -123,9 +122,7 @@ def test_the_body_in_another_process_moves_as_in_this_one():
     mechanics = Mechanics(0)
     for angle in (0.1, 0.2, -0.3):
         mechanics.add(ROTOR, NO_LOAD, angle)
-    sensed = SensedBodies(
-        UrdfBodies(CRANE, tuple(UrdfJoint(name, 0.0, 1.0) for name in ("turn", "slide", "swing")))
-    )
+    sensed = bodies_of(CRANE, [Turned(name, 0.0, 1.0) for name in ("turn", "slide", "swing")])
     memory = slot.private(9)
     shown = ShaftsShown(mechanics, SlotWriter(memory))
     remote = RemoteBody(sensed, SlotReader(memory))
@@ -146,7 +143,7 @@ def test_the_body_in_another_process_moves_as_in_this_one():
 def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest():
     mechanics = Mechanics(0)
     mechanics.add(ROTOR, NO_LOAD, 0.0)
-    sensed = SensedBodies(UrdfBodies(CRANE, (UrdfJoint("turn", 0.0, 1.0),)))
+    sensed = bodies_of(CRANE, [Turned("turn", 0.0, 1.0)])
     here = SensedBody(sensed, mechanics, lambda: mechanics.grid_ns)
     mechanics.command(0, LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.5))
     before = 0.0

@@ -8,22 +8,22 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 import pytest
-from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
+from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 from dxlsim.motion.control_law import ServoCommand
 from dxlsim.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.motion.motor import Motor
-from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
-from dxlsim.simulation_plan import NO_LOAD, CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
+from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint, PlantMaker
+from dxlsim.simulation_plan import NO_LOAD, Load, Mechanism, MechanismServo, SimulationConfig
 
 S = 1_000_000_000
 RUBBING = msgspec.structs.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 
 
-def alone(per_rad: float, load: Load, reference: float = 0.3) -> Coupling:
-    return Coupling((CoupledServo(0, reference, per_rad),), ("knee",), ((1.0,),), (load,))
+def alone(per_rad: float, load: Load, reference: float = 0.3) -> Mechanism:
+    return Mechanism((MechanismServo(0, reference, per_rad),), ("knee",), ((1.0,),), (load,))
 
 
 def felt(load: Load, per_rad: float, reference: float = 0.3) -> Load:
@@ -33,18 +33,22 @@ def felt(load: Load, per_rad: float, reference: float = 0.3) -> Load:
     return Load(load.inertia * ratio**2, load.friction * ratio, load.gravity * ratio, down, turns=ratio)
 
 
-def on_one_axis(load: Load = NO_LOAD, *per_rad: float) -> Coupling:
-    servos = tuple(CoupledServo(number, 0.0, each) for number, each in enumerate(per_rad or (1.0, -1.0)))
-    return Coupling(servos, ("hip",), ((1 / len(servos),) * len(servos),), (load,))
+def on_one_axis(load: Load = NO_LOAD, *per_rad: float) -> Mechanism:
+    servos = tuple(MechanismServo(number, 0.0, each) for number, each in enumerate(per_rad or (1.0, -1.0)))
+    return Mechanism(servos, ("hip",), ((1 / len(servos),) * len(servos),), (load,))
 
 
-def differential(*loads: Load, names: tuple[str, str] = ("pitch", "roll")) -> Coupling:
-    servos = (CoupledServo(0, 0.0, 1.0), CoupledServo(1, 1.0, 1.0))
+def differential(*loads: Load, names: tuple[str, str] = ("pitch", "roll")) -> Mechanism:
+    servos = (MechanismServo(0, 0.0, 1.0), MechanismServo(1, 1.0, 1.0))
     both = tuple(loads) or (NO_LOAD, NO_LOAD)
-    return Coupling(servos, names, ((0.5, 0.5), (0.5, -0.5)), both)
+    return Mechanism(servos, names, ((0.5, 0.5), (0.5, -0.5)), both)
 
 
-def plant(coupling: Coupling, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
+def without_bodies(*mechanisms: Mechanism) -> PlantMaker:
+    return plant_of(SimulationConfig((), mechanisms=mechanisms))
+
+
+def plant(coupling: Mechanism, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
     placed = angles or [servo.reference for servo in coupling.servos]
     return CoupledJoints(coupling, [PlantJoint(motor, NO_LOAD, angle) for angle in placed])
 
@@ -150,12 +154,12 @@ def test_friction_of_servo_and_joint_holds_what_it_can_hold():
 
 
 def test_a_hand_moves_what_is_on_one_axis_together():
-    mechanics = Mechanics(0, plant_of(None, [on_one_axis()]))
+    mechanics = Mechanics(0, without_bodies(on_one_axis()))
     for _ in range(3):
         mechanics.add(ROTOR, NO_LOAD, 0.0)
     mechanics.place(0, 0.4)
     assert mechanics.plant.angle == pytest.approx([0.4, -0.4, 0.0])
-    wrist = Mechanics(0, plant_of(None, [differential()]))
+    wrist = Mechanics(0, without_bodies(differential()))
     for angle in (0.0, 1.0):
         wrist.add(ROTOR, NO_LOAD, angle)
     wrist.place(1, 1.3)
@@ -167,7 +171,7 @@ def test_a_hand_moves_what_is_on_one_axis_together():
 def test_a_servo_that_counts_anew_moves_nothing(coupled, later):
     load = Load(0.02, gravity=0.4, gravity_angle=0.3)
     couplings = [alone(0.25, load)] if coupled else []
-    mechanics = Mechanics(0, plant_of(None, couplings))
+    mechanics = Mechanics(0, without_bodies(*couplings))
     braked = msgspec.structs.replace(ROTOR, damping=0.05)
     mechanics.add(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
     mechanics.recount(0, 0.3 + 1.2)
@@ -192,13 +196,13 @@ def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone():
 @pytest.mark.needs("physics")
 @pytest.mark.parametrize("in_bodies", [True, False])
 def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
-    reverse = Coupling(
-        (CoupledServo(1, 2.0, -1.0), CoupledServo(0, 0.5, 1.0)),
+    reverse = Mechanism(
+        (MechanismServo(1, 2.0, -1.0), MechanismServo(0, 0.5, 1.0)),
         ("pitch",),
         ((0.5, 0.5),),
         (NO_LOAD,),
     )
-    made = mujoco_plant(UrdfBodies(ARMS, (None, None)), [reverse]) if in_bodies else plant_of(None, [reverse])
+    made = mujoco_plant(bodies_of(ARMS, (), [reverse])) if in_bodies else without_bodies(reverse)
     moved = made([PlantJoint(ROTOR, NO_LOAD, 0.5), PlantJoint(ROTOR, NO_LOAD, 2.0)])
     assert moved.angle == pytest.approx([0.5, 2.0])
     moved.place(0, 0.8)
@@ -206,7 +210,7 @@ def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
 
 
 def test_a_commanded_pair_goes_to_its_goal_together():
-    mechanics = Mechanics(0, plant_of(None, [on_one_axis(Load(0.05, gravity=0.5))]))
+    mechanics = Mechanics(0, without_bodies(on_one_axis(Load(0.05, gravity=0.5))))
     motor = msgspec.structs.replace(RUBBING, damping=0.2)
     for goal in (0.5, -0.5):
         index = mechanics.add(motor, NO_LOAD, 0.0)
@@ -222,19 +226,17 @@ def test_a_commanded_pair_goes_to_its_goal_together():
 ARMS = urdf(link("a"), joint("pitch", "base", "a"), link("b"), joint("roll", "base", "b"))
 
 
-def bodies(
-    text: str, joints: Sequence[UrdfJoint | None], *couplings: Coupling, motor: Motor = ROTOR
-) -> Plant:
+def bodies(text: str, joints: Sequence[Turned | None], *couplings: Mechanism, motor: Motor = ROTOR) -> Plant:
     references = {servo.index: servo.reference for one in couplings for servo in one.servos}
     references |= {row: one.reference for row, one in enumerate(joints) if one is not None}
-    made = mujoco_plant(UrdfBodies(text, tuple(joints)), couplings)
+    made = mujoco_plant(bodies_of(text, joints, couplings))
     return made([PlantJoint(motor, NO_LOAD, references[row]) for row in sorted(references)])
 
 
 @pytest.mark.needs("physics")
 @pytest.mark.parametrize("per_rad", [0.25, -0.25, 2.0])
 def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
-    held = bodies(ARMS, [UrdfJoint("pitch", 1.5, per_rad)])
+    held = bodies(ARMS, [Turned("pitch", 1.5, per_rad)])
     run(held, 0.5, drive=PULL * per_rad, damping=0.2)
     assert held.angle[0] == pytest.approx(1.5, abs=1e-5)
     run(held, 0.3, drive=1.2 * PULL * per_rad, damping=0.2)
@@ -245,7 +247,7 @@ def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
 def test_a_body_on_a_slide_is_held_by_its_weight():
     lift = urdf(link("a"), joint("lift", "base", "a", kind="prismatic", axis="0 0 1"))
     per_rad = 0.01
-    held = bodies(lift, [UrdfJoint("lift", 0.5, per_rad, ("prismatic",))])
+    held = bodies(lift, [Turned("lift", 0.5, per_rad, ("prismatic",))])
     run(held, 0.5, drive=MASS * 9.81 * per_rad, damping=0.1)
     assert held.angle[0] == pytest.approx(0.5, abs=1e-5)
     run(held, 0.3, drive=0.0)
@@ -264,7 +266,7 @@ def test_a_slide_is_not_moved_by_a_joint_that_turns():
         link("b"),
         joint("x", "base", "b"),
     )
-    moved = bodies(both, [UrdfJoint("lift", 0.5, 1.0), UrdfJoint("x", 0.0, 1.0)])
+    moved = bodies(both, [Turned("lift", 0.5, 1.0), Turned("x", 0.0, 1.0)])
     run(moved, 0.2, drive=[0.0, PULL], damping=0.2)
     assert moved.angle[0] == 0.5
 
@@ -310,7 +312,7 @@ def test_a_joint_that_mimics_moves_with_the_one_it_mimics():
         link("c"), joint("yaw", "base", "c", more='<mimic joint="roll" multiplier="2"/>'),
         link("d"), joint("stiff", "base", "d", more='<mimic joint="nowhere" multiplier="2"/>'),
     )  # fmt: skip
-    held = bodies(grip, [UrdfJoint("pitch", 0.0, 1.0)])
+    held = bodies(grip, [Turned("pitch", 0.0, 1.0)])
     # its own weight, and those that hang on it the other way round: 1 - 0.5 - 1
     run(held, 1.0, drive=-0.5 * PULL, damping=0.3)
     assert held.angle[0] == pytest.approx(0.0, abs=5e-3)
@@ -320,7 +322,7 @@ def test_a_joint_that_mimics_moves_with_the_one_it_mimics():
 
 @pytest.mark.needs("physics")
 def test_a_blocked_body_stays():
-    held = bodies(ARMS, [UrdfJoint("pitch", 0.0, 1.0), UrdfJoint("roll", 0.0, 1.0)])
+    held = bodies(ARMS, [Turned("pitch", 0.0, 1.0), Turned("roll", 0.0, 1.0)])
     held.jam(0, True)
     run(held, 0.5)
     assert held.angle[0] == pytest.approx(0.0, abs=5e-3)

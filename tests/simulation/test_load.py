@@ -8,13 +8,14 @@ from typing import Any, Literal
 
 import pytest
 import serial
+from tests.kit.bodies import Turned, bodies_of
 from tests.kit.packets import packet2
 
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
-from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
+from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.control_table import control_table
 
@@ -44,7 +45,7 @@ def hang(make_line2: Callable[..., Any]) -> Hang:
 
     def hang(physics: Physics) -> Any:
         if physics == "mujoco":
-            bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
+            bodies = bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))
             mechanics, load = Mechanics(0, mujoco_plant(bodies)), Load()
         else:
             mechanics = Mechanics(0)
@@ -110,7 +111,7 @@ def test_both_ways_of_moving_show_the_host_the_same(hang):
 
 def test_the_process_of_simulated_buses_moves_bodies(start_buses):
     pytest.importorskip("mujoco")
-    bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
+    bodies = bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
     running = start_buses(SimulationConfig((bus,), bodies=bodies))
     read = packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position

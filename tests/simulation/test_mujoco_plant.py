@@ -9,14 +9,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
+from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 
 from dxlrun.errors import InputError
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
-from dxlsim.simulation_plan import NO_LOAD, Load, UrdfBodies, UrdfJoint
+from dxlsim.simulation_plan import NO_LOAD, Load
 
 RUBBING = msgspec.structs.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 
@@ -27,17 +27,17 @@ TWO = urdf(link("upper"), link("lower"), joint("shoulder", "base", "upper"), joi
 
 
 def _plant(
-    text: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
+    text: str, *joints: Turned, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
 ) -> Plant:
     placed = [angles[row] if angles else joint.reference for row, joint in enumerate(joints)]
-    return mujoco_plant(UrdfBodies(text, joints))([PlantJoint(rotor, load, angle) for angle in placed])
+    return mujoco_plant(bodies_of(text, joints))([PlantJoint(rotor, load, angle) for angle in placed])
 
 
 @pytest.mark.needs("physics")
 @pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
 def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     load = Load(inertia=MASS * ARM**2, friction=0.05)
-    bodies = _plant(FLAT, UrdfJoint("shoulder", 0.0, 1), load=load, rotor=rotor)
+    bodies = _plant(FLAT, Turned("shoulder", 0.0, 1), load=load, rotor=rotor)
     alone = IndependentJoints([PlantJoint(rotor, load, 0.0)])
     rng = np.random.default_rng(3)
     ways = []
@@ -55,7 +55,7 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
 @pytest.mark.needs("physics")
 def test_a_joint_with_weight_swings_as_an_independent_one():
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
-    bodies = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
+    bodies = _plant(ONE, Turned("shoulder", 0.0, 1))
     alone = IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
     run(bodies, 0.5, damping=0.02)
     run(alone, 0.5, damping=0.02)
@@ -65,7 +65,7 @@ def test_a_joint_with_weight_swings_as_an_independent_one():
 
 @pytest.mark.needs("physics")
 def test_a_limp_arm_ends_hanging_down():
-    plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
+    plant = _plant(ONE, Turned("shoulder", 0.0, 1))
     run(plant, 10.0, damping=0.3)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
 
@@ -75,7 +75,7 @@ def test_a_limp_arm_ends_hanging_down():
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.0])
 def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angle):
     servo_angle = reference + direction * angle
-    plant = _plant(ONE, UrdfJoint("shoulder", reference, direction), angles=[servo_angle])
+    plant = _plant(ONE, Turned("shoulder", reference, direction), angles=[servo_angle])
     run(plant, 1.0, drive=direction * PULL * math.cos(angle), damping=0.5)
     assert plant.angle[0] == pytest.approx(servo_angle, abs=1e-6)
     run(plant, 0.2, drive=direction * PULL * math.cos(angle) + 0.1, damping=0.5)
@@ -84,10 +84,10 @@ def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angl
 
 @pytest.mark.needs("physics")
 def test_friction_holds_what_it_can_hold():
-    holding = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
+    holding = _plant(ONE, Turned("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
     run(holding, 10.0)
     assert holding.angle[0] == pytest.approx(0.0, abs=0.002)
-    slipping = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.9 * PULL))
+    slipping = _plant(ONE, Turned("shoulder", 0.0, 1), load=Load(friction=0.9 * PULL))
     run(slipping, 2.0)
     assert slipping.angle[0] < -0.05
 
@@ -105,7 +105,7 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
     plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
     if bodies:
-        plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
+        plant = _plant(ONE, Turned("shoulder", 0.0, 1), rotor=gear)
     run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
     assert (plant.angle[0] < -0.05) == falls
 
@@ -113,14 +113,14 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies)
 @pytest.mark.needs("physics")
 def test_damping_and_friction_of_the_urdf_are_added():
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
-    bodies = _plant(rubbed, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.1))
+    bodies = _plant(rubbed, Turned("shoulder", 0.0, 1), load=Load(friction=0.1))
     run(bodies, 3.0, drive=0.5, damping=0.1)
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
 
 @pytest.mark.needs("physics")
 def test_the_shoulder_feels_what_the_elbow_does():
-    joints = (UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, 1))
+    joints = (Turned("shoulder", 0.0, 1), Turned("elbow", 0.0, 1))
     # both links stretched out: the lower weight hangs on two levers
     shoulder, elbow = PULL + 2 * PULL, PULL
     stretched = _plant(TWO, *joints)
@@ -133,7 +133,7 @@ def test_the_shoulder_feels_what_the_elbow_does():
 
 @pytest.mark.needs("physics")
 def test_servos_are_distinguished_by_their_joints_names():
-    plant = _plant(TWO, UrdfJoint("elbow", 1.0, -1), UrdfJoint("shoulder", 3.0, 1))
+    plant = _plant(TWO, Turned("elbow", 1.0, -1), Turned("shoulder", 3.0, 1))
     run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
     assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
 
@@ -145,7 +145,7 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_res
         joint("elbow", "upper", "lower"),
         joint("grip", "lower", "finger", kind="prismatic", more='<mimic joint="elbow" multiplier="2"/>'),
     )  # fmt: skip
-    joints = (UrdfJoint("grip", 0.5, 1), UrdfJoint("shoulder", 0.0, 1), UrdfJoint("nowhere", 1.5, 1))
+    joints = (Turned("grip", 0.5, 1), Turned("shoulder", 0.0, 1), Turned("nowhere", 1.5, 1))
     plant = _plant(text, *joints)
     three_links = PULL * (1 + 2 + 3)
     run(plant, 1.0, drive=[0.0, three_links, 0.02], damping=0.5)
@@ -160,16 +160,14 @@ def test_a_joint_with_a_servo_of_its_own_mimics_nojoint():
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
     )
-    plant = _plant(
-        mimic, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1), angles=[0.0, math.pi / 2]
-    )
+    plant = _plant(mimic, Turned("shoulder", 0.0, 1), Turned("wrist", 0.0, 1), angles=[0.0, math.pi / 2])
     run(plant, 1.0, drive=[2 * PULL, 0.0], damping=0.5)
     assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
 @pytest.mark.needs("physics")
 def test_a_servo_that_is_added_later_moves_by_itself():
-    make = mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
+    make = mujoco_plant(bodies_of(ONE, (Turned("shoulder", 0.0, 1),)))
     assert len(make(()).angle) == 0
     plant = make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)])
     run(plant, 1.0, drive=[PULL, 0.0], damping=0.1)
@@ -178,7 +176,7 @@ def test_a_servo_that_is_added_later_moves_by_itself():
 
 @pytest.mark.needs("physics")
 def test_a_joint_is_placed_at_rest():
-    plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
+    plant = _plant(ONE, Turned("shoulder", 0.0, 1))
     run(plant, 0.2)
     assert plant.velocity[0] < -1
     plant.place(0, -math.pi / 2)
@@ -189,9 +187,7 @@ def test_a_joint_is_placed_at_rest():
 @pytest.mark.needs("physics")
 def test_two_runs_are_the_same_to_the_last_bit():
     def once() -> list[float]:
-        plant = _plant(
-            TWO, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, -1), load=Load(friction=0.1)
-        )
+        plant = _plant(TWO, Turned("shoulder", 0.0, 1), Turned("elbow", 0.0, -1), load=Load(friction=0.1))
         run(plant, 2.0, drive=[0.3, -0.2], damping=0.03)
         return [*plant.angle, *plant.velocity]
 
@@ -209,7 +205,7 @@ def test_missing_meshes_and_pictures_are_no_error():
         joint("shoulder", "base", "arm"),
         joint("wrist", "arm", "hand"),
     )
-    plant = _plant(text, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1))
+    plant = _plant(text, Turned("shoulder", 0.0, 1), Turned("wrist", 0.0, 1))
     run(plant, 1.0, drive=[PULL, 0.0], damping=0.5)
     assert plant.angle == pytest.approx([0.0, 0.0], abs=1e-4)
 
@@ -219,7 +215,7 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
     plant = _plant(
         urdf(f'<link name="arm">{box}</link>', joint("shoulder", "base", "arm")),
-        UrdfJoint("shoulder", 0.0, 1),
+        Turned("shoulder", 0.0, 1),
     )
     run(plant, 1.0, drive=1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1, damping=0.5)
     assert plant.angle[0] == pytest.approx(0.0, abs=1e-6)
@@ -228,7 +224,7 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does():
 @pytest.mark.needs("physics")
 def test_the_torso_moves():
     text = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
-    joints = (UrdfJoint("left_shoulder_swing_joint", 1.0, -1), UrdfJoint("head_yaw_joint", 2.6, 1))
+    joints = (Turned("left_shoulder_swing_joint", 1.0, -1), Turned("head_yaw_joint", 2.6, 1))
     plant = _plant(text, *joints)
     run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)
     assert np.isfinite(plant.angle).all()
@@ -252,13 +248,13 @@ def test_the_torso_moves():
 )
 def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(text, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
-        mujoco_plant(UrdfBodies(text, (UrdfJoint("shoulder", 0.0, 1),)))
+        mujoco_plant(bodies_of(text, (Turned("shoulder", 0.0, 1),)))
     assert len(caught.value.sentences) == 1
 
 
 @pytest.mark.needs("physics")
 def test_a_hand_turns_a_body_evenly():
-    mechanics = Mechanics(0, mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),))))
+    mechanics = Mechanics(0, mujoco_plant(bodies_of(ONE, (Turned("shoulder", 0.0, 1),))))
     mechanics.add(ROTOR, NO_LOAD, 0.0)
     mechanics.turn(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))
     mechanics.advance(500_000_000)

@@ -6,7 +6,7 @@ On a real port none of these keys is used, so one that could not be simulated is
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.contribution import BusDevice
@@ -23,16 +23,14 @@ from dxlsim.simulation_plan import (
     WHOLE_REPLIES,
     AdapterConfig,
     BusConfig,
-    CoupledServo,
-    Coupling,
     DeviceConfig,
     Load,
-    SensedBodies,
+    Mechanism,
+    MechanismServo,
     ServoConfig,
     ServoTimes,
     SimulationConfig,
     UrdfBodies,
-    UrdfJoint,
 )
 from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import added_control_tables
@@ -190,70 +188,61 @@ def simulation_of(plan: Plan) -> SimulationConfig:
     Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
     user sees it, and not in the process of the simulated buses.
     """
-    sensed, bodies = _bodies(plan), None
-    if plan.simulation.physics != "independent":
-        if sensed is None:
-            raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+    bodies, physics = _bodies(plan), plan.simulation.physics != "independent"
+    if physics and bodies is None:
+        raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+    config = SimulationConfig(
+        tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED),
+        bodies=bodies if physics else None,
+        mechanisms=_mechanisms(plan),
+        sensed=bodies if any(one.link for one in plan.simulation.devices.values()) else None,
+    )
+    if physics:
         from dxlsim.motion.mechanics import plant_of  # not above: no check needs it
 
-        bodies = sensed.bodies
         try:
-            plant_of(bodies, sensed.couplings)
+            plant_of(config)
         except ImportError as error:  # MuJoCo may be installed and yet not load
             raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
-    return SimulationConfig(
-        tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED),
-        bodies=bodies,
-        couplings=_couplings(plan),
-        sensed=sensed if any(one.link for one in plan.simulation.devices.values()) else None,
-    )
+    return config
 
 
-def sensed_bodies(plan: Plan) -> SensedBodies | None:
+def sensed_bodies(plan: Plan) -> UrdfBodies | None:
     """Return the bodies whose motion simulated sensors sense, whatever moves them; None: none does."""
     return _bodies(plan) if any(one.links for one in plan.loop.sensors) else None
 
 
-def _bodies(plan: Plan) -> SensedBodies | None:
+def _bodies(plan: Plan) -> UrdfBodies | None:
     """Return the bodies of the robot's URDF, and how simulated servos move them; None: it has none."""
-    if plan.urdf is None:
-        return None
-    couplings = _couplings(plan)
-    coupled = {servo.index for one in couplings for servo in one.servos}
-    joints = (
-        None
-        if index in coupled
-        else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, TYPES[servo.unit])
-        for index, servo in enumerate(_simulated_servos(plan))
-    )
-    return SensedBodies(UrdfBodies(plan.urdf, tuple(joints)), couplings)
+    return None if plan.urdf is None else UrdfBodies(plan.urdf, _mechanisms(plan))
 
 
-def _couplings(plan: Plan) -> tuple[Coupling, ...]:
-    """Return which of the simulated servos share joints.
+def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
+    """Return what the simulated servos move, first those with a joint of their own.
 
-    One with a servo on a real port is left out: what that one does cannot be simulated.
+    What a servo on a real port does cannot be simulated: those that share its joints move by themselves.
     """
     by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
-    found: list[Coupling] = []
-    for one in plan.mechanics.couplings:
-        servos = [by_row[row] for row in one.servos if row in by_row]
-        if len(servos) < len(one.servos):
+    shared: list[Mechanism] = []
+    alone = dict(by_row)
+    for one in plan.mechanics.mechanisms(len(plan.loop.joints)):
+        if one.own or not by_row.keys() >= {*one.servos}:
             continue
+        servos = [alone.pop(row) for row in one.servos]
         names = tuple(plan.loop.joints[row].name for row in one.joints)
-        found.append(
-            Coupling(
-                servos=tuple(
-                    CoupledServo(index, servo.reference, servo.direction * servo.ratio)
-                    for index, servo in servos
-                ),
-                joints=names,
-                matrix=one.matrix,
-                loads=tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names),
-                types=TYPES[servos[0][1].unit],
-            )
-        )
-    return tuple(found)
+        loads = tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names)
+        shared.append(_mechanism(servos, names, one.matrix, loads))
+    return (*(_mechanism([each], (each[1].joint,)) for each in alone.values()), *shared)
+
+
+def _mechanism(
+    servos: Sequence[tuple[int, ServoPlan]],
+    joints: tuple[str, ...],
+    matrix: tuple[tuple[float, ...], ...] = ((1.0,),),
+    loads: tuple[Load, ...] = (),
+) -> Mechanism:
+    parts = (MechanismServo(index, one.reference, one.direction * one.ratio) for index, one in servos)
+    return Mechanism(tuple(parts), joints, matrix, loads, TYPES[servos[0][1].unit])
 
 
 def _simulated_servos(plan: Plan) -> list[ServoPlan]:
@@ -263,7 +252,7 @@ def _simulated_servos(plan: Plan) -> list[ServoPlan]:
 
 def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
     described = plan.simulation
-    shared = {row for one in plan.mechanics.couplings for row in one.servos}
+    own = {servo for _, servo in plan.mechanics.own_servos(len(plan.loop.joints))}
     return BusConfig(
         name=bus.name,
         baud_rate=bus.baud_rate,
@@ -273,8 +262,8 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 servo.model,
                 servo.reference,
                 bus.return_delay_ns,
-                # what several servos move is the load of their coupling
-                load=NO_LOAD if servo.row in shared else _felt(servo, described.loads.get(servo.joint)),
+                # the load of what several servos move is that of their mechanism
+                load=_felt(servo, described.loads.get(servo.joint)) if servo.row in own else NO_LOAD,
                 times=described.times.get(servo.own_name, ServoTimes()),
                 motor=described.motors.get(servo.own_name),
             )

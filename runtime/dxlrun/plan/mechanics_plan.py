@@ -23,6 +23,11 @@ class CouplingPlan(msgspec.Struct, frozen=True):
     """By how much a servo's s may differ from what the others say, rad or m; 0: none can, there are as many
     joints as servos."""
 
+    @property
+    def own(self) -> bool:
+        """True when it is a servo with a joint of its own."""
+        return not self.name
+
 
 class MechanicsPlan(msgspec.Struct, frozen=True):
     """How joints and servos belong together where a servo is not a joint; empty: each servo is one.

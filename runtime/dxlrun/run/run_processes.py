@@ -78,7 +78,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
         span=process.memory_file("dxlrun-span"),
         sensors=tuple(slot.create(f"sensor-{one.name}", len(one.states)) for one in plan.loop.sensors),
-        shafts=slot.create("shafts", 3 * len(sensed.bodies.joints)) if sensed is not None else -1,
+        shafts=slot.create("shafts", 3 * sensed.servos) if sensed is not None else -1,
         simulation=heartbeat.create_progress(simulated) if simulated else -1,
     )
 

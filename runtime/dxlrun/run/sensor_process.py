@@ -26,7 +26,7 @@ from dxlrun.errors import PlugInError
 from dxlrun.plan.loop_plan import SensorPlan
 from dxlsim.motion.body import SimulatedBody
 from dxlsim.motion.link_motion import LinkMotion, Shafts
-from dxlsim.simulation_plan import SensedBodies
+from dxlsim.simulation_plan import UrdfBodies
 
 END_S = 1.0
 """How long a sensor may take to close its device."""
@@ -45,7 +45,7 @@ class SensorJob:
     """Its PID."""
     restarted: bool = False
     """It was there before, in this run: it does not end when its device cannot be opened."""
-    bodies: SensedBodies | None = None
+    bodies: UrdfBodies | None = None
     """What the simulated servos move."""
     shafts: int = -1
     """Descriptor of the slot in which the simulated bus leaves the state of its shafts."""
@@ -54,11 +54,11 @@ class SensorJob:
 class RemoteBody:
     """The body of a simulation in another process, which leaves the state of its shafts in a slot."""
 
-    def __init__(self, bodies: SensedBodies, reader: SlotReader) -> None:
+    def __init__(self, bodies: UrdfBodies, reader: SlotReader) -> None:
         self._body = SimulatedBody(bodies)
         self._reader = reader
         self.now_ns = time.monotonic_ns
-        count = len(bodies.bodies.joints)
+        count = bodies.servos
         self._shafts = Shafts(0, *(np.zeros(count) for _ in range(3)))
 
     def motion(self, link: str) -> LinkMotion:

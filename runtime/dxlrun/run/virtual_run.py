@@ -74,7 +74,7 @@ class VirtualRobot:
         self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
         simulated = simulation_of(plan)
-        mechanics = Mechanics(0, plant_of(simulated.bodies, simulated.couplings))
+        mechanics = Mechanics(0, plant_of(simulated))
         self.buses = tuple(SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated.buses)
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         if simulated.sensed is not None:

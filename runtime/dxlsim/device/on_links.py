@@ -12,15 +12,15 @@ from dxlsim.geometry.transform import rotated
 from dxlsim.motion.body import SimulatedBody
 from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.motion.mechanics import Mechanics
-from dxlsim.simulation_plan import SensedBodies
+from dxlsim.simulation_plan import UrdfBodies
 
 
-def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: SensedBodies) -> None:
+def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: UrdfBodies) -> None:
     """Let each device that is on a link measure that link's motion, at the time of each reading.
 
     Raises KeyError for a link that the URDF does not have.
     """
-    body, count = SimulatedBody(sensed), len(sensed.bodies.joints)
+    body, count = SimulatedBody(sensed), sensed.servos
     mechanics.sense()
     for device in devices:
         if device.link:

@@ -8,7 +8,7 @@ test compares. The URDF's first link stands still at the world's origin, z up.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Protocol
 
 import msgspec
@@ -29,7 +29,7 @@ from dxlsim.geometry.transform import (
 from dxlsim.geometry.urdf import read_urdf
 from dxlsim.motion.link_motion import Floats, LinkMotion, Shafts
 from dxlsim.motion.mechanics import Mechanics
-from dxlsim.simulation_plan import SensedBodies
+from dxlsim.simulation_plan import UrdfBodies
 
 
 class _Step(msgspec.Struct, frozen=True):
@@ -48,15 +48,15 @@ class SimulatedBody:
     Raises InputError for a URDF that is wrong.
     """
 
-    def __init__(self, sensed: SensedBodies) -> None:
-        urdf = read_urdf(sensed.bodies.urdf)
+    def __init__(self, bodies: UrdfBodies) -> None:
+        urdf = read_urdf(bodies.urdf)
         self.links = urdf.links
         self._joints = {joint.name: joint for joint in urdf.joints}
         self._above = {joint.child: joint for joint in urdf.joints}
-        self._names, self._matrix, self._offset = _moved(sensed)
+        self._names, self._matrix, self._offset = _moved(bodies)
         self._chains: dict[str, tuple[_Step, ...]] = {}
         self._place = self._speed = self._gain = np.zeros(len(self._names))
-        self.move(Shafts(0, *(np.zeros(len(sensed.bodies.joints)) for _ in range(3))))
+        self.move(Shafts(0, *(np.zeros(bodies.servos) for _ in range(3))))
 
     def move(self, shafts: Shafts) -> None:
         """Take the state of the shafts, in the order in which the servos were added."""
@@ -122,30 +122,21 @@ class SimulatedBody:
         )
 
 
-def _moved(sensed: SensedBodies) -> tuple[tuple[str, ...], Floats, Floats]:
+def _moved(bodies: UrdfBodies) -> tuple[tuple[str, ...], Floats, Floats]:
     """Return the joints that shafts move, and their coordinates: q = matrix @ shafts + offset."""
     names: list[str] = []
     rows: list[Floats] = []
     offsets: list[float] = []
-    count = len(sensed.bodies.joints)
-
-    def add(name: str, parts: Iterable[tuple[int, float, float]]) -> None:
-        row, offset = np.zeros(count), 0.0
-        for index, per_rad, reference in parts:
-            row[index] += per_rad
-            offset -= per_rad * reference
-        names.append(name)
-        rows.append(row)
-        offsets.append(offset)
-
-    for index, joint in enumerate(sensed.bodies.joints):
-        if joint is not None:
-            add(joint.name, [(index, joint.per_rad, joint.reference)])
-    for coupling in sensed.couplings:
-        for name, weights in zip(coupling.joints, coupling.matrix, strict=True):
-            pairs = zip(coupling.servos, weights, strict=True)
-            add(name, [(servo.index, weight * servo.per_rad, servo.reference) for servo, weight in pairs])
-    return tuple(names), np.array(rows).reshape(-1, count), np.array(offsets)
+    for mechanism in bodies.mechanisms:
+        for name, weights in zip(mechanism.joints, mechanism.matrix, strict=True):
+            row, offset = np.zeros(bodies.servos), 0.0
+            for servo, weight in zip(mechanism.servos, weights, strict=True):
+                row[servo.index] += weight * servo.per_rad
+                offset -= weight * servo.per_rad * servo.reference
+            names.append(name)
+            rows.append(row)
+            offsets.append(offset)
+    return tuple(names), np.array(rows).reshape(-1, bodies.servos), np.array(offsets)
 
 
 class ShaftSink(Protocol):
@@ -182,10 +173,10 @@ class ShaftsShown:
 class SensedBody:
     """The body of a simulation in this process, as it is now."""
 
-    def __init__(self, sensed: SensedBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
+    def __init__(self, bodies: UrdfBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
         """Raises InputError for a URDF that is wrong."""
-        self._body, self._mechanics, self._now_ns = SimulatedBody(sensed), mechanics, now_ns
-        self._count = len(sensed.bodies.joints)
+        self._body, self._mechanics, self._now_ns = SimulatedBody(bodies), mechanics, now_ns
+        self._count = bodies.servos
         mechanics.sense()
 
     def motion(self, link: str) -> LinkMotion:

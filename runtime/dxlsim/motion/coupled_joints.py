@@ -25,7 +25,7 @@ from dxlsim.motion.plant import (
     Stribecks,
     combine_plants,
 )
-from dxlsim.simulation_plan import Coupling
+from dxlsim.simulation_plan import Mechanism
 
 GIVE_RAD = 0.05  # rad by which horn and bracket of one servo give way to its stall torque [i]
 
@@ -36,21 +36,22 @@ _SETTLED = 1e-10  # rad/s or m/s that a further round of friction would change
 
 
 class CoupledJoints:
-    """One coupling; a step takes damping and the give of brackets at its end: stable at any stiffness.
+    """A mechanism of several servos.
 
-    As with `IndependentJoints`, half a step of the motors' damping is taken off their inertia, and friction
-    is that of `Motor` and of `Load`. Which frictions hold is found by turns (projected Gauss and Seidel).
+    A step takes damping and the give of brackets at its end: it is stable at any stiffness. As with
+    `IndependentJoints`, half a step of the motors' damping is taken off their inertia, and friction is that
+    of `Motor` and of `Load`. Which frictions hold is found by turns (projected Gauss and Seidel).
     """
 
-    def __init__(self, coupling: Coupling, joints: Sequence[PlantJoint]) -> None:
+    def __init__(self, mechanism: Mechanism, joints: Sequence[PlantJoint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
         self.velocity: Floats = np.zeros(len(joints))
-        motors, loads = [joint.motor for joint in joints], coupling.loads
-        self._reference = np.array([each.reference for each in coupling.servos])
+        motors, loads = [joint.motor for joint in joints], mechanism.loads
+        self._reference = np.array([each.reference for each in mechanism.servos])
         self._reference += [joint.recounted for joint in joints]
-        self._per_rad = scale = np.array([each.per_rad for each in coupling.servos])
+        self._per_rad = scale = np.array([each.per_rad for each in mechanism.servos])
         self._size = size = np.abs(scale)
-        self._matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
+        self._matrix: Floats = np.array(mechanism.matrix, dtype=np.float64)
         self._together = coupled_projection(self._matrix)
         apart = np.eye(len(joints)) - self._together
         stiffness = np.array([motor.stall_torque / GIVE_RAD for motor in motors]) / scale**2
@@ -141,30 +142,32 @@ class CoupledJoints:
 
 
 def coupled_projection(matrix: Floats) -> Floats:
-    """Return the projection of servo coordinates onto motions that no coupling resists: pinv(M) M."""
+    """Return the projection of servo coordinates onto motions that no other servo resists: pinv(M) M."""
     found = np.linalg.pinv(matrix) @ matrix
     return np.where(np.abs(found) < _ROUNDED, 0.0, found)
 
 
 def coupled_motion(projection: Floats, index: int) -> Floats:
-    """Return how far each servo of a coupling moves when one of them moves by 1."""
+    """Return how far each servo of a mechanism moves when one of them moves by 1."""
     moved: Floats = projection[:, index] / projection[index, index]
     return moved
 
 
-def joints_without_bodies(couplings: Sequence[Coupling], joints: Sequence[PlantJoint]) -> Plant:
-    """Return the plant of coupled joints, and of the others, each by itself."""
-    return combine_plants(joints, parts_without_bodies(couplings, joints, range(len(joints))))
+def joints_without_bodies(mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint]) -> Plant:
+    """Return the plant of servos that move no body, by their mechanisms."""
+    return combine_plants(joints, parts_without_bodies(mechanisms, joints, range(len(joints))))
 
 
 def parts_without_bodies(
-    couplings: Sequence[Coupling], joints: Sequence[PlantJoint], rows: Sequence[int]
+    mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint], rows: Sequence[int]
 ) -> list[Part]:
-    """Return the plants of some servos: of each coupling, and of all that move by themselves.
+    """Return the plants of some servos: of each mechanism, and of all that move by themselves.
 
-    A coupling whose servos have not all been added yet is left out.
+    A mechanism whose servos have not all been added yet is omitted.
     """
-    whole = [one for one in couplings if all(servo.index in rows for servo in one.servos)]
+    whole = [
+        one for one in mechanisms if not one.is_single and all(servo.index in rows for servo in one.servos)
+    ]
     coupled = [[servo.index for servo in one.servos] for one in whole]
     alone = sorted(set(rows).difference(*coupled))
     parts: list[Part] = [

@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import entry_points
 
@@ -22,7 +22,7 @@ from dxlsim.motion.coupled_joints import joints_without_bodies
 from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, PlantMaker
-from dxlsim.simulation_plan import Coupling, Load, UrdfBodies
+from dxlsim.simulation_plan import Load, SimulationConfig
 
 STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
@@ -355,15 +355,15 @@ class Strain:
         return np.flatnonzero(news).tolist() if news.any() else []
 
 
-def plant_of(bodies: UrdfBodies | None, couplings: Sequence[Coupling] = ()) -> PlantMaker:
-    """Return what makes the plant of some bodies, or of joints that move by themselves or coupled.
+def plant_of(config: SimulationConfig) -> PlantMaker:
+    """Return what makes the plant of a simulation: of its bodies, or of joints that move without them.
 
     Raises InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
     """
-    if bodies is not None:
+    if config.bodies is not None:
         (found,) = entry_points(group="dxlrun.physics", name="mujoco")  # of a package, and slow to import
-        maker: PlantMaker = found.load()(bodies, couplings)
+        maker: PlantMaker = found.load()(config.bodies)
         return maker
-    if not couplings:
+    if all(one.is_single for one in config.mechanisms):
         return IndependentJoints
-    return partial(joints_without_bodies, couplings)
+    return partial(joints_without_bodies, config.mechanisms)

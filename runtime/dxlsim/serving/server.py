@@ -83,7 +83,7 @@ class Server:
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._starter = starter
-        self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies, config.couplings))
+        self._mechanics = Mechanics(self.start_ns, plant_of(config))
         self._buses = tuple(
             RecordedBus(bus, ledger, self.start_ns, recordings[bus.name], self._mechanics)
             if bus.recorded
