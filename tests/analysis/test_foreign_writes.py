@@ -10,7 +10,7 @@ from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol1, protocol2
 
@@ -36,7 +36,7 @@ def told(
 
 
 def item(protocol: float, name: str) -> tuple[int, int]:
-    entry = control_table(MODELS[protocol], protocol).items[name]
+    entry = find_table(MODELS[protocol], protocol).items[name]
     return entry.address, entry.size
 
 

@@ -47,7 +47,7 @@ from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import BusPlan, DevicePlan
 from dxlwire.clock import VirtualClock
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.control_table.device_table import read_device_table
 from dxlwire.exchange import kernel
 from dxlwire.exchange.bus import NEVER, Lines
@@ -419,7 +419,7 @@ def robot(name: str, count: int) -> tuple[list[BusPlan], object]:
                 joint=f"joint_{number}_{servo_id}",
                 row=number * len(IDS) + index,
                 servo_id=servo_id,
-                table=control_table(models[index % len(models)], protocol),
+                table=find_table(models[index % len(models)], protocol),
                 reference=math.radians(150),
                 direction=1 if index % 2 else -1,
                 lower=-2.5,

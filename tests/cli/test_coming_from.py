@@ -18,12 +18,12 @@ from dxlrun import RemoteRobot
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 ROS2_CONTROL, LIBRARIES = page_text("from-ros2-control.md"), page_text("from-lerobot-rustypot-sdk.md")
 Dxlrun = Callable[..., Any]
 ROOT = Path(__file__).parents[2]
-GOAL = control_table("XL330-M288").items["goal_position"].address
+GOAL = find_table("XL330-M288").items["goal_position"].address
 
 
 def commands(page: str) -> list[list[str]]:

@@ -38,7 +38,7 @@ from dxlrun_view import dxlrun_commands
 from dxlsim.faults.fault import parse_fault
 from dxlsim.messages import SimulationJob, SimulationMessage
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 ROOT = Path(__file__).parents[2]
 ROOTS = (ROOT, ROOT / "runtime", ROOT / "runtime/dxlrun", ROOT / "plugins")
@@ -219,7 +219,7 @@ def test_tools_md_its_commands_do_what_the_page_has(
     assert '"id":7' in (clone / "elbow.json").read_text().replace(" ", "")
     sent = [entry.data for entry in finish() if entry.direction == "in"]
     writes = {(data[4], data[8], data[10:-2]) for data in sent if data[2:3] == b"\xfd" and data[7] == 3}
-    items = control_table("XM430-W350").items
+    items = find_table("XM430-W350").items
     assert (1, items["return_delay_time"].address, b"\x00") in writes
     assert (1, items["id"].address, b"\x07") in writes
 

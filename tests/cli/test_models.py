@@ -10,7 +10,7 @@ from tests.kit.pages import page_text
 import dxlwire
 from dxlrun.cli.tools.models import runs, unit_of
 from dxlrun.contract.hookspecs import HookSpecs
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 from dxlwire.control_table.devices import device_tables
 
 
@@ -47,7 +47,7 @@ def test_a_name_prints_its_control_table(dxlrun):
     assert rows["return_delay_time"][:9] == [
         *("return_delay_time", "5", "1", "RW", "EEPROM", "0.002", "ms", "0..254", "250"),
     ]
-    assert set(control_table("AX-12A").items) <= rows.keys()
+    assert set(find_table("AX-12A").items) <= rows.keys()
 
 
 def test_another_name_prints_it_too(dxlrun):
@@ -108,14 +108,14 @@ def test_items_that_repeat_themselves_share_a_line(dxlrun):
     (line,) = (line for line in said.out.splitlines() if line.split()[:1] == ["indirect_address_1..28"])
     assert "168..222" in line
     assert "224..251" in line
-    names = [item.name for run in runs(tuple(control_table("XM430-W350").items.values())) for item in run]
-    assert names == list(control_table("XM430-W350").items)
+    names = [item.name for run in runs(tuple(find_table("XM430-W350").items.values())) for item in run]
+    assert names == list(find_table("XM430-W350").items)
 
 
 def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
     (shown,) = result_of(dxlrun("models", "XM430-W350", "--json").out)
 
-    table = control_table("XM430-W350")
+    table = find_table("XM430-W350")
     assert shown["rad_per_tick"] == table.rad_per_tick
     motor = {name: shown[name] for name in ("stall_torque", "stall_current", "nominal_voltage", "gear_ratio")}
     assert motor == {"stall_torque": 4.1, "stall_current": 2.3, "nominal_voltage": 12.0, "gear_ratio": 353.5}
@@ -169,7 +169,7 @@ def test_a_device_is_printed_with_its_states(dxlrun):
     [("goal_position", "0.08789 deg"), ("goal_pwm", "0.113 %"), ("present_current", "2.69 mA"), ("led", "")],
 )
 def test_units_are_those_that_people_read(item, unit):
-    assert unit_of(control_table("XM430-W350").items[item]) == unit
+    assert unit_of(find_table("XM430-W350").items[item]) == unit
 
 
 PAGE = page_text("models.md")

@@ -22,7 +22,7 @@ from dxlrun_controllers.motions.trajectory_command import (
     flat_trajectory,
     trajectory_speed_peaks,
 )
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)
@@ -137,5 +137,5 @@ def test_fields_that_are_no_numbers_of_joints_are_left_to_the_controller() -> No
 def test_the_top_speed_of_a_servo_is_not_below_what_its_manual_gives(
     model: str, protocol: float, rpm: float
 ) -> None:
-    speed = control_table(model, protocol).top_speed
+    speed = find_table(model, protocol).top_speed
     assert rpm <= speed * 30 / np.pi < 1.4 * rpm

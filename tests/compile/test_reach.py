@@ -7,9 +7,9 @@ from tests.kit.robots import compile_text
 
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.servos import joint_reach, servo_travel
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 
-AX = control_table("AX-12A")
+AX = find_table("AX-12A")
 TRAVEL = servo_travel(AX)
 INSIDE = st.floats(TRAVEL.lower, TRAVEL.upper)
 

@@ -9,7 +9,7 @@ from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.compile.joints.register_values import declarable, register_value, steered_value
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 
 ROBOT = """\
 name: arm
@@ -73,7 +73,7 @@ def outcome(table, name, value):
 @example("1e308 V")
 @settings(max_examples=40)
 def test_any_value_is_taken_or_refused_with_a_sentence(value):
-    table = control_table("XM430-W350", 2.0)
+    table = find_table("XM430-W350", 2.0)
     for name in ("max_voltage_limit", "homing_offset", "velocity_limit", "return_delay_time", "shutdown"):
         found = outcome(table, name, value)
         assert "; " in found if isinstance(found, str) else found.value in range(-(1 << 31), 1 << 32)
@@ -130,7 +130,7 @@ def test_what_is_declarable_is_declared_on_every_model():
     [("temperature_limit", "is in the EEPROM"), ("status_return_level", "cannot be changed"), ("goal_pwm", "controllers command it")],
 )  # fmt: skip
 def test_a_client_may_change_only_ram_of_its_own(name, said):
-    table = control_table("XM430-W350", 2.0)
+    table = find_table("XM430-W350", 2.0)
     assert steered_value(table, "position_p_gain", 640).value == 640
     with pytest.raises(ValueError, match=said):
         steered_value(table, name, 2)

@@ -16,7 +16,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
 from dxlrun.testing import VirtualRobot
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 
 ROBOT = """\
@@ -91,7 +91,7 @@ every_case = pytest.mark.parametrize(
 
 def run(case: Case, tmp_path: Path, share: float, limits: str = "limits: {position: [-10 deg, 10 deg]}"):
     """Command a share of the register's limit for some cycles; return the log, and the goals on the wire."""
-    table = control_table(case.model, case.protocol)
+    table = find_table(case.model, case.protocol)
     file, robots = tmp_path / "robot.yaml", []
     reference = 180 if table.min_tick == 0 and table.max_tick > 1023 else 150 if table.min_tick == 0 else 0
     file.write_text(
@@ -123,7 +123,7 @@ def run(case: Case, tmp_path: Path, share: float, limits: str = "limits: {positi
 
 def limit_of(case: Case, file: Path) -> float:
     """Return the limit in the unit of the command, as the servo's table has it."""
-    table = control_table(case.model, case.protocol)
+    table = find_table(case.model, case.protocol)
     if case.kind in {"velocity", "posvel"}:
         return case.raw * table.rad_s_per_tick
     if case.kind == "pwm":
@@ -207,7 +207,7 @@ def test_limits_are_read_again_when_another_servo_took_the_place_of_a_lost_one(
         robot.buses[0].at(600_000_000, lambda: servo.poke("velocity_limit", after))
         robots.append(robot)
 
-    speed = 45 * control_table("XM430-W350", 2.0).rad_s_per_tick
+    speed = 45 * find_table("XM430-W350", 2.0).rad_s_per_tick
     story = {number: [send("c", "velocities", speed)] for number in range(200, 204)}
     log = tell(file, story, tmp_path / "run.mcap", seconds=2.5, before=replace_servo)
     (robot,) = robots

@@ -11,7 +11,7 @@ from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
 from dxlsim.servo.making import make_servo
 from dxlsim.simulation_plan import Load, ServoConfig
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 
 S = 1_000_000_000
 
@@ -27,7 +27,7 @@ def fastest(line: Any, seconds: float) -> float:
 
 def held(model: str, torque: float, load: float, more_friction: float = 0.0) -> bool:
     """Return whether friction holds a shaft between the motor's torque and the load's, Nm."""
-    motor = motor_of(control_table(model, None if model != "MX-64" else 1.0))
+    motor = motor_of(find_table(model, None if model != "MX-64" else 1.0))
     rubbing = motor.friction + more_friction + motor.load_friction * abs(torque + load)
     return abs(torque - load) <= rubbing + 0.003
 

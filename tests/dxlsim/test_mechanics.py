@@ -19,7 +19,7 @@ from dxlsim.motion.mechanics import (
 )
 from dxlsim.motion.motor import Motor, motor_of
 from dxlsim.simulation_plan import Load
-from dxlwire.control_table import ControlTable, all_tables, control_table
+from dxlwire.control_table import ControlTable, all_tables, find_table
 
 MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12.0, inertia=0.003)
 S = 1_000_000_000
@@ -270,7 +270,7 @@ def test_a_servo_at_rest_wakes_for_a_new_goal():
 def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew():
     speeds = []
     for turns in (0, 1):
-        motor, load = motor_of(control_table("XM430-W350")), Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
+        motor, load = motor_of(find_table("XM430-W350")), Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
         mechanics = Mechanics(0)
         index = mechanics.add(motor, load, 2.0)
         mechanics.recount(index, 2.0 + turns * math.tau)
@@ -317,7 +317,7 @@ def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_
 
 
 def test_torque_figures_are_those_of_the_tables():
-    motor = motor_of(control_table("XM430-W350"))
+    motor = motor_of(find_table("XM430-W350"))
     assert (motor.no_load_speed, motor.stall_torque) == pytest.approx((4.817, 4.1), rel=1e-3)
     assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
 

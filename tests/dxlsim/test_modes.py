@@ -11,13 +11,13 @@ import pytest
 from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import Load
 from dxlsim.wire.protocol2 import ErrorNumber
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 TICK = math.tau / 4096
 RPM = math.tau / 60
 REST = 3
 """Ticks that the friction of an XM430-W350 leaves: 1.9 % of the duty, and 8 % more of it, at 4.6 a rad"""
-MOTOR = motor_of(control_table("XM430-W350"))
+MOTOR = motor_of(find_table("XM430-W350"))
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from dxlsim.motor_model import MotorModel, Stribeck
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import Load, ServoConfig
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 
 S, STEP_NS = 1_000_000_000, 2_000_000
 START = 1.0
@@ -246,7 +246,7 @@ def test_time_constants_are_those_that_were_identified(model, constant_s):
     assert parameters.armature * parameters.resistance / parameters.kt**2 == pytest.approx(
         constant_s, abs=1e-4
     )
-    motor = motor_of(control_table(model, BENCH[model].protocol))
+    motor = motor_of(find_table(model, BENCH[model].protocol))
     assert motor.time_constant / (1 - motor.load_friction) == pytest.approx(constant_s, rel=0.1)
 
 
@@ -267,7 +267,7 @@ def test_the_output_for_a_rad_of_error_is_that_which_was_identified(model, proto
     mechanics.advance(STEP_NS)
     duty = float(mechanics.law.duty[0]) / (round((START + error) / unit) * unit - START)
     assert duty == pytest.approx(stiffness, rel=0.01)
-    assert servo.registers[item] == control_table(model, protocol).items[item].initial
+    assert servo.registers[item] == find_table(model, protocol).items[item].initial
 
 
 def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so():
@@ -298,7 +298,7 @@ def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like, models):
 
 @pytest.mark.parametrize("p", [5.06, 20.0])
 def test_the_gain_that_does_not_overshoot_is_the_critical_one(p):
-    motor = motor_of(control_table("XM430-W350"))
+    motor = motor_of(find_table("XM430-W350"))
     speed = motor.stall_torque / motor.damping
     # T x'' + (1 + D w) x' + P w x = 0 has one root twice
     assert (1 + critical_d(p, motor) * speed) ** 2 == pytest.approx(4 * motor.time_constant * p * speed)
@@ -307,7 +307,7 @@ def test_the_gain_that_does_not_overshoot_is_the_critical_one(p):
 @pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
 def test_simulated_motors_take_up_speed_with_their_own_time_constant(model, protocol):
     motor = structs.replace(
-        motor_of(control_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
+        motor_of(find_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
     )
     for load in (Load(), Load(inertia=0.01)):
         plant = IndependentJoints([PlantJoint(motor, load, 0.0)])

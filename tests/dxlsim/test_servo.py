@@ -7,7 +7,7 @@ from tests.kit.line_faults import turn_by_hand
 
 from dxlsim.registers.memory import Memory
 from dxlsim.wire.protocol1 import ErrorBit
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
 BROADCAST = 0xFE
@@ -245,7 +245,7 @@ def test_a_cut_data_line_silences_but_does_not_stop(line):
 
 
 def test_values_and_bytes_of_the_registers_never_differ():
-    table = control_table("AX-12A")
+    table = find_table("AX-12A")
     registers = Memory(table, 24)
     for run in registers.runs(26, bytes((5, 6, 7, 8, 0x23, 0x01))):
         registers.write(run)

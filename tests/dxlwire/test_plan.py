@@ -3,7 +3,7 @@ import pytest
 from tests.kit.plans import make_plan
 
 from dxlwire.bus_plan import BusPlan
-from dxlwire.control_table import control_table, model_names
+from dxlwire.control_table import find_table, model_names
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
 from dxlwire.plan.planning import torque_off_ns
 
@@ -38,9 +38,9 @@ def test_every_model_has_a_plan(protocol):
     for model in model_names(protocol):
         plan = make_plan((1, 2), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
         layout = plan.servos[0].state
-        items = control_table(model, protocol).items
+        items = find_table(model, protocol).items
         assert layout.address + layout.position.offset == items["present_position"].address
-        assert len(plan.groups) == (1 if "bulk_read" in control_table(model, protocol).capabilities else 2)
+        assert len(plan.groups) == (1 if "bulk_read" in find_table(model, protocol).capabilities else 2)
         assert len(plan.limp) == 1
 
 

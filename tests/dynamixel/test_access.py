@@ -7,7 +7,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.registers import settle
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import control_table, decoded
+from dxlwire.control_table import decoded, find_table
 from dxlwire.transaction import Outcome, Reply
 
 PLAN = make_x((11,))
@@ -93,6 +93,6 @@ def test_nothing_is_written_where_one_register_cannot_be_read():
 
 
 def test_only_items_that_lie_whole_in_the_bytes_are_decoded():
-    items = control_table("XM430-W350", 2.0).items
+    items = find_table("XM430-W350", 2.0).items
     assert decoded(items.values(), 80, b"\1\0\2\0\3") == {"position_d_gain": 1, "position_i_gain": 2}
     assert decoded([items["position_d_gain"]], 81, b"\0\0\0") == {}

@@ -12,7 +12,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.checks import CHECKS, inspect, survey
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.plan.planning import plan_line
 from dxlwire.transaction import Outcome, Reply
 
@@ -72,7 +72,7 @@ def look(protocol, change, *, take_over=False, refused=()):
     model = "MX-28" if multi_turn else "AX-12A" if protocol == 1.0 else "XM430-W350"
     plan = make_plan((1,), protocol=protocol, model=model)
     servo = plan.servos[0]
-    table = control_table(model, protocol)
+    table = find_table(model, protocol)
     if "declared" in change:
         item = table.items[change["declared"]]
         servo = replace(servo, registers=(RegisterValue(item.address, item.size, 0, item.name),))
@@ -106,7 +106,7 @@ def look(protocol, change, *, take_over=False, refused=()):
 
 
 def test_firmware_before_an_item_may_refuse_reads_of_it():
-    items = control_table("XM430-W350").items.values()
+    items = find_table("XM430-W350").items.values()
     newer = [item.name for item in items if item.firmware > 44 and not item.name.startswith("indirect")]
     assert "startup_configuration" in newer
     found = look(2.0, {"firmware_version": 44, "homing_offset": 5}, refused=newer)

@@ -22,8 +22,8 @@ from dxlwire.control_table import (
     ControlItem,
     ControlTable,
     all_tables,
-    control_table,
     find_deviations,
+    find_table,
     read_control_table,
 )
 from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
@@ -200,7 +200,7 @@ def test_a_reported_setting_that_the_robot_file_then_declares_is_no_longer_repor
 
 
 def test_a_setting_that_cannot_be_declared_is_reported_with_its_own_remedy():
-    bench = Bench(control_table("AX-12A", 1.0))
+    bench = Bench(find_table("AX-12A", 1.0))
     (text,) = said(bench.inspect(lock=1))
     assert text.endswith("; switch its power off and on")
     (text,) = said(bench.inspect(lock=1, punch=40))
@@ -220,7 +220,7 @@ def test_a_setting_that_cannot_be_declared_is_reported_with_its_own_remedy():
     ],
 )
 def test_a_start_restores_a_torque_limit_and_reports_what_it_was(model, protocol, item):
-    bench = Bench(control_table(model, protocol))
+    bench = Bench(find_table(model, protocol))
     full = bench.servo.registers[item]
     bench.servo.poke(item, 20)
     bench.rig.hardware.start()

@@ -8,7 +8,7 @@ from tests.kit.line_faults import corrupt_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
-from dxlwire.control_table import control_table, model_names
+from dxlwire.control_table import find_table, model_names
 from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol2
 
@@ -202,7 +202,7 @@ def test_no_model_has_a_state_that_indirect_addresses_would_shorten(protocol):
     for model in model_names(protocol):
         plan = make_plan((1,), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
         layout = plan.servos[0].state
-        between = control_table(model, protocol).items.get("reserved_619")
+        between = find_table(model, protocol).items.get("reserved_619")
         spared = 0 if between is None else between.size  # PRO before (A): not worth addresses in the EEPROM
         assert layout.length == layout.position.size + layout.velocity.size + layout.effort.size + spared, (
             model

@@ -11,7 +11,7 @@ from dxlrun.dynamixel.tools.scanning import Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import StartUpError
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import ControlTable, all_tables, control_table, read_control_table
+from dxlwire.control_table import ControlTable, all_tables, find_table, read_control_table
 
 X = {
     0x01: "input voltage",
@@ -115,7 +115,7 @@ def test_an_error_item_is_read_where_the_model_has_it(table):
 
 @pytest.mark.parametrize("model", MANUALS)
 def test_bits_and_codes_are_those_of_the_manual(model):
-    table = control_table(model, 1.0 if model == "AX-12A" else 2.0)
+    table = find_table(model, 1.0 if model == "AX-12A" else 2.0)
     for value, name in MANUALS[model].items():
         assert table.errors.describe(value) == f"{name} error"
     assert table.errors.has_codes == model.startswith("Y")
@@ -152,25 +152,24 @@ def test_scan_names_the_error_of_a_servo(table):
 
 
 def test_a_second_error_is_named_besides_the_first():
-    errors = control_table("XL-320").errors
+    errors = find_table("XL-320").errors
     assert errors.describe(0x03) == "overload error; overheating error"
     assert errors.describe(0) == "no hardware error"
     assert errors.describe(0x28) == "bits 28, which the control table does not define"
     assert (
-        control_table("YM070-210-M001").errors.describe(6)
-        == "code 6, which the control table does not define"
+        find_table("YM070-210-M001").errors.describe(6) == "code 6, which the control table does not define"
     )
 
 
 def test_a_register_that_reports_errors_is_shown_by_its_meaning():
     for model, value, words in (("XL-320", 2, "overheating error"), ("YM070-210-M001", 9, "battery warning")):
-        table = control_table(model)
+        table = find_table(model)
         assert meaning(table.items[table.errors.item], value, table.errors) == words
         assert meaning(table.items["id"], 1, table.errors) == ""
 
 
 def test_a_warning_neither_takes_the_goals_nor_marks_the_joint_as_broken():
-    rig = rig_of(control_table("YM070-210-M001"), (1, 2))
+    rig = rig_of(find_table("YM070-210-M001"), (1, 2))
     rig.hardware.start()
     rig.cycles(3)
     rig.events.list.clear()

@@ -27,7 +27,7 @@ from dxlrun_hand.servo_setup import bring
 from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.bus_plan import BusPlan
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.plan.planning import Wiring, bus_plan
 
 COUNT = os.environ.get("DXLRUN_LATE_REPLIES", "40")
@@ -199,7 +199,7 @@ def scan_line(protocol: float, faults: Faults) -> tuple[set[str], int]:
 def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
     """Give a servo what a robot file has for it, and read it back, as `dxlrun setup` does."""
     line, tool = tool_of(protocol)
-    table = control_table(MODELS[protocol], protocol)
+    table = find_table(MODELS[protocol], protocol)
     wiring = Wiring("elbow", 0, 1, table, math.pi, 1, -1.5, 1.5)
     plan = bus_plan(
         name="main",

@@ -11,7 +11,7 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import mode_in, position_reach
 from dxlwire.wire import protocol2
@@ -54,7 +54,7 @@ def make_pair(**change):
 
 def make_one(model, protocol, **change):
     """One servo of a model, in the middle of its travel, started."""
-    table = control_table(model, protocol)
+    table = find_table(model, protocol)
     limits = [table.items.get(f"{end}_position_limit") for end in ("min", "max")]
     low, high = (
         given if item is None else item.initial
@@ -184,7 +184,7 @@ def test_gains_that_a_tool_set_outlive_a_change_and_others_begin_with_those_of_t
 def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
     """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
     (11)), which does not say to what: here to 400, and more than the manual names."""
-    items = control_table("XM430-W350", 2.0).items
+    items = find_table("XM430-W350", 2.0).items
     plan = make_pair()
     declared = tuple(
         RegisterValue(items[name].address, items[name].size, value, name)
@@ -550,7 +550,7 @@ def test_a_servo_that_shut_itself_down_gets_no_torque_back_by_a_limit(limited, s
 
 def test_extended_positions_reach_as_far_as_the_manual_says():
     """e-Manual XM430-W350, Goal Position (116): -1,048,575 to 1,048,575, 256 turns."""
-    assert position_reach(control_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)
+    assert position_reach(find_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)
 
 
 def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it():

@@ -16,7 +16,7 @@ import dxlwire.control_table.devices
 import dxlwire.control_table.models
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import read_log
-from dxlwire.control_table import added_control_tables, control_table
+from dxlwire.control_table import added_control_tables, find_table
 
 TABLES = Path(dxlwire.control_table.__file__).parent / "tables"
 PLUGIN = """
@@ -81,7 +81,7 @@ def test_a_table_is_taken_as_a_path_or_as_a_text(
 ) -> None:
     install(f"[{table.read_text()!r}]" if as_text else f"[Path({str(table)!r})]")
     assert load_plugins().broken == {}
-    found = control_table("Mine-1", 1.0)
+    found = find_table("Mine-1", 1.0)
     assert (found.model_number, found.max_tick) == (60001, 1023)
     assert found.items["model_number"].initial == 60001
     assert added_control_tables(["AX-12A", "Mine-1", "Mine-1"]) == (table.read_text(),)

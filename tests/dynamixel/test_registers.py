@@ -12,7 +12,7 @@ from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketLog
 
@@ -25,7 +25,7 @@ def register(table, name, value):
 def declared(plan, index=0, **values):
     """Return the plan with registers of one servo declared, EEPROM first."""
     servo = plan.servos[index]
-    table = control_table(servo.model, plan.protocol)
+    table = find_table(servo.model, plan.protocol)
     wanted = sorted((register(table, *one) for one in values.items()), key=lambda one: not one.eeprom)
     servos = list(plan.servos)
     servos[index] = replace(servo, registers=tuple(wanted))

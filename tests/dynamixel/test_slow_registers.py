@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.plan.reads import slow_items
 
 SECOND_NS = 1_000_000_000
@@ -18,7 +18,7 @@ def start(model="XM430-W350", ids=(11, 12), *, protocol=2.0, period_ns=SECOND_NS
     returning = change.pop("returning", False)
     x = {"reference": math.pi, "lower": -2.5, "upper": 2.5, "return_delay_ns": 0}
     plan = make_plan(ids, protocol=protocol, model=model, **(x if protocol == 2.0 else {}) | change)
-    slow = items or slow_items(control_table(model, protocol))
+    slow = items or slow_items(find_table(model, protocol))
     servos = tuple(replace(servo, slow=slow, torque_on_return=returning) for servo in plan.servos)
     return start_rig(replace(plan, servos=servos, slow_period_ns=period_ns))
 

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.servo.access import reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.transaction import Outcome, Reply
 from dxlwire.wire import protocol2
 
@@ -263,7 +263,7 @@ def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(sta
 
 
 def test_a_ramp_that_the_watchdog_reset_is_written_again():
-    item = control_table("XM430-W350").items["profile_acceleration"]
+    item = find_table("XM430-W350").items["profile_acceleration"]
     rig = start_rig(every_servo(arm(), registers=(RegisterValue(item.address, item.size, 100, item.name),)))
     rig.cycles(5)
     rig.wait(300_000_000)

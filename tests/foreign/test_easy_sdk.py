@@ -19,7 +19,7 @@ from dynamixel_easy_sdk import (
 from tests.foreign.patience import PATIENCE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlwire.control_table import all_tables, control_table
+from dxlwire.control_table import all_tables, find_table
 
 NUMBERS = ControlTable.parsingModelList()
 MODELS = tuple(
@@ -73,7 +73,7 @@ def test_it_finds_every_model_and_reads_it_by_its_own_table(connect: Any) -> Non
         if model == "XL-320":
             continue  # its file there has no operating mode, and a Motor reads it at once
         motor = bus.createMotor(servo_id)
-        table = control_table(model, 2.0)
+        table = find_table(model, 2.0)
         assert motor.model_number == table.model_number
         assert motor.torque_status == 0
         assert motor.operating_mode_status in (OperatingMode.POSITION, OperatingMode.CURRENT_BASED_POSITION)

@@ -10,7 +10,7 @@ import rustypot
 from tests.foreign.patience import PATIENCE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 RATE = 1_000_000
 POSITION = 2.0
@@ -65,7 +65,7 @@ def test_every_register_is_read_and_written_back_where_its_table_has_it(
     connect: Any, simulation: Any, kind: str
 ) -> None:
     servo = connect(f"read {kind}", kind)
-    access = {item.address: item.access for item in control_table(*MODELS[kind]).items.values()}
+    access = {item.address: item.access for item in find_table(*MODELS[kind]).items.values()}
     written = 0
     for register in servo.registers():
         if register.addr not in access:
@@ -85,7 +85,7 @@ def test_every_register_is_read_and_written_back_where_its_table_has_it(
 def test_two_servos_are_found_and_driven_by_a_sync_write(connect: Any, simulation: Any, kind: str) -> None:
     simulation.expect_haste(f"drive {kind}")
     bus = connect(f"drive {kind}", kind)
-    model = control_table(*MODELS[kind]).model_number
+    model = find_table(*MODELS[kind]).model_number
     assert until(lambda: bus.scan([1, 2]) == {1: model, 2: model})  # it does not wait long for any
     for servo_id in (1, 2):
         bus.write_torque_enable(servo_id, True)

@@ -14,7 +14,7 @@ from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2
 from tests.foreign.patience import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlwire.control_table import ControlItem, control_table
+from dxlwire.control_table import ControlItem, find_table
 
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")
 FOLLOWER = {1: "XL430-W250", 2: "XL430-W250", **dict.fromkeys(range(3, 7), "XL330-M288")}
@@ -47,7 +47,7 @@ class Arm:
         return {each: self._sdk.ping(self._port, each)[0] for each in self.models}
 
     def item(self, name: str, servo_id: int) -> ControlItem:
-        return control_table(self.models[servo_id], 2.0).items[name]
+        return find_table(self.models[servo_id], 2.0).items[name]
 
     def write(self, name: str, servo_id: int, value: int) -> None:
         item = self.item(name, servo_id)
@@ -78,7 +78,7 @@ class Arm:
         for each in self.models:
             self.write("torque_enable", each, 0)
             self.write("return_delay_time", each, 0)
-            has_current = "goal_current" in control_table(self.models[each], 2.0).items
+            has_current = "goal_current" in find_table(self.models[each], 2.0).items
             mode = CURRENT_BASED_POSITION if each == GRIPPER and has_current else EXTENDED_POSITION
             self.write("operating_mode", each, mode)
             self.write("position_p_gain", each, 800)
@@ -98,9 +98,7 @@ def connect(open_port: Any) -> Callable[[str], Arm]:
 @pytest.mark.parametrize("name", ["leader", "follower"])
 def test_every_servo_of_an_arm_is_of_the_model_that_was_promised(connect: Any, name: str) -> None:
     held = connect(name)
-    assert held.greet() == {
-        each: control_table(model, 2.0).model_number for each, model in held.models.items()
-    }
+    assert held.greet() == {each: find_table(model, 2.0).model_number for each, model in held.models.items()}
 
 
 @pytest.mark.parametrize("name", ["leader", "follower"])

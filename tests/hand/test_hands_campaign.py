@@ -31,7 +31,7 @@ from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.servo_setup import SetUp, factory_rate
 from dxlrun_hand.teaching import taught
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import ControlTable, control_table
+from dxlwire.control_table import ControlTable, find_table
 
 HANDS = int(os.environ.get("DXLRUN_HANDS", "3"))
 TAUGHT = int(os.environ.get("DXLRUN_TAUGHT", "0"))
@@ -100,7 +100,7 @@ def drawn(chance: random.Random) -> World:
 def joint(chance: random.Random, name: str, protocol: float, servo_id: int) -> Joint:
     """Draw a joint whose ends lie in the turn of its servo."""
     model = chance.choice(MODELS[protocol])
-    table = control_table(model, protocol)
+    table = find_table(model, protocol)
     reach = math.degrees(table.max_tick * table.rad_per_tick)
     low, high = sorted(chance.sample(range(3, int(reach) - 3), 2))
     while high - low < 15:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import VirtualClock
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.port.ports import OwnProcessors
 
@@ -69,7 +69,7 @@ def make_plan(
             joint=names[index],
             row=first_row + index,
             servo_id=servo_id,
-            table=control_table(models[index], protocol),
+            table=find_table(models[index], protocol),
             reference=change.get("reference", MIDDLE),
             direction=1 if index % 2 else -1,
             lower=change.get("lower", -MIDDLE),

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import Torque
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.plan.planning import Wiring, bus_plan
 
 GAIN = "/joints/pan/registers/position_p_gain"
@@ -19,7 +19,7 @@ GAIN = "/joints/pan/registers/position_p_gain"
 @pytest.fixture
 def arm(desk):
     """Return the desk of a robot with two XM430."""
-    table = control_table("XM430-W350", 2.0)
+    table = find_table("XM430-W350", 2.0)
     wirings = [
         Wiring(name, row, 11 + row, table, 3.14, 1, -1.0, 1.0) for row, name in enumerate(("pan", "tilt"))
     ]
@@ -164,7 +164,7 @@ def test_what_there_is_not_cannot_be_read(arm, path, said):
 
 
 def test_a_servo_of_protocol_1_is_not_rebooted(desk):
-    table = control_table("AX-12A", 1.0)
+    table = find_table("AX-12A", 1.0)
     bus = bus_plan(
         name="main", port="sim", baud_rate=1_000_000, latency_ns=0, return_delay_ns=0,
         joints=[Wiring("pan", 0, 3, table, 2.6, 1, -1.0, 1.0)], protocol=1.0,

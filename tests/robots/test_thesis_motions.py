@@ -10,7 +10,7 @@ import pytest
 from tests.kit.clients import command_of, played
 
 from dxlsim.motion.motor import motor_of
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
 STEP_S = 3.0
@@ -30,7 +30,7 @@ def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
 def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, model, tmp_path):
     t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_position.yaml")), joint)
-    table = control_table(model, 1.0)
+    table = find_table(model, 1.0)
 
     fastest = motor_of(table).no_load_speed
     assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
@@ -42,7 +42,7 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, m
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
 def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, tmp_path):
     t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
-    table = control_table(model, 1.0)
+    table = find_table(model, 1.0)
 
     assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
     on_the_way = (q > -0.6) & (q < 0.9)  # by then it has come to its speed

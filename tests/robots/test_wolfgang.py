@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.testing import simulated_robot
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.control_table.devices import device_table
 
 WOLFGANG = Path(__file__).parents[2] / "robots" / "wolfgang.yaml"
@@ -44,7 +44,7 @@ def test_it_has_the_servos_and_boards_of_the_team_and_runs():
     found = {
         servo.joint: (
             servo.servo_id,
-            control_table(servo.model, 2.0).model_number,
+            find_table(servo.model, 2.0).model_number,
             bus.name,
             next(one.value for one in servo.registers if one.name == "position_p_gain"),
         )

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dxlrun.testing import simulated_robot
-from dxlwire.control_table import control_table, model_names
+from dxlwire.control_table import find_table, model_names
 
 ROBOT = """\
 name: one
@@ -29,7 +29,7 @@ controllers:
     ("model", "protocol"), [(name, protocol) for protocol in (1.0, 2.0) for name in model_names(protocol)]
 )
 def test_a_servo_of_every_model_runs(tmp_path, model, protocol):
-    table = control_table(model, protocol)
+    table = find_table(model, protocol)
     ends = [table.min_tick, table.max_tick]
     # some come with position limits that are narrower than their travel, which the robot file has to follow
     for index, (name, tighter) in enumerate((("min_position_limit", max), ("max_position_limit", min))):

@@ -17,7 +17,7 @@ from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig
 from dxlsim.virtual_ports import VirtualPorts
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 TICK = math.tau / 4096
 MASS, ARM = 0.5, 0.2
@@ -61,7 +61,7 @@ def hang(make_line2: Callable[..., Any]) -> Hang:
 
 def rubbing(torque: float, pull: float) -> float:
     """Return the friction that holds between the motor's torque and an arm's pull, Nm."""
-    motor = motor_of(control_table("XM430-W350"))
+    motor = motor_of(find_table("XM430-W350"))
     return motor.friction + motor.load_friction * abs(torque + pull)
 
 

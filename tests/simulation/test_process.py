@@ -24,7 +24,7 @@ from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlsim.serving.realtime import PollBudget
 from dxlsim.serving.server import _WRITTEN, lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -181,7 +181,7 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
 def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start):
     """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
     running = start()
-    table = control_table("AX-12A")
+    table = find_table("AX-12A")
     foreign = rustypot.AxPyController(running.ports["main"], 1_000_000, PATIENCE_S)
     values = {"id": 1, "baud_rate": 1, "cw_angle_limit": 10, "moving_speed": 300, "punch": 40, "led": 1}
     for name, wire in values.items():

@@ -20,7 +20,7 @@ from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, 
 from dxlrun.errors import suggestion
 from dxlrun.features import installed_features, stages
 from dxlwire.bus_plan import Budget, BusPlan
-from dxlwire.control_table import ControlTable, control_table
+from dxlwire.control_table import ControlTable, find_table
 from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.modes import Mode
 from dxlwire.plan.planning import Wiring, bus_plan
@@ -229,7 +229,7 @@ def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
         servos=tuple(
             replace(
                 servo,
-                slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
+                slow=slow_items(find_table(servo.model, plan.protocol)) if items is None else items,
                 torque_on_return=policies.of_joint("on_returned_servo", joints[servo.own_name]) == "hold",
                 torque_at_start=file.robot.joints[joints[servo.own_name]].torque,
             )
@@ -283,7 +283,7 @@ def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
 
 def _slow_period_ns(file: RobotFile, plan: BusPlan) -> int:
     slow = file.robot.buses[plan.name].slow_registers
-    tables = [control_table(servo.model, plan.protocol).items for servo in plan.servos]
+    tables = [find_table(servo.model, plan.protocol).items for servo in plan.servos]
     known = tuple(dict.fromkeys(name for items in tables for name in items))
     for index, name in enumerate(slow.items or ()):
         if name not in known:

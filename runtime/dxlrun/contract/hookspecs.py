@@ -84,7 +84,7 @@ class HookSpecs:
         """Return control tables of servos and of other devices that dxlrun does not know.
 
         Each is a TOML text, or the path of a file, in the form of dxlrun's own files
-        (dynamixel/control_table/tables/protocol1, tables/devices), without `extends`; one that describes a
+        (dxlwire/control_table/tables/protocol1, tables/devices), without `extends`; one that describes a
         device has `kind = "device"`. The robot file then names the model. A name or a model number that is
         taken already is an error.
         """

@@ -13,7 +13,7 @@ from dxlsim.servo.node import baud_item, baud_value
 from dxlsim.servo.protocol2_servo import Protocol2Servo
 from dxlsim.servo.simulated_servo import Protocol1Servo, SimulatedServo
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import ControlTable, control_table, models_by_number
+from dxlwire.control_table import ControlTable, find_table, models_by_number
 
 FIRMWARE = {1.0: 24, 2.0: 45}
 """Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""
@@ -54,7 +54,7 @@ def make_servo(
 
 
 def _table(config: ServoConfig, protocol: float) -> ControlTable:
-    table = control_table(config.model, protocol)
+    table = find_table(config.model, protocol)
     if config.firmware is None:
         return table
     return next(iter(models_by_number(table.model_number, protocol, config.firmware)), table)

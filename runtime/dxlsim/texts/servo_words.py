@@ -9,7 +9,7 @@ from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import (
     ControlTable,
     added_control_tables,
-    control_table,
+    find_table,
     perhaps_meant,
     protocols_of,
 )
@@ -44,7 +44,7 @@ def bus_of_servos(
     models = _models(words)
     spoken = _protocol([model for model, _ in models], protocol)
     _check_ids(models, spoken)
-    tables = {model: control_table(model, spoken) for model, _ in models}
+    tables = {model: find_table(model, spoken) for model, _ in models}
     rate = _baud_rate(list(tables.values()), baud_rate)
     servos = [
         ServoConfig(servo_id, tables[model].model, _middle(tables[model]))

@@ -1,6 +1,6 @@
 """Control tables: the places of a servo's control items in its memory, and their units.
 
-`control_table("AX-12A")` is the table of a model, `control_table("MX-28", 2.0)` that of one of its firmwares.
+`find_table("AX-12A")` is the table of a model, `find_table("MX-28", 2.0)` that of one of its firmwares.
 Each model has a data file in `tables/`.
 """
 
@@ -9,7 +9,7 @@ from dxlwire.control_table.hardware_errors import HardwareErrors as HardwareErro
 from dxlwire.control_table.models import add_control_table as add_control_table
 from dxlwire.control_table.models import added_control_tables as added_control_tables
 from dxlwire.control_table.models import all_tables as all_tables
-from dxlwire.control_table.models import control_table as control_table
+from dxlwire.control_table.models import find_table as find_table
 from dxlwire.control_table.models import model_names as model_names
 from dxlwire.control_table.models import models_by_number as models_by_number
 from dxlwire.control_table.models import perhaps_meant as perhaps_meant

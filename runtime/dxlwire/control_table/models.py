@@ -19,7 +19,7 @@ _SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
 _TEXTS: dict[str, str] = {}  # Name -> TOML text of the tables that were added
 
 
-def control_table(model: str, protocol: float | None = None) -> ControlTable:
+def find_table(model: str, protocol: float | None = None) -> ControlTable:
     """Return the control table of a model or of one of its aliases; `understood` has the rules.
 
     MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
@@ -40,10 +40,6 @@ def control_table(model: str, protocol: float | None = None) -> ControlTable:
     if listing is None:  # protocols_of has just found it
         raise LookupError(f"no control table of the model {model!r}")
     return listing.build()
-
-
-find_table = control_table
-"""Name of the function at the face of dxlwire, where `control_table` is the package."""
 
 
 def protocols_of(model: str) -> tuple[float, ...]:
@@ -79,7 +75,7 @@ def _key(name: str) -> str:
 
 
 def model_names(protocol: float | None = None) -> tuple[str, ...]:
-    """Return every name that `control_table` knows (of one protocol if given), aliases too, sorted."""
+    """Return every name that `find_table` knows (of one protocol if given), aliases too, sorted."""
     return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.exchange.arrays import Floats, JointArrays, SourceArrays
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.reports import Reason, ReportSink
@@ -202,6 +202,6 @@ def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:
 
     Velocity Limit (44) of an X servo ends at 1023, Profile Velocity (112) at 32767 (e-Manual XM430-W350).
     """
-    limit = control_table(servo.model, plan.protocol).items.get("velocity_limit")
+    limit = find_table(servo.model, plan.protocol).items.get("velocity_limit")
     ticks = servo.max_speed_tick if limit is None else min(servo.max_speed_tick, limit.maximum)
     return ticks * servo.rad_s_per_tick

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dxlwire.control_table
-from dxlwire.control_table import ControlItem, control_table, model_names, read_control_table
+from dxlwire.control_table import ControlItem, find_table, model_names, read_control_table
 
-AX = control_table("AX-12A")
+AX = find_table("AX-12A")
 AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables" / "protocol1" / "AX-12A.toml").read_text(
     "utf-8"
 )
@@ -47,13 +47,13 @@ def test_speed_at_the_highest_tick_is_what_the_manual_prints() -> None:
 def test_the_aliases_name_the_same_table() -> None:
     assert model_names() == tuple(sorted(model_names()))
     assert {"AX-12", "AX-12+", "AX-12A"} <= set(model_names())
-    assert control_table("AX-12") is AX
-    assert control_table("AX-12+").model == "AX-12A"
+    assert find_table("AX-12") is AX
+    assert find_table("AX-12+").model == "AX-12A"
 
 
 def test_an_unknown_model_is_named_with_those_that_are_known() -> None:
     with pytest.raises(LookupError, match=r"'AX-13'.*AX-12A"):
-        control_table("AX-13")
+        find_table("AX-13")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import rustypot
 
-from dxlwire.control_table import ControlTable, all_tables, control_table, models_by_number
+from dxlwire.control_table import ControlTable, all_tables, find_table, models_by_number
 
 PRO = {
     "L42-10-S300-R": 35072,
@@ -56,12 +56,12 @@ def _foreign(controller: Any) -> dict[str, tuple[int, int, bool]]:
     "model", ["AX-12A", "AX-12W", "AX-18A", "RX-24F", "RX-28", "RX-64", "DX-113", "DX-117"]
 )
 def test_ax_rx_and_dx_stand_where_a_foreign_list_has_them(model: str, places: Places) -> None:
-    assert places(control_table(model)) == _foreign(rustypot.AxPyController)
+    assert places(find_table(model)) == _foreign(rustypot.AxPyController)
 
 
 @pytest.mark.parametrize("model", ["MX-12W", "MX-28", "MX-64", "MX-106"])
 def test_mx_stands_where_a_foreign_list_has_it(model: str, places: Places) -> None:
-    ours = places(control_table(model, 1.0))
+    ours = places(find_table(model, 1.0))
     foreign = _foreign(rustypot.MxPyController)
     assert foreign.items() <= ours.items()
     assert ours.keys() - foreign.keys() == ONLY_HERE.get(model, set())
@@ -70,11 +70,11 @@ def test_mx_stands_where_a_foreign_list_has_it(model: str, places: Places) -> No
 def test_xl_320_stands_where_a_foreign_list_has_it(places: Places) -> None:
     foreign = _foreign(rustypot.Xl320PyController)
     foreign["registered_instruction"] = foreign.pop("registered")  # the name in the manual's table
-    assert places(control_table("XL-320")) == foreign
+    assert places(find_table("XL-320")) == foreign
 
 
 def test_x430_stands_where_a_foreign_list_has_it(places: Places) -> None:
-    ours = places(control_table("XM430-W350"))
+    ours = places(find_table("XM430-W350"))
     foreign = _foreign(rustypot.Xl430PyController)
     foreign["secondary_shadow_id"] = foreign.pop("secondary_id")
     common = foreign.keys() & ours.keys()
@@ -119,7 +119,7 @@ def test_every_model_of_the_sdk_is_there() -> None:
 def test_models_that_the_sdk_lacks_are_there_by_name_and_number() -> None:
     for model, number in OWN.items():
         (table,) = models_by_number(number, 2.0)
-        assert table is control_table(model)
+        assert table is find_table(model)
         assert table.model == model
         assert f"{number}\t" not in (sdk_files()[0].parent / "dynamixel.model").read_text("utf-8")
 
@@ -128,7 +128,7 @@ def test_models_that_the_sdk_lacks_are_there_by_name_and_number() -> None:
 def test_pro_stands_where_the_maker_s_examples_address_it(model: str, places: Places) -> None:
     # DynamixelSDK 2ded684d, c++/example/protocol2.0: read_write.cpp (PRO_SERIES), indirect_address.cpp;
     # Dynamixel2Arduino, actuator.cpp, pro_r_control_table
-    ours = places(control_table(model))
+    ours = places(find_table(model))
     assert {name: ours[name][0] for name in ("torque_enable", "led_red", "goal_position", "moving")} == {
         "torque_enable": 562,
         "led_red": 563,
@@ -145,7 +145,7 @@ def test_pro_stands_where_the_maker_s_examples_address_it(model: str, places: Pl
 @pytest.mark.parametrize("model", sorted(PRO.keys() - {"L42-10-S300-R", "RH-P12-RN"}))
 def test_pro_counts_its_speed_in_turns_of_the_motor_a_minute(model: str) -> None:
     # e-Manual, Goal Velocity(600): 1 is one turn a minute before the gear; Specifications, Gear Ratio
-    table = control_table(model)
+    table = find_table(model)
     for name in ("goal_velocity", "present_velocity", "velocity_limit", "moving_threshold"):
         assert table.items[name].scale == pytest.approx(math.tau / 60 / table.gear_ratio, rel=3e-4), name
 
@@ -160,7 +160,7 @@ def test_pro_counts_its_speed_in_turns_of_the_motor_a_minute(model: str) -> None
     ],
 )
 def test_a_model_with_ball_bearings_is_the_one_without(model: str, same: str) -> None:
-    assert control_table(model) is control_table(same)
+    assert find_table(model) is find_table(same)
 
 
 @pytest.mark.parametrize(
@@ -222,8 +222,8 @@ def _table_of(path: Path) -> ControlTable:
     """Return the table of an SDK file; of two by firmware, the newer one has the plain name."""
     name = re.sub("-RA$", "-R(A)", path.stem.removesuffix("_fw52").upper().replace("_", "-"))
     if path.stem.endswith("_fw52") or not path.with_name(f"{path.stem}_fw52.model").exists():
-        return control_table({"RH-P12-RN": "RH-P12-RN(A)", "XL320": "XL-320"}.get(name, name), 2.0)
-    return control_table(f"{name}-FW51", 2.0)
+        return find_table({"RH-P12-RN": "RH-P12-RN(A)", "XL320": "XL-320"}.get(name, name), 2.0)
+    return find_table(f"{name}-FW51", 2.0)
 
 
 @pytest.mark.parametrize("fact", OMITTED)
@@ -260,7 +260,7 @@ def test_what_the_manual_does_not_confirm_is_not_taken_over(patterns: tuple[str,
 @pytest.mark.parametrize("model", ["MX-28", "MX-64", "MX-106"])
 def test_mx_of_protocol_2_has_no_startup_configuration_in_any_source(model: str) -> None:
     # e-Manual, MX-28(2.0) to MX-106(2.0); dynamixel-workbench, items_MX2 and items_EXTMX2; the SDK's files
-    assert not {"startup_configuration", "backup_ready"} & control_table(model, 2.0).items.keys()
+    assert not {"startup_configuration", "backup_ready"} & find_table(model, 2.0).items.keys()
 
 
 def test_the_sdk_is_still_wrong_about_what_we_correct() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import dxlwire.control_table.models
-from dxlwire.control_table import add_control_table, control_table, model_names, models_by_number
+from dxlwire.control_table import add_control_table, find_table, model_names, models_by_number
 from dxlwire.control_table.sources import resolve
 
 MINE = {'model = "AX-12A"': 'model = "Mine-1"', 'aliases = ["AX-12", "AX-12+"]': "aliases = []"}
@@ -27,11 +27,11 @@ def mine(data_files: Path) -> str:
 
 
 def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
-    assert control_table("MX-28", 1.0).model_number == 29
-    assert control_table("MX-28", 2.0).model_number == 30
-    assert control_table("MX-28(2.0)").model_number == 30
+    assert find_table("MX-28", 1.0).model_number == 29
+    assert find_table("MX-28", 2.0).model_number == 30
+    assert find_table("MX-28(2.0)").model_number == 30
     with pytest.raises(LookupError, match=r"Protocol 1\.0 and with Protocol 2\.0: say which"):
-        control_table("MX-28")
+        find_table("MX-28")
 
 
 @pytest.mark.parametrize(
@@ -51,20 +51,20 @@ def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
     ],
 )
 def test_names_that_mean_one_model_are_understood(name: str, model: str) -> None:
-    assert control_table(name).model == model
+    assert find_table(name).model == model
 
 
 @pytest.mark.parametrize("name", ["XM430", "XL330", "XL", "XL-3", "AX", "XL430-W250-B", "T", "-", ""])
 def test_names_that_mean_several_models_or_none_are_not(name: str) -> None:
     with pytest.raises(LookupError, match="no control table of the model"):
-        control_table(name)
+        find_table(name)
 
 
 def test_a_protocol_that_a_model_does_not_speak_is_named() -> None:
     with pytest.raises(LookupError, match=r"AX-12A speaks Protocol 1\.0, not Protocol 2\.0"):
-        control_table("AX-12A", 2.0)
+        find_table("AX-12A", 2.0)
     with pytest.raises(LookupError, match="no control table of the model 'AX-12B'"):
-        control_table("AX-12B", 1.0)
+        find_table("AX-12B", 1.0)
 
 
 def test_names_by_protocol_are_all_names() -> None:
@@ -77,7 +77,7 @@ def test_names_by_protocol_are_all_names() -> None:
 @pytest.mark.usefixtures("forgotten")
 def test_a_table_of_a_plug_in_is_found_by_name_and_number(mine: str) -> None:
     table = add_control_table(mine)
-    assert control_table("Mine-1") is table
+    assert find_table("Mine-1") is table
     assert models_by_number(60001, 1.0) == (table,)
     assert "Mine-1" in model_names()
     assert add_control_table(mine) == table, "the same table twice is no contradiction"

@@ -12,7 +12,7 @@ from dxlwire.control_table import (
     CAPABILITIES,
     ControlTable,
     all_tables,
-    control_table,
+    find_table,
     models_by_number,
 )
 
@@ -141,9 +141,7 @@ def test_only_mx_has_bulk_read_in_protocol_1(table: ControlTable) -> None:
     ],
 )
 def test_degrees_a_tick(model: str, protocol: float, degrees: float, ticks: int) -> None:
-    assert math.degrees(control_table(model, protocol).rad_per_tick) == pytest.approx(
-        degrees / ticks, rel=1e-8
-    )
+    assert math.degrees(find_table(model, protocol).rad_per_tick) == pytest.approx(degrees / ticks, rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -175,11 +173,11 @@ def test_degrees_a_tick(model: str, protocol: float, degrees: float, ticks: int)
 def test_units_by_examples_of_the_manual(
     model: str, protocol: float, item: str, tick: int, si: float
 ) -> None:
-    assert control_table(model, protocol).items[item].scale * tick == pytest.approx(si, rel=1e-3)
+    assert find_table(model, protocol).items[item].scale * tick == pytest.approx(si, rel=1e-3)
 
 
 def test_the_block_of_an_x_servo_is_that_of_the_manual() -> None:
-    table = control_table("XM430-W350")
+    table = find_table("XM430-W350")
     assert (table.effort_item, table.present_speed_item) == ("present_current", "present_velocity")
     assert [table.items[name].address for name in (table.effort_item, table.present_speed_item)] == [126, 128]
     assert table.items["present_position"].address == 132
@@ -190,16 +188,16 @@ def test_the_block_of_an_x_servo_is_that_of_the_manual() -> None:
 
 
 def test_indirect_items_are_numbered_through_both_blocks() -> None:
-    items = control_table("XM430-W350").items
+    items = find_table("XM430-W350").items
     assert [items[f"indirect_address_{number}"].address for number in (1, 28, 29, 56)] == [168, 222, 578, 632]
     assert [items[f"indirect_data_{number}"].address for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
     assert [items[f"indirect_address_{number}"].initial for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
-    last = control_table("PH54-200-S500").items["indirect_address_128"]
+    last = find_table("PH54-200-S500").items["indirect_address_128"]
     assert (last.address, last.initial, last.area) == (422, 761, "EEPROM")
 
 
 def test_present_position_may_leave_the_turn_but_the_goal_may_not() -> None:
-    items = control_table("XM430-W350").items
+    items = find_table("XM430-W350").items
     assert items["present_position"].minimum == -(2**31)
     assert (items["goal_position"].minimum, items["goal_position"].maximum) == (0, 4095)
 
@@ -253,7 +251,7 @@ def test_the_gear_is_the_one_in_the_name(table: ControlTable) -> None:
 def test_the_motor_is_that_of_the_specifications(
     model: str, protocol: float, gear: float, amperes: float, volts: float
 ) -> None:
-    table = control_table(model, protocol)
+    table = find_table(model, protocol)
     assert (table.gear_ratio, table.stall_current, table.nominal_voltage) == (gear, amperes, volts)
 
 
@@ -268,7 +266,7 @@ def test_the_motor_is_that_of_the_specifications(
     ],
 )
 def test_factory_values_of_the_430s_without_current(model: str, initial: tuple[int, ...]) -> None:
-    items = control_table(model).items
+    items = find_table(model).items
     names = ("max_voltage_limit", "velocity_limit", "velocity_i_gain", "position_d_gain", "position_p_gain")
     assert tuple(items[name].initial for name in names) == initial
     assert items["min_voltage_limit"].maximum == items["max_voltage_limit"].maximum == initial[0]
@@ -276,7 +274,7 @@ def test_factory_values_of_the_430s_without_current(model: str, initial: tuple[i
 
 @pytest.mark.parametrize("model", ["H42-20-S300-R", "H54-200-S500-R", "M42-10-S260-R", "L54-50-S500-R"])
 def test_the_first_pro_takes_the_ranges_of_its_pages(model: str) -> None:
-    table = control_table(model, 2.0)
+    table = find_table(model, 2.0)
     assert (table.items["baud_rate"].maximum, table.items["return_delay_time"].maximum) == (13, 255)
     assert max(table.baud_rates) == 8  # the page gives no rate for 9 to 13
     assert table.items["goal_position"].maximum == table.items["max_position_limit"].initial  # half a turn

@@ -28,7 +28,7 @@ from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import Identified, KnownLoad, identified
 from dxlrun_lab.identify.servo import Servo
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 
 RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "0")
@@ -85,7 +85,7 @@ def test_an_mx_64_with_published_parameters():
     rate = 200
     parts = excitation(Room(-0.6, 0.6), 14.0, 1 / rate, start=0.0)
     cycles = moved(np.concatenate([part.goals for part in parts]), rate)
-    found = result_of(cycles, Servo("elbow", control_table("MX-64", 1.0), math.pi, 1))
+    found = result_of(cycles, Servo("elbow", find_table("MX-64", 1.0), math.pi, 1))
     assert (found.scale, found.friction_model) == ("load", "m1")
     assert found.motor.load.gravity == pytest.approx(MASS * G * LENGTH)
     damping = KT**2 / RESISTANCE
@@ -124,7 +124,7 @@ def recording(files: Sequence[Path], p_gain: int) -> NDArray[np.void]:
 @pytest.mark.skipif(RECORDINGS == "0", reason="the recordings: DXLRUN_BAM_RECORDINGS")
 @pytest.mark.parametrize("p_gain", [100, 200, 400])
 def test_the_recordings_of_a_real_xl330(p_gain):
-    table = dataclasses.replace(control_table("XL330-M288", 2.0), effort_unit="1")
+    table = dataclasses.replace(find_table("XL330-M288", 2.0), effort_unit="1")
     servo = Servo("elbow", table, 0.0, 1, {"position_p_gain": p_gain})
     found = result_of(recording(sorted(Path(RECORDINGS).glob("*.json")), p_gain), servo)
     half = found.uncertainty

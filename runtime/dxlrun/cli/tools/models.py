@@ -72,7 +72,7 @@ def models(
 
 def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable], list[DeviceTable]]:
     """Return the tables that were requested, of servos and devices; raises InputError when there is none."""
-    from dxlwire.control_table import all_tables, control_table, perhaps_meant, protocols_of
+    from dxlwire.control_table import all_tables, find_table, perhaps_meant, protocols_of
     from dxlwire.control_table.devices import device_table, device_tables, perhaps_meant_device
 
     if protocol not in (None, 1.0, 2.0):
@@ -81,7 +81,7 @@ def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable
         servos = [table for table in all_tables() if protocol in (None, table.protocol)]
         return servos, [table for table in device_tables() if protocol in (None, table.protocol)]
     chosen = [each for each in (1.0, 2.0) if protocol in (None, each)]
-    found = [control_table(name, each) for each in protocols_of(name) if each in chosen]
+    found = [find_table(name, each) for each in protocols_of(name) if each in chosen]
     if not found:
         with suppress(LookupError):
             return [], [device_table(name, protocol)]

@@ -308,9 +308,9 @@ def _robot_name(stem: str) -> str:
 
 
 def _joint(servo: FoundServo, velocity: int) -> list[str]:
-    from dxlwire.control_table import control_table
+    from dxlwire.control_table import find_table
 
-    table = control_table(servo.model, servo.protocol)
+    table = find_table(servo.model, servo.protocol)
     reference = _middle(table)
     entries = [
         f"bus: main, id: {servo.servo_id}, model: {servo.model}, reference: {reference} deg, direction: 1"

@@ -19,7 +19,7 @@ from dxlrun.errors import Mark, suggestion
 from dxlrun.features import installed_features, stages
 from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import BusPlan, RegisterValue
-from dxlwire.control_table import ControlTable, control_table, perhaps_meant, protocols_of
+from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans
 
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # The model that is assumed where none is known, by protocol
@@ -202,7 +202,7 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
     bus = file.robot.buses.get(servo.bus)
     protocol = None if bus is None else bus.protocol
     try:
-        return control_table(model, protocol)
+        return find_table(model, protocol)
     except LookupError:
         protocols = protocols_of(model)
     if not protocols:
@@ -214,7 +214,7 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
             f"{model} of {name} speaks Protocol {protocols[0]}, bus {servo.bus} Protocol {bus.protocol}",
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
-    return control_table(model, protocols[0])
+    return find_table(model, protocols[0])
 
 
 def _one_table(model: str) -> bool:

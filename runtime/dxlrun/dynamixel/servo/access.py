@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import ControlItem, ControlTable, Table, control_table, decoded, side_by_side
+from dxlwire.control_table import ControlItem, ControlTable, Table, decoded, find_table, side_by_side
 from dxlwire.plan.line import MOST_SPARE, Line
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
@@ -193,7 +193,7 @@ class Access(ItemAccess):
     @property
     def table(self) -> ControlTable:
         """Its control table."""
-        return control_table(self.servo.model, self.plan.protocol)
+        return find_table(self.servo.model, self.plan.protocol)
 
     def spare(self, end: int) -> int:
         """Return how many bytes behind an end can be read too."""
@@ -210,7 +210,7 @@ class Access(ItemAccess):
 
 @lru_cache
 def _spare(model: str, protocol: float, end: int) -> int:
-    return control_table(model, protocol).spare(end, MOST_SPARE)
+    return find_table(model, protocol).spare(end, MOST_SPARE)
 
 
 def reach(plan: BusPlan, servo: ServoPlan) -> Access:

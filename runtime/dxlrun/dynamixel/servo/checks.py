@@ -25,8 +25,8 @@ from dxlwire.control_table import (
     ControlItem,
     FoundDeviation,
     HardwareErrors,
-    control_table,
     find_deviations,
+    find_table,
 )
 from dxlwire.modes import Mode
 from dxlwire.plan.line import listen
@@ -284,7 +284,7 @@ def deviations(
 @functools.cache
 def _inspected(model: str, protocol: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the items of a model that decide about a start, and those that only may differ."""
-    items = control_table(model, protocol).items
+    items = find_table(model, protocol).items
     essential = {check.item for check in CHECKS} | _MODES
     optional = set[str]()
     for item in items.values():

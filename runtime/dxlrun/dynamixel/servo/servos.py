@@ -24,7 +24,7 @@ from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.errors import counted
 from dxlrun.plan.loop_plan import ServoLimit
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.exchange.cyclic_reads import CyclicReads
 from dxlwire.exchange.goals import GoalArrays
 from dxlwire.exchange.idle import IdleScheduler
@@ -61,7 +61,7 @@ class Servos:
         self._events = events
         self._samples = samples
         self._shown = states.hardware_error  # of the robot: the model's error item, or the error byte of 1.0
-        self._hardware_errors = [control_table(servo.model, plan.protocol).errors for servo in plan.servos]
+        self._hardware_errors = [find_table(servo.model, plan.protocol).errors for servo in plan.servos]
         self._rows = [servo.row for servo in plan.servos]
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count

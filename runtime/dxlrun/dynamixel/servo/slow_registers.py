@@ -7,7 +7,7 @@ from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlwire.bus_plan import SLOW_STATES, BusPlan
-from dxlwire.control_table import ControlItem, control_table, decoded, side_by_side
+from dxlwire.control_table import ControlItem, decoded, find_table, side_by_side
 from dxlwire.exchange.bus import NEVER
 from dxlwire.exchange.idle import Urgency
 from dxlwire.transaction import Program
@@ -116,7 +116,7 @@ def _round(plan: BusPlan) -> list[tuple[int, _Block]]:
         return []
     found: list[tuple[int, int, _Block]] = []
     for index, servo in enumerate(plan.servos):
-        items = control_table(servo.model, plan.protocol).items
+        items = find_table(servo.model, plan.protocol).items
         blocks = [*side_by_side(items[name] for name in servo.slow if name in items)]
         if "realtime_tick" in items:
             blocks.append(())

@@ -27,7 +27,7 @@ from dxlrun.errors import PortError, StartUpError
 from dxlrun.features import stages
 from dxlrun.features.feature import Feature
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import control_table
+from dxlwire.control_table import find_table
 from dxlwire.exchange.bus import Lines
 from dxlwire.modes import Mode
 from dxlwire.plan.line import TIMEOUT_MARGIN_NS, listen
@@ -271,7 +271,7 @@ def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
     old: list[str] = []
     needed: set[int] = set()
     for servo in servos:
-        first = control_table(servo.model, plan.protocol).fast_sync_read_firmware
+        first = find_table(servo.model, plan.protocol).fast_sync_read_firmware
         found = yield from first_reach(plan, servo).read_one("firmware_version")
         if first is not None and found is not None and found < first:
             old.append(f"{plan.label(servo)} has {found}")

@@ -13,7 +13,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.registers import tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import ControlItem, control_table
+from dxlwire.control_table import ControlItem, find_table
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import dialect_of, sync_writes
 
@@ -129,7 +129,7 @@ def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
 
 def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
     """Return the item of a servo's watchdog, None where the model has none."""
-    return control_table(servo.model, plan.protocol).items.get("bus_watchdog")
+    return find_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 
 def _write(one: Access, ticks: int) -> Program[str]:

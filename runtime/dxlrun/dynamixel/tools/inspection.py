@@ -22,7 +22,7 @@ from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.clock import Clock, MonotonicClock
-from dxlwire.control_table import ControlTable, FoundDeviation, control_table, models_by_number
+from dxlwire.control_table import ControlTable, FoundDeviation, find_table, models_by_number
 from dxlwire.exchange.bus import Lines
 from dxlwire.packets import PacketSink
 from dxlwire.plan.line import listen
@@ -154,7 +154,7 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
             continue
         if not (yield from inspect(one, survey, take_over=True)):
             continue
-        table = control_table(servo.model, plan.protocol)
+        table = find_table(servo.model, plan.protocol)
         for each in (yield from compare(one, stored_registers(table, plan, servo))):
             title = table.items[each.register.name].title
             if each.found is None:
@@ -242,7 +242,7 @@ def _deviation(joint: str, servo: str, one: FoundDeviation) -> DeviationRow:
 
 def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:
     register = one.register
-    item = control_table(servo.model, plan.protocol).items[register.name]
+    item = find_table(servo.model, plan.protocol).items[register.name]
     action = "write" if one.differs else "nothing"
     return RegisterRow(servo.joint, item.name, item.address, item.area, register.value, one.found, action)
 

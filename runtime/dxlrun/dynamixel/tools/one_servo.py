@@ -26,7 +26,7 @@ from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import (
     ControlTable,
     FoundDeviation,
-    control_table,
+    find_table,
 )
 from dxlwire.modes import Mode
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen
@@ -68,7 +68,7 @@ class OneServo(OneNode):
     def __init__(self, tool: ToolLine, found: FoundServo) -> None:
         if not found.model or found.garbled:
             raise ServoFault(f"ID {found.servo_id} at {found.baud_rate} bit/s {'; '.join(found.remarks)}")
-        super().__init__(tool, found, control_table(found.model, found.protocol))
+        super().__init__(tool, found, find_table(found.model, found.protocol))
         self.move_to(found.servo_id, found.baud_rate)
 
     def move_to(self, servo_id: int, baud_rate: int) -> None:

@@ -20,7 +20,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.preparation import refused
 from dxlwire.bus_plan import ServoPlan
-from dxlwire.control_table import ControlTable, control_table
+from dxlwire.control_table import ControlTable, find_table
 from dxlwire.modes import Mode
 
 _LONGEST = 80
@@ -71,7 +71,7 @@ def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
 def effort_units(plan: Plan) -> dict[str, str]:
     """Return the unit in which each joint's servos measure effort; empty: the fraction of their maximum."""
     return {
-        joint: servo.unit.effort_unit(control_table(servo.model, bus.protocol).effort_unit).replace("1", "")
+        joint: servo.unit.effort_unit(find_table(servo.model, bus.protocol).effort_unit).replace("1", "")
         for joint, servos in plan.servos_by_joint.items()
         for bus, servo in servos[:1]
     }
@@ -111,7 +111,7 @@ def require_reboots(plan: Plan, joints: tuple[str, ...]) -> None:
         for label, bus, servo in {
             servo.row: (bus.label(servo), bus, servo) for joint in joints for bus, servo in servos[joint]
         }.values()
-        if "reboot" not in control_table(servo.model, bus.protocol).capabilities
+        if "reboot" not in find_table(servo.model, bus.protocol).capabilities
     ]
     if cannot:
         verb = "knows" if len(cannot) == 1 else "know"
@@ -189,4 +189,4 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
         names = ", ".join(each.own_name for _, each in mine)
         problem = f"{name} has servos of several models ({', '.join(models)}); name one of them: {names}"
         raise refused(Code.INVALID, {"problem": problem})
-    return servo, control_table(servo.model, bus.protocol), fields
+    return servo, find_table(servo.model, bus.protocol), fields
