@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar, cast
 
 import msgspec
 
@@ -26,7 +27,7 @@ from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
-from dxlrun_analysis.joints.health import Extremes, ServoHealth
+from dxlrun_analysis.joints.health import ServoHealth
 from dxlrun_analysis.joints.tracking import JointTracking, Tracking
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
@@ -74,7 +75,6 @@ class RunTotals:
     gaps: int = 0  # Records that the recorder did not get
     damage: tuple[str, ...] = ()
     tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
-    extremes: tuple[Extremes, ...] = ()
     conduct: Conduct = NO_CONDUCT
     findings: tuple[Finding, ...] = ()  # What the accumulators of each room found by rules of their own
 
@@ -107,27 +107,43 @@ class RunTotals:
         return next((servo.bus for servo in self.servos if servo.subject == subject), next(movers, subject))
 
 
+class Collector(Protocol):
+    """Collects something of a log, slice by slice."""
+
+    def take(self, log: Log) -> None:
+        """Take the next slice."""
+
+
+C = TypeVar("C", bound=Collector)
+
+
 class Tally:
     """Counts a log, whole or slice by slice, in memory that does not grow with it."""
 
-    def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
-        """`watch` is called with all exchanges, too."""
-        self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic(watch)
-        self._health, self._tracking = ServoHealth(), Tracking()
-        self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
+    def __init__(
+        self, watch: Callable[[Exchanges], None] = lambda _: None, others: Iterable[type[Collector]] = ()
+    ) -> None:
+        """`watch` is called with all exchanges, too; one of each of `others` gets the slices."""
+        own = (
+            *(Punctuality(), CycleCauses(), Traffic(watch), ServoHealth()),
+            *(Tracking(), SteeringHistory(), ConductHistory(), Sensors()),
+        )
+        self._collectors: dict[type[Collector], Collector] = {type(each): each for each in own}
+        self._collectors |= {kind: kind() for kind in others}
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
         self._granted = False
         self._unread = 0
         self._wait = SimulationWait()
 
+    def of(self, kind: type[C]) -> C:
+        """Return the collector of a class."""
+        return cast("C", self._collectors[kind])
+
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
-        for take in (
-            *(self._punctuality.take, self._causes.take, self._traffic.take, self._health.take),
-            *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
-        ):
-            take(log)
+        for collector in self._collectors.values():
+            collector.take(log)
         for event in log.events:
             self._events.add(event)
             with suppress(*UNREADABLE):
@@ -145,20 +161,21 @@ class Tally:
 
     def totals(self, log: Log) -> RunTotals:
         """Return the totals of all slices; `log`: the metadata of the file, which come last."""
-        account, late = self._punctuality.finish()
-        servos, buses = self._traffic.finish()
-        acts, pauses = self._steering.finish()
-        tracking = self._tracking.finish(log)
-        conduct = self._conduct.finish()
-        movement = tuple(self._tracking.movement.findings(conduct.goals.allowed))
+        punctuality, traffic = self.of(Punctuality), self.of(Traffic)
+        account, late = punctuality.finish()
+        servos, buses = traffic.finish()
+        acts, pauses = self.of(SteeringHistory).finish()
+        tracking = self.of(Tracking).finish(log)
+        conduct = self.of(ConductHistory).finish()
+        movement = tuple(self.of(Tracking).movement.findings(conduct.goals.allowed))
         gaps = self._unread
         with suppress(KeyError, ValueError):
             gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
         return RunTotals(
             periods=account,
             latency=late,
-            slowest=self._punctuality.slowest,
-            causes=self._causes.finish(),
+            slowest=punctuality.slowest,
+            causes=self.of(CycleCauses).finish(),
             virtual=on_virtual_time(log),
             plan=plan_of(log),
             real_time=_real_time(log, granted=self._granted),
@@ -175,13 +192,12 @@ class Tally:
             gaps=gaps,
             damage=log.damage,
             findings=(
-                *self._traffic.findings,
+                *traffic.findings,
                 *movement,
-                *self._health.findings(movement),
-                *self._sensors.findings(),
+                *self.of(ServoHealth).findings(movement),
+                *self.of(Sensors).findings(),
             ),
             tracking=tracking,
-            extremes=self._health.extremes(),
             conduct=conduct,
         )
 

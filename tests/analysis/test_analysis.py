@@ -21,7 +21,10 @@ from dxlrun.output.json import json_text
 from dxlrun.output.table import microseconds
 from dxlrun.output.terminal import show
 from dxlrun_analysis.cycles.latency import Durations, Punctuality
-from dxlrun_analysis.report import Report, analyze_log, parts, tables
+from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
+from dxlrun_analysis.parts.history import EVENTS
+from dxlrun_analysis.parts.part import Report
+from dxlrun_analysis.report import analyze_log, parts, tables
 from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
@@ -62,7 +65,7 @@ def test_a_good_run_is_good(write: Make) -> None:
 
 def test_the_wake_up_latency_is_that_of_the_records(write: Make) -> None:
     late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
-    latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).latency
+    latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).totals.latency
     assert latency is not None
     mean = sum(late) / 8
     assert latency.max_us == 20_001
@@ -81,10 +84,10 @@ def test_percentiles_of_wake_ups_are_values_that_occurred(write: Make) -> None:
     late = [(number * 7919) % 2003 for number in range(2000)]
     report = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)]))
     expected = [sorted(late)[rank - 1] for rank in (1980, 1998)]
-    assert report.latency is not None
-    assert [report.latency.p99_us, report.latency.p999_us] == expected
-    assert report.latency.median_us == median(late)
-    rows = {str(row[0].text): row[1].text for row in tables(report)["loop"].rows}
+    assert report.totals.latency is not None
+    assert [report.totals.latency.p99_us, report.totals.latency.p999_us] == expected
+    assert report.totals.latency.median_us == median(late)
+    rows = {str(row[0].text): row[1].text for row in tables(report)["periods"].rows}
     assert [rows[name] for name in ("  99 %", "  99.9 %")] == [microseconds(us) for us in expected]
 
 
@@ -93,20 +96,24 @@ def test_the_steps_take_the_times_of_the_records(write: Make) -> None:
         Cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
     ]
     report = analyze_log(write(cycles))
-    steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in report.steps}
+    steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in STEPS.of(report)}
     assert steps["read"] == pytest.approx((5050, 5099, 5100))
     assert steps["update"] == pytest.approx((100, 100, 100))
     assert steps["write"] == pytest.approx((250, 299, 300))
     assert steps["cycle"] == pytest.approx((5400, 5400, 5400))
-    head, idle = report.controllers
+    head, idle = CONTROLLERS.of(report)
     assert (head.name, head.cycles, head.max_us) == ("head", 101, 50)
     assert (idle.name, idle.cycles) == ("idle", 0)
 
 
 def test_periods_that_were_skipped_are_accounted_for(write: Make) -> None:
     report = analyze_log(write([Cycle(0), Cycle(1), Cycle(22, skipped=20), Cycle(23)]))
-    assert (report.periods.elapsed, report.periods.records, report.periods.skipped) == (24, 4, 20)
-    assert (report.periods.missing, report.periods.agree) == (0, True)
+    assert (report.totals.periods.elapsed, report.totals.periods.records, report.totals.periods.skipped) == (
+        24,
+        4,
+        20,
+    )
+    assert (report.totals.periods.missing, report.totals.periods.agree) == (0, True)
     assert not report.verdict.good
     assert (
         "did not keep 50 Hz: 20 of 24 periods skipped (83.33%; 10 tolerated in a short run)"
@@ -121,7 +128,7 @@ def test_periods_that_were_skipped_are_accounted_for(write: Make) -> None:
 )
 def test_periods_that_vanished_are_reported(write: Make, numbers: list[tuple[int, int]]) -> None:
     report = analyze_log(write([Cycle(number, skipped=skipped) for number, skipped in numbers]))
-    assert not report.periods.agree
+    assert not report.totals.periods.agree
     assert not report.verdict.good
     assert any("neither recorded nor declared skipped" in one for one in report.verdict.sentences)
 
@@ -136,7 +143,7 @@ def test_a_servo_that_was_silent_is_named(write: Make) -> None:
         Wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
     ]
     report = analyze_log(write([Cycle(0)], packets))
-    elbow, head = report.servos
+    elbow, head = report.totals.servos
     assert (elbow.servo_id, elbow.joint, elbow.asked, elbow.lost, elbow.replies) == (
         5,
         "left_elbow_joint",
@@ -146,7 +153,7 @@ def test_a_servo_that_was_silent_is_named(write: Make) -> None:
     )
     assert (elbow.reply_median_us, elbow.reply_max_us) == (640, 640)
     assert (head.servo_id, head.joint, head.asked, head.lost, head.replies) == (21, "head_yaw_joint", 2, 2, 0)
-    (bus,) = report.buses
+    (bus,) = report.totals.buses
     assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (5, 2, 1, 3)
     assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 2 * 5, len(ANSWER) + 3)
     assert report.verdict.sentences[2] == (
@@ -158,21 +165,21 @@ def test_a_servo_that_was_silent_is_named(write: Make) -> None:
 def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make) -> None:
     packets = [Wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), Wire(PacketKind.STATUS, 5, 500, ANSWER)]
     packets.append(Wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
-    elbow, head = analyze_log(write([], packets)).servos
+    elbow, head = analyze_log(write([], packets)).totals.servos
     assert (elbow.replies, elbow.lost) == (1, 0)
     assert head.lost == 1
 
 
 def test_packets_of_two_rings_are_paired_by_time(write: Make) -> None:
     packets = [*asked_and_answered(20_000), *asked_and_answered(0)]
-    (servo,) = analyze_log(write([], [packets[0], packets[2], packets[1], packets[3]])).servos
+    (servo,) = analyze_log(write([], [packets[0], packets[2], packets[1], packets[3]])).totals.servos
     assert (servo.asked, servo.lost, servo.reply_max_us) == (2, 0, 640)
 
 
 def test_error_bits_are_named(write: Make) -> None:
     packets = [*asked_and_answered(0), *asked_and_answered(20_000, error=0x24)]
     report = analyze_log(write([Cycle(0)], packets))
-    assert report.servos[0].error_names == ("overheating", "overload")
+    assert report.totals.servos[0].error_names == ("overheating", "overload")
     assert (
         "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 reply."
         in report.verdict.sentences
@@ -187,7 +194,7 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
         Cycle(2, position=9.9, goal=0.7, valid=False),
         Cycle(3, position=0.9, goal=0.0),
     ]
-    elbow, head = analyze_log(write(cycles)).joints
+    elbow, head = analyze_log(write(cycles)).totals.tracking
     assert elbow.rms_rad == pytest.approx(((0.1**2 + 0.2**2) / 2) ** 0.5)
     assert elbow.worst_rad == pytest.approx(0.2)
     assert (elbow.invalid, elbow.oldest_ms, elbow.clamped) == (1, 20.0, 1)
@@ -210,13 +217,13 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
         Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
     ]
     report = analyze_log(write([Cycle(0)], events=events, gaps=17, close=False))
-    assert (report.gaps, report.complete) == (17, False)
+    assert (report.totals.gaps, report.about.complete) == (17, False)
     assert not report.verdict.good
     assert report.verdict.sentences[1] == "One error was logged; the first, of head: ValueError: no"
     assert "no end" in report.verdict.sentences[2]
     assert "17 records were lost" in report.verdict.sentences[2]
     assert "ValueError: no" in shown(report)
-    assert [(event.name, event.count) for event in report.events] == [
+    assert [(event.name, event.count) for event in EVENTS.of(report)] == [
         ("controller_fault", 1),
         ("recorder_gap", 1),
         ("loop_started", 1),
@@ -225,7 +232,7 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
 
 def test_a_finished_log_with_gaps_counts_them(write: Make) -> None:
     report = analyze_log(write([Cycle(0)], gaps=4))
-    assert (report.gaps, report.complete) == (4, True)
+    assert (report.totals.gaps, report.about.complete) == (4, True)
 
 
 def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
@@ -235,7 +242,7 @@ def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
         "Not good: the loop never ran a cycle.",
         "The loop never ran a cycle.",
     )
-    assert (report.latency, report.steps) == (None, ())
+    assert (report.totals.latency, STEPS.of(report)) == (None, ())
     assert "torso" in shown(report)
 
 
@@ -250,7 +257,7 @@ def test_the_terminal_shows_the_verdict_first_and_every_number_after(write: Make
 
 
 def test_json_carries_the_whole_report(write: Make) -> None:
-    read = json.loads(json_text(analyze_log(write([Cycle(0)]))))
+    read = json.loads(json_text(analyze_log(write([Cycle(0)])).numbers))
     assert read["verdict"]["good"] is True
     assert read["periods"] == {
         "elapsed": 1,

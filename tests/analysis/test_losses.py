@@ -67,7 +67,9 @@ def own(write: Make, wire: Make, packets: list[tuple[PacketKind, int, bytes]]) -
     wires.append(wire(PacketKind.INSTRUCTION, 254, 400 * len(wires), PING_ALL))
     report = analyze_log(write([], wires))
     return {
-        servo.servo_id: (servo.losses.asked, servo.losses.lost) for servo in report.servos if servo.losses
+        servo.servo_id: (servo.losses.asked, servo.losses.lost)
+        for servo in report.totals.servos
+        if servo.losses
     }
 
 

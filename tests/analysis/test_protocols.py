@@ -45,7 +45,7 @@ def test_a_sync_read_asks_each_servo_of_its_list(write: Make, wire: Make) -> Non
         asks(wire, 40_000, PING_ALL),
     ]
     report = analyze_log(write([], packets))
-    first, second = report.servos
+    first, second = report.totals.servos
     assert (first.servo_id, first.asked, first.lost, first.replies, first.instructions) == (1, 2, 0, 2, 0)
     assert (second.servo_id, second.asked, second.lost, second.replies) == (2, 2, 1, 1)
     assert (first.reply_max_us, second.reply_max_us) == (500, 700)
@@ -56,7 +56,7 @@ def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
     blocks = bytes([0, 3, 166, 0, 0, 0, 0x2E, 0x90, 0x80, 7, 1, 0, 0, 0, 0x11, 0x22])
     whole = bytes([0xFF, 0xFF, 0xFD, 0, 0xFE, 1 + len(blocks), 0, 0x55]) + blocks
     packets = [asks(wire, 0, FAST_SYNC_READ), answers(wire, 300, 254, whole), asks(wire, 600, PING_ALL)]
-    third, fourth, seventh = analyze_log(write([], packets)).servos
+    third, fourth, seventh = analyze_log(write([], packets)).totals.servos
     assert (third.asked, third.lost, third.replies, third.errors) == (1, 0, 1, 0)
     assert (seventh.replies, seventh.errors, seventh.error_names) == (1, 1, ("alert",))
     assert (fourth.asked, fourth.lost) == (1, 1)
@@ -65,7 +65,7 @@ def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
 def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire: Make) -> None:
     answer = bytes.fromhex("ffff030400000000f8")
     packets = [asks(wire, 0, BULK_READ_1), answers(wire, 600, 3, answer), asks(wire, 900, BULK_READ_1)]
-    first, second = analyze_log(write([], packets)).servos
+    first, second = analyze_log(write([], packets)).totals.servos
     assert (first.servo_id, first.asked, first.lost, first.replies) == (3, 1, 0, 1)
     assert (second.servo_id, second.asked, second.lost, second.replies) == (7, 1, 1, 0)
 
@@ -73,7 +73,7 @@ def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire
 def test_a_stuffed_list_is_read_as_it_was_meant(write: Make, wire: Make) -> None:
     # a sync read of 253 bytes at address 65535: no table has it, but FF FF FD lies in the list
     stuffed = bytes.fromhex("fffffd00fe0a0082fffffdfd0005cefa")
-    (servo,) = analyze_log(write([], [asks(wire, 0, stuffed), asks(wire, 900, PING_ALL)])).servos
+    (servo,) = analyze_log(write([], [asks(wire, 0, stuffed), asks(wire, 900, PING_ALL)])).totals.servos
     assert (servo.servo_id, servo.asked, servo.lost) == (5, 1, 1)
 
 
@@ -83,13 +83,15 @@ def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Make, wire:
         answers(wire, 10, 1, status(1, 0x84)),
         answers(wire, 20, 2, status(2)),
     ]
-    first, second = analyze_log(write([], packets)).servos
+    first, second = analyze_log(write([], packets)).totals.servos
     assert (first.errors, first.error_names) == (2, ("range", "access", "alert"))
     assert (second.errors, second.error_names) == (0, ())
 
 
 def test_a_broadcast_ping_requests_no_certain_reply(write: Make, wire: Make) -> None:
-    (servo,) = analyze_log(write([], [asks(wire, 0, PING_ALL), answers(wire, 500, 1, status(1))])).servos
+    (servo,) = analyze_log(
+        write([], [asks(wire, 0, PING_ALL), answers(wire, 500, 1, status(1))])
+    ).totals.servos
     assert (servo.asked, servo.lost, servo.replies) == (0, 0, 1)
 
 
@@ -98,9 +100,9 @@ def test_a_read_of_one_servo_by_protocol_2_is_paired(write: Make, wire: Make) ->
     packets = [asks(wire, 0, read, 1), answers(wire, 640, 1, status(1)), asks(wire, 900, read, 1)]
     packets.append(asks(wire, 1900, PING_ALL))
     report = analyze_log(write([], packets))
-    (servo,) = report.servos
+    (servo,) = report.totals.servos
     assert (servo.instructions, servo.asked, servo.lost, servo.reply_max_us) == (2, 2, 1, 640)
-    assert report.buses[0].broadcasts == 1
+    assert report.totals.buses[0].broadcasts == 1
 
 
 @pytest.mark.parametrize(("rounds", "lost"), [(1, 0), (2, 1)])
@@ -109,7 +111,7 @@ def test_what_is_open_where_the_log_ends_is_not_lost(write: Make, wire: Make, ro
     for at in range(0, rounds * 20_000, 20_000):
         packets += [asks(wire, at, SYNC_READ), answers(wire, at + 400, 1, status(1))]
     report = analyze_log(write([], packets))
-    first, second = report.servos
+    first, second = report.totals.servos
     assert (first.asked, first.lost) == (rounds, 0)
     assert (second.asked, second.lost) == (rounds - 1, lost)
     assert ("Replies are missing" in " ".join(report.verdict.sentences)) == bool(lost)

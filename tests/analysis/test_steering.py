@@ -17,7 +17,8 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.cycles.latency import cycle_periods_ns
-from dxlrun_analysis.report import Report, analyze, parts, tables
+from dxlrun_analysis.parts.part import Report
+from dxlrun_analysis.report import analyze, parts, tables
 
 MS = 1_000_000
 ROBOT = """\
@@ -76,7 +77,7 @@ def report(log: Log) -> Report:
 def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
     expected = [20 * MS] * 5 + [10 * MS] * 20 + [20 * MS] * 31
     assert cycle_periods_ns(log).tolist() == expected
-    account = report.periods
+    account = report.totals.periods
     assert (account.elapsed, account.records, account.skipped, account.missing) == (56, 56, 0, 0)
     assert account.agree
     assert account.seconds == pytest.approx(sum(expected) / 1e9)
@@ -113,11 +114,11 @@ def test_the_table_has_each_request_with_its_origin(report: Report) -> None:
         ["55", 'load {"name":', "mallory", rows[-2][-1]],
         ["55", "stop", "anna", "done"],
     ]
-    assert report.steering[1].time_s == pytest.approx(0.2)
+    assert report.totals.acts[1].time_s == pytest.approx(0.2)
 
 
 def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
-    (pause,) = report.pauses
+    (pause,) = report.totals.pauses
     assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
     assert pause.periods == 15
     console = Console(file=io.StringIO(), width=160)
@@ -166,7 +167,7 @@ def test_a_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
 
 
 def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
-    (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).pauses
+    (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).totals.pauses
     assert pause.periods == 11
 
 
@@ -183,5 +184,5 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
 def test_a_run_without_commands_has_no_steering(tmp_path: Path) -> None:
     log = run(tmp_path, {20: []})
     report = analyze(log)
-    assert (report.steering, report.pauses) == ((), ())
+    assert (report.totals.acts, report.totals.pauses) == ((), ())
     assert not any("steered" in sentence for sentence in report.verdict.sentences)

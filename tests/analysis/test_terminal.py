@@ -13,7 +13,8 @@ from tests.kit.made_logs import Cycle, Said, Wire
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show
-from dxlrun_analysis.report import Report, analyze_log, parts
+from dxlrun_analysis.parts.part import Report
+from dxlrun_analysis.report import analyze_log, parts
 from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]

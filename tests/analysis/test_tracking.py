@@ -211,7 +211,7 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     (row,) = tables(report)["joints"].rows
     shown = dict(zip((column.name for column in tables(report)["joints"].columns), row, strict=True))
     assert [shown[name].text for name in ("worst", "lag", "at rest")] == ["1.72", "59 ms", "0.00"]
-    (as_json,) = json.loads(json_text(report))["joints"]
+    (as_json,) = json.loads(json_text(report.numbers))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
     words = "worst 1.72 deg (position minus what was reachable), lag 59 ms, settled after"

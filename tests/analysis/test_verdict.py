@@ -374,7 +374,7 @@ def test_replies_are_compared_with_the_plan(  # noqa: PLR0917  what is written, 
     wire_us = 10 * (len(ASK) + len(ANSWER)) + 500
     plan = {"buses": [PLANNED | {"latency_ns": latency_ms * MS}]}
     report = analyze_log(write([cycle(0)], exchanges(wire, wire_us + extra_us), plan=plan))
-    assert report.buses[0].extra_us == pytest.approx(extra_us)
+    assert report.totals.buses[0].extra_us == pytest.approx(extra_us)
     assert report.verdict.good
     (late,) = [one for one in report.verdict.sentences if one.startswith("Replies on")] or [""]
     assert shown in late
@@ -390,7 +390,7 @@ def test_a_request_that_waits_for_the_line_is_not_late(write: Make, cycle: Make,
         packets.append(wire(PacketKind.INSTRUCTION, 5, at + 10, ASK))
         packets.append(wire(PacketKind.STATUS, 5, at + 5900, ANSWER))
     plan = {"buses": [PLANNED | {"latency_ns": MS}]}
-    extra_us = analyze_log(write([cycle(0)], packets, plan=plan)).buses[0].extra_us
+    extra_us = analyze_log(write([cycle(0)], packets, plan=plan)).totals.buses[0].extra_us
     assert extra_us is not None
     assert extra_us < 500
 
@@ -470,7 +470,7 @@ def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
     said = judge(totals_of(storm))
     assert not said.good
     assert report.verdict == said
-    shown = json.loads(json_text(report))["verdict"]
+    shown = json.loads(json_text(report.numbers))["verdict"]
     assert (shown["good"], tuple(shown["sentences"])) == (said.good, said.sentences)
     _, text = analyzed_page(log)
     assert f"<h1>{said.findings[0].sentence}</h1>" in text

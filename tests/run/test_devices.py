@@ -135,7 +135,7 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen,
     (missing,) = (one for one in found.verdict.sentences if one.startswith("Replies are missing: "))
     assert "device 101 (foot) " in missing
     assert missing.endswith(" of 16 servos and devices answered every time.")
-    servos = {servo.joint: servo for servo in found.servos}
+    servos = {servo.joint: servo for servo in found.totals.servos}
     assert servos["foot"].device
     assert servos["foot"].lost > 0
     assert servos["joint_1"].lost == 0

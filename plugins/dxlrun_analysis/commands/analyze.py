@@ -98,9 +98,9 @@ def analyze(
             write_report(report, text)
     code = 0 if result.verdict.good else 1
     if as_json:
-        show_json(result, code=code, errors=result.verdict.sentences[:code])
+        show_json(result.numbers, code=code, errors=result.verdict.sentences[:code])
         return code
-    show(*analysis.parts(result), *worst_tables(result.causes.worst[:worst]))
+    show(*analysis.parts(result), *worst_tables(result.totals.causes.worst[:worst]))
     if report is not None:
         show(f"\nreport: {report}")
     return code
@@ -183,9 +183,9 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
                 words = line(measured)
             else:
                 report = analyze_log(reader)
-                results.append(report)
+                results.append(report.numbers)
                 words = report.verdict.sentences[0]
-                words = f"being written; so far: {words}" if report.being_written else words
+                words = f"being written; so far: {words}" if report.about.being_written else words
                 if not report.verdict.good:
                     code = max(code, 1)
                     failures.append(f"{log}: {words}")

@@ -21,14 +21,10 @@ from dxlrun_analysis.page.machine import MachineCollector, machine_plots
 from dxlrun_analysis.page.replies import ReplyCollector
 from dxlrun_analysis.page.servos import reply_plots
 from dxlrun_analysis.page.worst import worst_plots
-from dxlrun_analysis.report import (
-    Report,
-    analyze,
-    began,
-    facts,
-    tables,
-    tone_of,
-)
+from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
+from dxlrun_analysis.parts.history import EVENTS, tone_of
+from dxlrun_analysis.parts.part import Report
+from dxlrun_analysis.report import analyze, began, facts, tables
 
 _MOST_EVENTS = 100
 _MARKED = ("switch", "rate", "load", "unload", "policy")
@@ -65,7 +61,7 @@ def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
         _header(report, when, run.canvas.names),
         sections,
         _footer(run.log),
-        report,
+        report.numbers,
         run.canvas.scripts(),
     )
 
@@ -82,7 +78,7 @@ class _Run(NamedTuple):
 
 
 def _drawn(reader: LogReader | Log, report: Report, replies: Curves) -> _Run:
-    curves = CurveCollector(worst.scheduled_ns for worst in report.causes.worst)
+    curves = CurveCollector(worst.scheduled_ns for worst in report.totals.causes.worst)
     events, machine = EventCollector(), MachineCollector()
     for part in reader.slices(packets=False):
         for collector in (curves, events, machine):
@@ -90,13 +86,13 @@ def _drawn(reader: LogReader | Log, report: Report, replies: Curves) -> _Run:
     log = replace(reader.about, cycles=reader.about.cycles[:0], events=events.finish())
     drawn = curves.finish()
     shown = drawn.begin_ns, drawn.end_ns
-    if not report.periods.records and log.events:
+    if not report.totals.periods.records and log.events:
         shown = log.events[0].t_ns, log.events[-1].t_ns
-    changes = [act.time_s for act in report.steering if act.kind in _MARKED and not act.refusal]
+    changes = [act.time_s for act in report.totals.acts if act.kind in _MARKED and not act.refusal]
     canvas = Canvas(
-        report.periods.begin_ns,
+        report.totals.periods.begin_ns,
         *shown,
-        pauses=[(pause.begin_s, pause.end_s) for pause in report.pauses],
+        pauses=[(pause.begin_s, pause.end_s) for pause in report.totals.pauses],
         changes=changes if len(changes) <= _FEW_CHANGES else (),
     )
     return _Run(log, drawn, replies, *machine.finish(), canvas)
@@ -105,7 +101,7 @@ def _drawn(reader: LogReader | Log, report: Report, replies: Curves) -> _Run:
 def _header(report: Report, when: str, plots: Collection[str]) -> Element:
     """Return the verdict, the robot's line first, with links to the plots of this page."""
     first, *others = report.verdict.findings
-    rows = {joint.name: f"joint-{row}" for row, joint in enumerate(report.joints)}
+    rows = {joint.name: f"joint-{row}" for row, joint in enumerate(report.totals.tracking)}
     sentences = []
     for one in others:
         wanted = _plot_of(one.code), rows.get(one.subject, "")
@@ -127,7 +123,7 @@ def _plot_of(code: str) -> str:
 
 def _key_numbers(report: Report) -> list[tuple[str, str]]:
     """Return the numbers that a reader compares between runs."""
-    account, late = report.periods, report.latency
+    account, late = report.totals.periods, report.totals.latency
     numbers = [
         ("rate", account.rates),
         ("lasted", f"{account.seconds:.1f} s"),
@@ -135,37 +131,39 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
     ]
     if late is not None:
         numbers.append(("worst wake-up", microseconds(late.max_us)))
-    if report.steps:
-        numbers.append(("99 % of cycles take", microseconds(report.steps[-1].p99_us)))
-    if report.servos:
-        lost, asked = sum(s.lost for s in report.servos), sum(s.asked for s in report.servos)
+    if STEPS.of(report):
+        numbers.append(("99 % of cycles take", microseconds(STEPS.of(report)[-1].p99_us)))
+    if report.totals.servos:
+        lost, asked = sum(s.lost for s in report.totals.servos), sum(s.asked for s in report.totals.servos)
         numbers.append(("replies lost", f"{lost} of {asked}"))
     return numbers
 
 
 def _sections(run: _Run, report: Report) -> list[Element]:
     """Return the sections in the order of the page; one without a part is left out."""
-    canvas, found = run.canvas, tables(report)
+    canvas, totals = run.canvas, report.totals
 
-    def shown(*names: str) -> list[Element]:
-        return [table_element(found[name]) for name in names if name in found]
+    def shown(section: str) -> list[Element]:
+        return [table_element(table) for table in tables(report, section).values()]
 
     return [
-        section("joints", "Joints", [*shown("joints", "sources"), *_joints(run, report)]),
+        section("joints", "Joints", [*shown("joints"), *_joints(run, report)]),
         section("steering", "Steered from outside", [*shown("steering"), *_marks(canvas)]),
         section("events", "Events", _events(run, report, shown("events"))),
         section(
             "buses",
             "Buses and servos",
-            [*shown("buses", "servos"), *canvas.elements(reply_plots(canvas, run.replies, report.servos))],
+            [*shown("buses"), *canvas.elements(reply_plots(canvas, run.replies, totals.servos))],
         ),
         section(
             "budget",
             "Where the time of a cycle goes",
-            _budget(run, report, shown("steps", "controllers", "causes")),
+            _budget(run, report, shown("budget")),
         ),
-        section("latency", "Wake-up latency", [*shown("loop"), *_latency(run, report)]),
-        section("worst", "The worst cycles", canvas.elements(worst_plots(canvas, report.causes.worst))),
+        section("latency", "Wake-up latency", [*shown("latency"), *_latency(run, report)]),
+        section(
+            "worst", "The worst cycles", canvas.elements(worst_plots(canvas, report.totals.causes.worst))
+        ),
         folded(
             "machine",
             "The machine and all versions",
@@ -178,12 +176,12 @@ def _sections(run: _Run, report: Report) -> list[Element]:
 
 
 def _budget(run: _Run, report: Report, tables: list[Element]) -> list[Element]:
-    if not report.steps:
+    if not STEPS.of(report):
         return tables
     canvas, cycles = run.canvas, run.curves.cycles
-    period_us = 1e6 / report.periods.rate_hz
-    plots = [typical_plot(canvas, report.steps, period_us), steps_plot(canvas, cycles)]
-    updates = controllers_plot(canvas, cycles, report.controllers)
+    period_us = 1e6 / report.totals.periods.rate_hz
+    plots = [typical_plot(canvas, STEPS.of(report), period_us), steps_plot(canvas, cycles)]
+    updates = controllers_plot(canvas, cycles, CONTROLLERS.of(report))
     return [*canvas.elements(plots), *tables, *canvas.elements([updates] if updates else [])]
 
 
@@ -191,13 +189,13 @@ def _latency(run: _Run, report: Report) -> list[Element]:
     if on_virtual_time(run.log):
         text = "The run was on virtual time: every wake-up is exact, so there is no latency to show."
         return [paragraph(text)]
-    if report.latency is None:
+    if report.totals.latency is None:
         return []
-    return run.canvas.elements(latency_plots(run.canvas, run.curves, report.latency))
+    return run.canvas.elements(latency_plots(run.canvas, run.curves, report.totals.latency))
 
 
 def _joints(run: _Run, report: Report) -> list[Element]:
-    if not (report.steps and report.joints):
+    if not (STEPS.of(report) and report.totals.tracking):
         return []
     canvas, cycles = run.canvas, run.curves.cycles
     parts = [
@@ -208,10 +206,11 @@ def _joints(run: _Run, report: Report) -> list[Element]:
             "command the gate changed (clamped). A click on a name hides its curve."
         )
     ]
-    for row, joint in enumerate(report.joints):
+    for row, joint in enumerate(report.totals.tracking):
         parts.append(Element("div", {"class": "joint"}))
         parts[-1].extend(canvas.elements(joint_plots(canvas, cycles, row, joint)))
-    return [*parts, *canvas.elements(state_plots(canvas, cycles, [joint.name for joint in report.joints]))]
+    names = [joint.name for joint in report.totals.tracking]
+    return [*parts, *canvas.elements(state_plots(canvas, cycles, names))]
 
 
 def _marks(canvas: Canvas) -> list[Element]:
@@ -223,7 +222,7 @@ def _marks(canvas: Canvas) -> list[Element]:
 def _events(run: _Run, report: Report, table: list[Element]) -> list[Element]:
     if not run.log.events:
         return table
-    number = sum(one.count for one in report.events)
+    number = sum(one.count for one in EVENTS.of(report))
     plot = events_plot(run.canvas, run.log.events, number)
     return [*run.canvas.elements([plot]), *table, *_each_event(run, number)]
 

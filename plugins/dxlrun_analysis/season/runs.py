@@ -22,7 +22,9 @@ from dxlrun import ROTARY, InputError, Log, LogError, open_log
 from dxlrun.tooling.logs import IDENTITY_NAME, is_being_written, is_log_directory, log_files, runtime_hash
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.finding import ROBOT
-from dxlrun_analysis.report import Report, analyze
+from dxlrun_analysis.parts.part import Report
+from dxlrun_analysis.parts.servos import EXTREMES
+from dxlrun_analysis.report import analyze
 from dxlrun_analysis.season.pools import processes
 
 Row = dict[str, object]
@@ -40,7 +42,8 @@ def _began(report: Report, log: Log) -> datetime | None:
     offset_ns = log.header.epoch_offset_ns
     if not offset_ns:
         return None
-    return datetime.fromtimestamp((report.periods.begin_ns + offset_ns) / 1e9, UTC).replace(tzinfo=None)
+    begin_ns = report.totals.periods.begin_ns + offset_ns
+    return datetime.fromtimestamp(begin_ns / 1e9, UTC).replace(tzinfo=None)
 
 
 def _worst(report: Report, field: str) -> str | None:
@@ -52,18 +55,22 @@ def _most(values: Iterable[float]) -> float | None:
     return max(values, default=None)
 
 
+def _latency(report: Report, name: str) -> float | None:
+    return None if report.totals.latency is None else getattr(report.totals.latency, name)
+
+
 def _hottest(report: Report) -> tuple[float | None, str | None]:
-    known = [(one.hottest_c, one.joint) for one in report.extremes if one.hottest_c is not None]
+    known = [(one.hottest_c, one.joint) for one in EXTREMES.of(report) if one.hottest_c is not None]
     return max(known, default=(None, None))
 
 
 def _lowest_voltage(report: Report) -> float | None:
-    known = [one.lowest_volts for one in report.extremes if one.lowest_volts is not None]
+    known = [one.lowest_volts for one in EXTREMES.of(report) if one.lowest_volts is not None]
     return min(known, default=None)
 
 
 def _farthest(report: Report) -> tuple[float | None, str | None]:
-    turning = [one for one in report.joints if one.unit is ROTARY and one.worst_rad is not None]
+    turning = [one for one in report.totals.tracking if one.unit is ROTARY and one.worst_rad is not None]
     return max(((one.worst_rad, one.name) for one in turning), default=(None, None))
 
 
@@ -71,31 +78,31 @@ Value = Callable[[Report, Log], object]
 COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "robot": (_TEXT, lambda report, _: report.robot),
     "began": (pa.timestamp("us"), _began),
-    "lasted_s": (_NUMBER, lambda report, _: report.periods.seconds),
-    "rate_hz": (_NUMBER, lambda report, _: report.periods.rate_hz),
+    "lasted_s": (_NUMBER, lambda report, _: report.totals.periods.seconds),
+    "rate_hz": (_NUMBER, lambda report, _: report.totals.periods.rate_hz),
     "good": (_YES, lambda report, _: report.verdict.good),
     "finding": (_TEXT, lambda report, _: _worst(report, "code")),
     "subject": (_TEXT, lambda report, _: _worst(report, "subject")),
     "sentence": (_TEXT, lambda report, _: _worst(report, "sentence")),
     "findings": (pa.list_(_TEXT), lambda report, _: [one.code for one in report.verdict.findings]),
-    "cycles": (_WHOLE, lambda report, _: report.periods.records),
-    "skipped": (_WHOLE, lambda report, _: report.periods.skipped),
-    "worst_wake_up_us": (_NUMBER, lambda report, _: report.latency and report.latency.max_us),
-    "mean_wake_up_us": (_NUMBER, lambda report, _: report.latency and report.latency.mean_us),
-    "late_share": (_NUMBER, lambda report, _: report.latency and report.latency.share_over_150_us),
-    "asked": (_WHOLE, lambda report, _: sum(servo.asked for servo in report.servos)),
-    "lost": (_WHOLE, lambda report, _: sum(servo.lost for servo in report.servos)),
-    "errors": (_WHOLE, lambda report, _: sum(servo.errors for servo in report.servos)),
-    "noise_bytes": (_WHOLE, lambda report, _: sum(bus.noise_bytes for bus in report.buses)),
-    "slowest_reply_us": (_NUMBER, lambda report, _: _most(one.reply_max_us for one in report.servos)),
+    "cycles": (_WHOLE, lambda report, _: report.totals.periods.records),
+    "skipped": (_WHOLE, lambda report, _: report.totals.periods.skipped),
+    "worst_wake_up_us": (_NUMBER, lambda report, _: _latency(report, "max_us")),
+    "mean_wake_up_us": (_NUMBER, lambda report, _: _latency(report, "mean_us")),
+    "late_share": (_NUMBER, lambda report, _: _latency(report, "share_over_150_us")),
+    "asked": (_WHOLE, lambda report, _: sum(servo.asked for servo in report.totals.servos)),
+    "lost": (_WHOLE, lambda report, _: sum(servo.lost for servo in report.totals.servos)),
+    "errors": (_WHOLE, lambda report, _: sum(servo.errors for servo in report.totals.servos)),
+    "noise_bytes": (_WHOLE, lambda report, _: sum(bus.noise_bytes for bus in report.totals.buses)),
+    "slowest_reply_us": (_NUMBER, lambda report, _: _most(one.reply_max_us for one in report.totals.servos)),
     "hottest_joint": (_TEXT, lambda report, _: _hottest(report)[1]),
     "hottest_deg_c": (_NUMBER, lambda report, _: _hottest(report)[0]),
     "lowest_voltage_v": (_NUMBER, lambda report, _: _lowest_voltage(report)),
     "worst_joint": (_TEXT, lambda report, _: _farthest(report)[1]),
     "worst_error_rad": (_NUMBER, lambda report, _: _farthest(report)[0]),
-    "records_lost": (_WHOLE, lambda report, _: report.gaps),
-    "complete": (_YES, lambda report, _: report.complete),
-    "being_written": (_YES, lambda report, _: report.being_written),
+    "records_lost": (_WHOLE, lambda report, _: report.totals.gaps),
+    "complete": (_YES, lambda report, _: report.about.complete),
+    "being_written": (_YES, lambda report, _: report.about.being_written),
     "virtual": (_YES, lambda _, log: on_virtual_time(log)),
     "host": (_TEXT, lambda _, log: log.metadata.get(IDENTITY_NAME, {}).get("host")),
     "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),

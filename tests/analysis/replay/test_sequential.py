@@ -69,11 +69,15 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
     sentence = "Cycles followed each other, not the clock: 320 periods of 320 Hz took 1."
     assert any(one.startswith(sentence) for one in report.verdict.sentences)
     assert judge(totals_of(log)).sentences[1] == report.verdict.sentences[1]
-    assert report.periods.rates_hz == (320.0,)
-    assert (report.periods.elapsed, report.periods.skipped, report.periods.agree) == (320, 0, True)
-    assert report.periods.seconds > 1.1
-    assert report.latency is not None
-    assert report.latency.max_us > 6_000
+    assert report.totals.periods.rates_hz == (320.0,)
+    assert (report.totals.periods.elapsed, report.totals.periods.skipped, report.totals.periods.agree) == (
+        320,
+        0,
+        True,
+    )
+    assert report.totals.periods.seconds > 1.1
+    assert report.totals.latency is not None
+    assert report.totals.latency.max_us > 6_000
 
 
 def test_times_that_no_sequence_has_are_refused(log: Path) -> None:

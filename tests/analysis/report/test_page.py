@@ -164,7 +164,7 @@ def test_the_plots_of_each_joint_and_of_the_thesis_are_there_in_degrees(run: Pat
 def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
     text, reader = whole
     report = analyze(read_log(run))
-    assert data(text, "report") == json.loads(json_text(report))
+    assert data(text, "report") == json.loads(json_text(report.numbers))
     shown = reader.words("td", "th")
     for table in tables(report).values():
         assert table.title in reader.words("caption")

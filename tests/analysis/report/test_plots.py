@@ -98,7 +98,7 @@ def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
 ) -> None:
     log = logs[COUNT]
     run = collected(log, slices=slices)
-    joint = analyze(log).joints[row]
+    joint = analyze(log).totals.tracking[row]
     plots = joint_plots(canvas_of(run), run.cycles, row, joint)
     by_label = {plot.model.yaxis[0].axis_label: lines(plot) for plot in plots}
     degree = np.float32(180 / np.pi)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msgspec import structs
 from tests.kit.made_logs import Cycle
 
 from dxlrun.log.reader import Log, read_log
@@ -171,7 +170,8 @@ def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest
     )
     log = read_log(write([Cycle(0), Cycle(1)]))
     report = analyze(log)
-    report = structs.replace(report, causes=replace(report.causes, worst=(WORST,)))
+    causes = replace(report.totals.causes, worst=(WORST,))
+    report = replace(report, totals=replace(report.totals, causes=causes))
     text = page(log, report, ReplyCollector().finish())
     for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
         assert f'id="plot-{name}"' in text

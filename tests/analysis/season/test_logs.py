@@ -116,9 +116,9 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dx
         report = analyze_log(season / name)
         assert row["robot"] == report.robot
         assert row["good"] == report.verdict.good
-        assert row["cycles"] == report.periods.records
-        assert row["lasted_s"] == pytest.approx(report.periods.seconds)
-        assert row["asked"] == sum(servo.asked for servo in report.servos)
+        assert row["cycles"] == report.totals.periods.records
+        assert row["lasted_s"] == pytest.approx(report.totals.periods.seconds)
+        assert row["asked"] == sum(servo.asked for servo in report.totals.servos)
         assert row["sentence"] == report.verdict.findings[1].sentence
         assert row["findings"] == [one.code for one in report.verdict.findings]
         assert row["bytes"] == (season / name).stat().st_size
@@ -303,7 +303,7 @@ def test_a_log_in_parts_is_one_log(known: Path, dxlrun: Dxlrun) -> None:
     (path / "notes.txt").touch()
     said = dxlrun("logs", known, "--json")
     row = rows(said)["torso_1"]
-    assert row["cycles"] == analyze_log(path).periods.records == 100
+    assert row["cycles"] == analyze_log(path).totals.periods.records == 100
     assert row["bytes"] == sum(part.stat().st_size for part in path.glob("*.mcap"))
     assert result_of(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
     assert list(rows(said)) == [*NAMES, "torso_1"]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Floats, Log
-from dxlrun.tooling.output import Column, Columns, Table, quantity_text
+from dxlrun.tooling.output import Column, Columns, quantity_text
+from dxlrun_analysis.parts.part import Part, listing
 
 _DIGITS = 4
 
@@ -36,7 +35,7 @@ class SourceHistory:
         self._least: Floats = np.zeros(0)
         self._greatest: Floats = np.zeros(0)
 
-    def count_cycles(self, log: Log) -> None:
+    def take(self, log: Log) -> None:
         """Count the cycles of the next slice."""
         layout = log.header.layout
         if not len(log.cycles) or not layout.source_states:
@@ -69,15 +68,18 @@ class SourceHistory:
         )
 
 
-def sources_table(values: Sequence[SourceValues]) -> Table:
-    """Return the table of these states."""
-    return Table.listing("Devices, sensors and states of controllers", _COLUMNS, values)
-
-
 _COLUMNS: Columns[SourceValues] = (
     (Column("state", "name"), "name"),
     (Column("valid cycles"), "cycles"),
     (Column("least"), lambda one: quantity_text(one.least, one.unit, digits=_DIGITS)),
     (Column("mean"), lambda one: quantity_text(one.mean, one.unit, digits=_DIGITS)),
     (Column("greatest"), lambda one: quantity_text(one.greatest, one.unit, digits=_DIGITS)),
+)
+
+SOURCES = Part(
+    "sources",
+    lambda report: report.tally.of(SourceHistory).finish(),
+    listing("Devices, sensors and states of controllers", _COLUMNS),
+    SourceHistory,
+    section="joints",
 )

@@ -1,0 +1,57 @@
+"""Part: numbers of a log that the report has under one name, and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar, cast
+
+from dxlrun import Log
+from dxlrun.tooling.output import Columns, Table
+from dxlrun_analysis.tally import Collector, RunTotals, Tally
+from dxlrun_analysis.verdict import Verdict
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All results of `dxlrun analyze` on a log."""
+
+    about: Log  # The log, without its records
+    tally: Tally
+    totals: RunTotals
+    verdict: Verdict
+    numbers: dict[str, object]  # Of each part, by its name: what `--json` prints
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return self.about.header.robot
+
+
+@dataclass(frozen=True, slots=True)
+class Part(Generic[T]):
+    """A part of the report."""
+
+    name: str  # Key of `--json`, and name of its table
+    numbers: Callable[[Report], T]
+    table: Callable[[Report, T], Table] | None = None  # Without rows it is not shown
+    collector: type[Collector] | None = None  # Gets the log slice by slice; `report.tally.of` returns it
+    section: str = ""  # Of the page, which has the table
+    first: bool = False  # The table is the first of its section
+    late: int = 0  # In a terminal, tables with a higher number come later
+
+    def of(self, report: Report) -> T:
+        """Return its numbers of a log."""
+        return cast("T", report.numbers[self.name])
+
+    def table_of(self, report: Report) -> Table | None:
+        """Return its table, where it has one with rows."""
+        found = self.table and self.table(report, self.of(report))
+        return found if found and found.rows else None
+
+
+def listing(title: str, columns: Columns[T]) -> Callable[[Report, Sequence[T]], Table]:
+    """Return a function that makes a table with a row for each of several things."""
+    return lambda _, things: Table.listing(title, columns, things)
