@@ -35,7 +35,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log
 from dxlrun.testing import VirtualRobot
-from dxlrun_analysis.client_commands import client_commands
+from dxlrun_analysis.conduct.client_commands import client_commands
 from dxlsim.bus.ledger import LedgerEntry
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import parse_fault

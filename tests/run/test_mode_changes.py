@@ -8,7 +8,7 @@ from tests.kit.stories import replayed, send, switch, tell
 
 from dxlrun.channels.events import EventCode
 from dxlrun.log.reader import Log, read_log
-from dxlrun_analysis.client_commands import client_commands
+from dxlrun_analysis.conduct.client_commands import client_commands
 from dxlwire.modes import Mode
 
 ROBOT = """\

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.records import ClientCommand, Event, EventCode, TakenCommand
-from dxlrun_analysis.client_commands import client_commands, policy_begun
+from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.cycles.latency import DISORDER_NS, begins, first_deadline_ns
 
 _LONGEST = 80

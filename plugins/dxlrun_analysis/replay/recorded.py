@@ -17,7 +17,7 @@ from dxlrun.tooling.plans import LoopPlan, PolicyPlan, decode_plan
 from dxlrun.tooling.records import EventCode
 from dxlrun.tooling.robots import PlugIns
 from dxlrun.tooling.runs import RunInputs, kept_states_of
-from dxlrun_analysis.client_commands import client_commands, policy_begun, unlogged_commands
+from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")  # A different version of these may change a command

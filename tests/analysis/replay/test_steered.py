@@ -27,7 +27,7 @@ from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.testing import VirtualRobot
-from dxlrun_analysis.client_commands import client_commands, policy_begun
+from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.replay import replay_log
 
 Changed = Callable[..., Path]
