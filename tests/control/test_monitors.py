@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Self
 
 import pytest
@@ -87,3 +88,26 @@ def test_sensors_that_a_run_does_not_need_are_not_monitored(on_lost, built) -> N
     plan = loop_plan([JointPlan("a", -1.0, 1.0, None)], sensors=(imu,), sources=(source,))
     found = build_monitors(plan, CycleRecord(plan.layout), None)
     assert [type(one) for one in found] == built
+
+
+class HeldJoints:
+    """Notes which joints a manager has to hold; a gate, too."""
+
+    def __init__(self) -> None:
+        self.held: list[tuple[set[int], str]] = []
+
+    def hold_lost(self, rows, until: str) -> tuple[int, ...]:
+        self.held.append((set(rows), until))
+        return ()
+
+    def ease_in(self, rows) -> None:
+        assert rows == ()
+
+
+def test_controllers_are_held_until_no_policy_holds_them() -> None:
+    noted = HeldJoints()
+    context = SimpleNamespace(plan=loop_plan([JointPlan("a", -1.0, 1.0, None)]))
+    actions = PolicyActions(context, noted, noted)
+    for rows, until in (({0}, "answer"), ({0, 1}, "are cool"), (set(), "answer"), (set(), "are cool")):
+        actions.hold_controllers(rows, until)
+    assert noted.held == [({0}, "answer"), ({0, 1}, "are cool"), ({0, 1}, "answer"), (set(), "are cool")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from dxlrun.testing import installed, plan_of, read_log, simulated_robot
 from dxlrun_analysis.replay.replay import replay_log
 
 HOT = "policies: {on_hot_servo: {above: 70 degC, do: %s}}\n"
+STEPS = "[{pose: rest, speed: 60 deg/s}, limp]"
+OVERHEAT = f"poses: {{rest: {{tilt: 20 deg}}}}\npolicies: {{exit_timeout: 6 s, on_overheat: {STEPS}}}\n"
 ROBOT = """\
 name: pair
 buses:
@@ -105,6 +108,29 @@ def test_group_has_its_own_policy(tmp_path: Path) -> None:
     assert run(tmp_path, both % "tilt").events == [("pan", "is hot; on_hot_servo: continue")]
 
 
+def test_run_ends_by_the_steps_of_the_policy(tmp_path: Path) -> None:
+    ended = run(tmp_path, OVERHEAT)
+    assert (ended.reason, ended.torque) == ("fault", [True, True])
+    assert ended.detail == "a servo is above 72 degC; on_overheat: pose rest at 60 deg/s, then limp"
+    assert ended.log.cycles["position"][-1][1] == pytest.approx(math.radians(20), abs=0.05)
+
+
+def test_steps_of_the_policy_are_checked(tmp_path: Path) -> None:
+    file = tmp_path / "pair.yaml"
+    file.write_text(ROBOT + OVERHEAT)
+    rows = {row.name: row for row in compile_files(file, {}, []).report["policies"]}
+    assert rows["on_overheat"].does == "pose rest at 60 deg/s, then limp"
+    assert 2 < rows["on_overheat"].longest < 6
+    file.write_text(ROBOT + OVERHEAT.replace("exit_timeout: 6 s", "exit_timeout: 2 s"))
+    with pytest.raises(InputError, match="on_overheat may take "):
+        plan_of(file)
+    file.write_text(ROBOT + OVERHEAT.replace("pose: rest", "pose: nest"))
+    with pytest.raises(
+        InputError, match="on_overheat has pose nest, which is not defined; did you mean rest"
+    ):
+        plan_of(file)
+
+
 def test_check_shows_the_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "pair.yaml"
     file.write_text(ROBOT + HOT % "hold")
@@ -147,9 +173,9 @@ def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
     assert plan_of(file).packages["dxlrun_hot"] == "dxlrun-hot"
 
 
-@pytest.mark.parametrize("action", ["limp", "hold", "stop"])
-def test_replay_decides_like_the_run(tmp_path: Path, action: str) -> None:
-    ended = run(tmp_path, HOT % action)
+@pytest.mark.parametrize("policies", [HOT % "limp", HOT % "hold", HOT % "stop", OVERHEAT])
+def test_replay_decides_like_the_run(tmp_path: Path, policies: str) -> None:
+    ended = run(tmp_path, policies)
     report = replay_log(tmp_path / "run.mcap")
     assert (report.compared, report.different, report.fault) == (len(ended.log.cycles), 0, "")
     assert not any("not installed" in remark for remark in report.remarks)

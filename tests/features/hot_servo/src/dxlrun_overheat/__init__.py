@@ -1,0 +1,1 @@
+"""Policy for overheated servos: the example of a policy with steps that end the run."""
