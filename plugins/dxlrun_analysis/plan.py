@@ -152,13 +152,18 @@ class LoggedPlan(msgspec.Struct):
         """
         if not any(bus.simulated for bus in self.buses):
             return False
-        real = {one.name for one in self.loop.controllers} | {one.name for one in self.loop.sensors}
+        real = {one.name for one in self.loop.controllers} | self.sensors
         real -= self.by_name.keys()
         for bus in self.buses:
             if not bus.simulated:
                 real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}
         of_bus = subject.rpartition(" ")[0]  # `main 7`: a servo that the plan does not have
         return subject not in real and of_bus not in real
+
+    @property
+    def sensors(self) -> set[str]:
+        """Names of the sources that are sampled by processes of their own."""
+        return {one.name for one in self.loop.sources if one.kind == "sensor"}
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:

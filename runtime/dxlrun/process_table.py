@@ -21,7 +21,7 @@ _ROLES = {
     b"dxlrun.run.loop_process": "loop",
     b"dxlrun.log.recorder": "recorder",
     b"dxlrun.remote": "gateway",
-    b"dxlrun.run.sensor_process": "sensor",
+    b"dxlrun.run.source_process": "sensor",
 }
 
 

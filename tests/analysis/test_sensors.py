@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from tests.kit.made_logs import loop_of
 
-from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.plan.loop_plan import SourcePlan
 from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.finding import Rank
 
@@ -37,9 +37,9 @@ def findings(
     cycles["source_valid"][:, 0] = True if valid is None else valid
     cycles["position"][:, 0], cycles["source_state"] = joint, values
     sensors, layout = Sensors(), SimpleNamespace(source_slice=lambda name: slice(0, len(states)))
-    sensor = (SensorPlan(name, "", "", "{}", states, 1, 1),)
+    sensor = (SourcePlan(name, "sensor", states),)
     device = {"name": "main", "devices": [{"name": name, "servo_id": 101}]}
-    plan = {"loop": loop_of(sensors=sensor)} if kind == "sensor" else {"buses": [device]}
+    plan = {"loop": loop_of(sources=sensor)} if kind == "sensor" else {"buses": [device]}
     for begin in range(0, len(TIME), 170):
         part: Any = SimpleNamespace(
             cycles=cycles[begin : begin + 170],

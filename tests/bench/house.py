@@ -17,7 +17,10 @@ feature commits, the imported names, the files and the functions.
   and `dxlwire` and `dxlsim` themselves. A name is counted once a package (`in each file`: once a file),
   also inside functions and for type checking.
 - **A mention** is a match of a feature's pattern (`MENTIONS`) in code: not in a docstring, a comment or a
-  text with blanks, such as a message. A feature's own folder is not counted, nor are tests.
+  text with blanks, such as a message. A feature's own folder is not counted, nor are tests. "Sensor" is each
+  identifier or key with this word, but for messages of ROS and controllers that publish states; drivers in
+  packages count. It replaces a pattern of the general idea of a source, which is anything with states or
+  commands that is not a joint, such as a device: the core has to know that.
 - **A function without an object** is a public function or method whose name is one of `BARE_VERBS`.
 - **A parameter** is one of a function or method, without `self` and those of protocols, or a field of
   a dataclass that its constructor takes. It is **only handed on** if each use is an argument of a call, or
@@ -65,11 +68,7 @@ MENTIONS = {
         "mechanics",
         r"(dxlsim|simulation)/bus/",  # bytes on a line
     ),
-    "sensor source": Mention(
-        r"SourcePlan|SourceStates|SensorSource|sensor_source"
-        r"|source_(states?|valid|age|slice|values|names)|\b(layout|record|loop|plan|header|states)\.sources\b",
-        "sensors",
-    ),
+    "sensor": Mention(r"(?i)sensor(?!_msgs|_?broadcaster)", "sensors"),
     "register declaration": Mention(
         r"\b(servo|joint|described|desired|own)\.registers\b(?! import)|registers: dict\[ItemName|'registers'"
         r"|compile_registers|declared_registers|declarable|steered_value|RegisterDifference",

@@ -78,4 +78,4 @@ def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]
 @cache
 def _with_part() -> PlugIns:
     offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
-    return PlugIns(offers, {}, sensors=load_plugins().sensors)
+    return PlugIns(offers, {}, drivers=load_plugins().drivers)

@@ -17,7 +17,8 @@ from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.features.feature import Feature, S
 from dxlrun.features.lost_servos.monitor import LostServos
 from dxlrun.features.sensors.monitor import NeededSensors
-from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SensorPlan, SourcePlan
+from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
+from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SourcePlan
 from dxlrun.testing import VirtualRobot, plan_of
 
 ROBOT = """\
@@ -85,7 +86,11 @@ def test_monitor_of_a_package_acts_in_the_loop(tmp_path) -> None:
 def test_sensors_that_a_run_does_not_need_are_not_monitored(on_lost, built) -> None:
     imu = SensorPlan("imu", "imu", "tests 1", "{}", ("x",), 10_000_000, 50_000_000, on_lost=on_lost)
     source = SourcePlan("imu", "sensor", ("x",))
-    plan = loop_plan([JointPlan("a", -1.0, 1.0, None)], sensors=(imu,), sources=(source,))
+    plan = loop_plan(
+        [JointPlan("a", -1.0, 1.0, None)],
+        feature_plans={"sensors": encode_sensors((imu,))},
+        sources=(source,),
+    )
     found = build_monitors(plan, CycleRecord(plan.layout), None)
     assert [type(one) for one in found] == built
 

@@ -26,14 +26,18 @@ import pytest
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode
+from dxlrun.channels.process import RunMemory
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.sensors.readings import Readings
-from dxlrun.control.sensors.sampling import SampledSensor
+from dxlrun.control.source_process import PlannedProcess, ReaderContext, planned_processes
 from dxlrun.errors import PortError
-from dxlrun.run import sensor_process, supervisor
-from dxlrun.run.run_processes import create_memory, start_sensor
+from dxlrun.features.sensors.plan import decode_sensors
+from dxlrun.features.sensors.reader import Readings
+from dxlrun.features.sensors.sampling import SampledSensor, build_sensor
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.run import source_process, supervisor
+from dxlrun.run.run_processes import create_memory, start_source
 from dxlrun.testing import plan_of
 
 pytestmark = pytest.mark.usefixtures("no_memory_left")
@@ -88,13 +92,24 @@ def unit():
     unit.close()
 
 
+def only_process(plan: Plan) -> PlannedProcess:
+    """Return the process of the robot's only sensor."""
+    (planned,) = planned_processes(plan.loop)
+    return planned
+
+
+def start_only(plan: Plan, memory: RunMemory) -> Any:
+    """Start the process of the robot's only sensor."""
+    return start_source(plan, only_process(plan), memory)
+
+
 def sensor_of(run: Any, port: str) -> int | None:
     """Return the process that has the unit's port open."""
     for path in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             if run.mark.encode() not in (path / "environ").read_bytes():
                 continue
-            if b"run.sensor_process" in (path / "cmdline").read_bytes() and port in {
+            if b"run.source_process" in (path / "cmdline").read_bytes() and port in {
                 os.readlink(each) for each in (path / "fd").iterdir()
             }:
                 return int(path.name)
@@ -112,9 +127,11 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
         def emit(self, code, severity, source, text):
             events.append(text.removeprefix("sensor imu").lstrip(": "))
 
-    slots = [mapped(descriptor) for descriptor in memory.sensors]
-    readings = Readings(plan.loop, slots, record, time.monotonic_ns, Sink())
-    sensor = supervisor._SensorProcess(plan, 0, memory, start_sensor(plan, 0, memory))
+    slots = [mapped(descriptor) for descriptor in memory.slots["sensors"]]
+    readings = Readings(
+        ReaderContext(plan.feature_plans["sensors"], slots, record, time.monotonic_ns, Sink())
+    )
+    sensor = supervisor._SourceProcess(plan, only_process(plan), memory, start_only(plan, memory))
 
     def read_until(valid, *, value=0.25):
         give_up = time.monotonic() + 60
@@ -146,7 +163,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     finally:
         sensor.end()
     assert process.returncode == 0  # it closed its device in time
-    assert time.monotonic() - began < sensor_process.END_S
+    assert time.monotonic() - began < source_process.END_S
     assert events[:5] == [
         "its process ended (signal SIGKILL), another one is started",
         "is gone; its values are not valid",
@@ -221,7 +238,7 @@ def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):
     robot.write_text(ROBOT + "sensors:\n  imu: {type: serial_imu, port: /dev/no_imu}\n")
     plan = plan_of(robot)
     memory = create_memory(plan)
-    child = start_sensor(plan, 0, memory)
+    child = start_only(plan, memory)
     with pytest.raises(PortError, match=r"sensor imu cannot be opened: there is no /dev/no_imu; "):
         child.ready()
     assert child.process.wait(20) == 1
@@ -273,7 +290,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Any
 
 def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(tmp_path, monkeypatch):
     plan = installed(tmp_path, monkeypatch, STUBBORN)
-    child = start_sensor(plan, 0, create_memory(plan))
+    child = start_only(plan, create_memory(plan))
     try:
         child.ready()
         child.process.terminate()  # as the kernel does when the supervisor is gone
@@ -305,10 +322,10 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
         tmp_path, monkeypatch, text + body.split("return None\n\n")[1].replace("while True", "if False")
     )
     memory = create_memory(plan)
-    child = start_sensor(plan, 0, memory)
-    sensor = supervisor._SensorProcess(plan, 0, memory, child)
+    child = start_only(plan, memory)
+    sensor = supervisor._SourceProcess(plan, only_process(plan), memory, child)
     child.ready()
-    reader = SlotReader(mapped(memory.sensors[0]))
+    reader = SlotReader(mapped(memory.slots["sensors"][0]))
     until = time.monotonic() + 20
     while not (restarted := child.process.poll() is not None) and reader.state is not SlotState.FAILED:
         assert time.monotonic() < until
@@ -318,7 +335,7 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
     )
     pidfd = os.pidfd_open(grandchild)
     assert not restarted
-    assert os.fstat(memory.sensors[0]).st_size >= slot.size(1)
+    assert os.fstat(memory.slots["sensors"][0]).st_size >= slot.size(1)
     if killed:
         os.kill(child.process.pid, signal.SIGKILL)
         while sensor.child is not None:
@@ -338,8 +355,8 @@ def test_a_time_in_the_future_is_reported(tmp_path, monkeypatch):
     plan = installed(tmp_path, monkeypatch, "import time\n" + FUTURE)
     memory = slot.private(1)
     reader, writer = SlotReader(memory), slot.SlotWriter(memory)
-    (sensor,) = plan.loop.sensors
-    sampled = SampledSensor(sensor, load_plugins().built_sensor(sensor), writer, time.monotonic_ns, None)
+    (sensor,) = decode_sensors(plan.feature_plans["sensors"])
+    sampled = SampledSensor(sensor, build_sensor(load_plugins(), sensor), writer, time.monotonic_ns, None)
     sampled.open_first()
     for _ in range(2):
         assert sampled.sample()

@@ -11,7 +11,7 @@ from tests.kit.bodies import Turned, bodies_of
 
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
-from dxlrun.run.sensor_process import RemoteBody
+from dxlrun.run.source_process import RemoteBody
 from dxlsim.motion.body import SensedBody, ShaftsShown, SimulatedBody
 from dxlsim.motion.control_law import LIMP
 from dxlsim.motion.link_motion import Shafts

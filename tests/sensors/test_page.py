@@ -15,9 +15,9 @@ from tests.kit.pages import page_text
 from dxlrun import SensorContext
 from dxlrun.cli import main
 from dxlrun.cli.examples import schema_text
-from dxlrun.control.sensors.offer import sensor_breach
-from dxlrun.control.sensors.sampling import REOPEN_NS
-from dxlrun.run import sensor_process, supervisor
+from dxlrun.features.sensors.offer import sensor_breach
+from dxlrun.features.sensors.sampling import REOPEN_NS
+from dxlrun.run import source_process, supervisor
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("sensors.md")
@@ -44,7 +44,7 @@ def test_it_has_the_table_of_keys_of_every_sensor():
 
 
 def test_its_times_are_those_of_the_program():
-    assert (REOPEN_NS, supervisor._RESTART_S, sensor_process.END_S) == (1_000_000_000, 2.0, 1.0)
+    assert (REOPEN_NS, supervisor._RESTART_S, source_process.END_S) == (1_000_000_000, 2.0, 1.0)
     assert "opened again each second" in PAGE
     assert "started again after 2 s" in PAGE
     assert "has 1 s to close" in PAGE

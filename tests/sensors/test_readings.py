@@ -13,8 +13,10 @@ from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.slot import SlotState, SlotWriter
-from dxlrun.control.sensors.readings import Readings
-from dxlrun.plan.loop_plan import LoopPlan, SchedulerPlan, SensorPlan, SourcePlan
+from dxlrun.control.source_process import ReaderContext
+from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
+from dxlrun.features.sensors.reader import Readings
+from dxlrun.plan.loop_plan import LoopPlan, SchedulerPlan, SourcePlan
 
 MS = 1_000_000
 STATES = ("angular_velocity.x", "angular_velocity.y")
@@ -38,11 +40,12 @@ class Desk:
             *(SourcePlan(one.name, "sensor", one.states) for one in sensors),
         )
         scheduler = SchedulerPlan("other", 31, False)
-        plan = LoopPlan(20 * MS, scheduler, (), (), (), None, sources=sources, sensors=sensors)
+        plan = LoopPlan(20 * MS, scheduler, (), (), (), None, sources=sources)
         self.record = CycleRecord(plan.layout)
         slots = [slot.private(2), slot.private(2)]
         self.writer, self.other = (SlotWriter(memory) for memory in slots)
-        self.readings = Readings(plan, slots, self.record, lambda: self.now_ns, self)
+        context = ReaderContext(encode_sensors(sensors), slots, self.record, lambda: self.now_ns, self)
+        self.readings = Readings(context)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         self.events.append((code, severity, source, text))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.testing import plan_of
 
 IMU = "  imu: {type: simulated_imu, link: tip}"
@@ -78,7 +79,7 @@ def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals):
 
 def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane):
     def of(entry: str) -> tuple[int, int]:
-        (plan,) = plan_of(crane((IMU, f"  imu: {entry}"))).loop.sensors
+        (plan,) = decode_sensors(plan_of(crane((IMU, f"  imu: {entry}"))).feature_plans["sensors"])
         return plan.period_ns, plan.timeout_ns
 
     assert of("{type: simulated_imu, link: tip}") == (10_000_000, 50_000_000)

@@ -17,8 +17,8 @@ import pytest
 from dxlrun import SensorContext
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
-from dxlrun.control.sensors.sampling import SampledSensor
-from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.features.sensors.plan import SensorPlan
+from dxlrun.features.sensors.sampling import SampledSensor
 from dxlrun_controllers.sensors.serial_imu import SerialImu, SerialImuParameters, checked
 
 LINE = b"0.5,-0.25,9.75,1,2,-3\n"

@@ -143,7 +143,7 @@ class Sensors:
         if not len(log.cycles):
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
-        known = {one.name for one in self._plan.loop.sensors}
+        known = self._plan.sensors
         known |= {device.name for bus in self._plan.buses for device in bus.devices}
         position, at_ns = np.nan_to_num(log.cycles["position"]), log.cycles["read_ns"]
         for index, (name, states) in enumerate(self._states.items()):
@@ -163,7 +163,7 @@ class Sensors:
 
     def findings(self) -> Iterable[Finding]:
         """Name the sensors and devices that hung."""
-        sensors = {one.name for one in self._plan.loop.sensors}
+        sensors = self._plan.sensors
         for name, one in self._sources.items():
             whole, stays = one.all.stay, [each.stay for each in one.each]
             still = {

@@ -13,7 +13,8 @@ import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import Generic, TypeVar
 
 import msgspec
@@ -126,10 +127,10 @@ class RunMemory:
     """What controllers kept in earlier runs."""
     span: int
     """Which cycles the log has on the disk, written by the recorder at each flush."""
-    sensors: tuple[int, ...] = ()
-    """Slots of the sensors, in the order of the plan."""
+    slots: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    """Slots of the processes of each feature, by its name."""
     shafts: int = -1
-    """Slot of the shafts of simulated servos, for sensors that sense the simulated body; -1: none does."""
+    """Slot of the shafts of simulated servos, for processes that sense the simulated body; -1: none does."""
     simulation: int = -1
     """Progress of the simulation; -1: no bus is simulated."""
 
@@ -138,7 +139,7 @@ class RunMemory:
         """Those that the loop's process inherits."""
         rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
         simulated = (self.simulation,) if self.simulation >= 0 else ()
-        own = (self.result, self.grants, self.kept, *self.sensors, *simulated)
+        own = (self.result, self.grants, self.kept, *chain(*self.slots.values()), *simulated)
         return (self.plan, self.heartbeat, *rings, *own)
 
     @property

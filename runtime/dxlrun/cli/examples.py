@@ -222,10 +222,11 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
             for name in found.controllers
             if (offer := found.controllers.get(name)) and offer.distribution.startswith(only)
         }
+        offers = found.drivers_of("sensors")
         sensors = {
-            name: sensor.sensor.Parameters
-            for name in found.sensors
-            if (sensor := found.sensors.get(name)) and sensor.distribution.startswith(only)
+            name: sensor.driver.Parameters
+            for name in offers
+            if (sensor := offers.get(name)) and sensor.distribution.startswith(only)
         }
         of_kind = robot_schema if kind == "robot" else fragment_schema
         made = of_kind(controllers, sensors)

@@ -19,7 +19,9 @@ from dxlrun.output.terminal import show, show_json
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
+    from dxlrun.control.controllers.offers import OfferStage
     from dxlrun.control.controllers.plugins import LoadedPlugIn, Offer, PlugIns
+    from dxlrun.features.feature import Feature
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 _LONGEST_NAME = 60
@@ -53,22 +55,39 @@ def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
 def _row(name: str, distribution: str = "", contract: int | None = None, *, broken: str) -> Row:
     """Return a plug-in that offers nothing; `broken`: why it cannot be used, empty: it can."""
     about = {"name": name, "distribution": distribution, "contract": contract}
-    offers = {"controllers": (), "servo_models": (), "overrun": False, "sensors": (), "verbs": ()}
+    offers = {"controllers": (), "servo_models": (), "overrun": False, **_drivers(), "verbs": ()}
     return about | offers | {"broken": broken}
 
 
 def _shown(plugin: LoadedPlugIn, found: PlugIns) -> Row:
     controllers = (found.controllers.get(name) for name in plugin.controllers)
-    sensors = (found.sensors.get(name) for name in plugin.sensors)
+    drivers = {
+        feature.name: [
+            {"type": one.type, **stage.facts(one.driver)}
+            for name in plugin.drivers[feature.name]
+            if (one := found.drivers_of(feature.name).get(name)) is not None
+        ]
+        for feature, stage in _offer_stages()
+    }
     return _row(plugin.name, plugin.distribution, plugin.contract, broken="") | {
         "controllers": [_controller(offer) for offer in controllers if offer is not None],
         "servo_models": plugin.servo_models,
         "overrun": plugin.overrun is not None,
-        "sensors": [
-            {"type": one.type, "simulated": one.sensor.simulated} for one in sensors if one is not None
-        ],
+        **drivers,
         "verbs": plugin.verbs,
     }
+
+
+def _offer_stages() -> Iterator[tuple[Feature, OfferStage]]:
+    """Yield the features for whose sections plug-ins offer classes."""
+    from dxlrun.control.controllers.offers import OfferStage  # not above: `--help` loads no pydantic
+    from dxlrun.features import FEATURES, stages
+
+    return stages(OfferStage, FEATURES)
+
+
+def _drivers() -> dict[str, tuple[()]]:
+    return {feature.name: () for feature, _ in _offer_stages()}
 
 
 def _controller(offer: Offer) -> Row:
@@ -119,7 +138,7 @@ _OFFERS: Columns[Row] = [
 def _table(row: Row) -> Table:
     """Return a line for each thing that a plug-in offers."""
     others = [
-        *(f"sensor {one['type']}" for one in row["sensors"]),
+        *(f"{stage.kind} {one['type']}" for feature, stage in _offer_stages() for one in row[feature.name]),
         *(f"servo model {name}" for name in row["servo_models"]),
         *(f"command {name}" for name in row["verbs"]),
         *["decisions about late cycles"] * row["overrun"],

@@ -13,7 +13,7 @@ from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.description.robot import WrittenPolicy
-from dxlrun.plan.loop_plan import ControllerPlan, SensorPlan, SourcePlan
+from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.policy_plan import GroupPolicy
 from dxlsim.simulation_plan import Shown
@@ -72,8 +72,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Contents of the files that its section names, by path."""
     plan: bytes = b""
     """Whatever its part in the run needs beside that, encoded; `BusContext.plan` has it."""
-    sensors: tuple[SensorPlan, ...] = ()
-    """Processes that sample its sources."""
+    packages: Mapping[str, str] = {}
+    """Packages of plug-ins whose code runs for it, with their distributions."""
     mechanics: MechanicsPlan | None = None
     """Which servos move which joints, of the feature that knows."""
     policies: tuple[PolicyEntry, ...] = ()

@@ -16,9 +16,9 @@ from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.compile.graph import Mistake
+from dxlrun.control.controllers.offers import Breach
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.controllers.single_files import is_of_file
-from dxlrun.control.sensors.offer import Breach
 from dxlrun.description.document import KeyPath
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.mistakes.foreign import ros_type

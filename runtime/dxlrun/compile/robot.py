@@ -163,7 +163,6 @@ def compile_robot(
     }
     contributions = tuple(by_feature.values())
     sources = tuple(source for each in contributions for source in each.sources)
-    sensors = tuple(sensor for each in contributions for sensor in each.sensors)
     devices = (device for each in contributions for device in each.devices)
     simulation = compile_simulation(file, joints, devices, motors)
     controllers = compile_controllers(file, plugins, contributions)
@@ -208,7 +207,6 @@ def compile_robot(
         slowest_period_ns=slowest_period_ns(buses),
         sources=sources,
         urdf=urdf,
-        sensors=sensors,
         features=features,
         feature_plans={name: each.plan for name, each in by_feature.items() if each.plan},
     )
@@ -231,7 +229,8 @@ def compile_robot(
         simulation=simulation,
         groups=description.groups,
         gateway=robot.processes.gateway.enabled,
-        packages=plugins.packages_of(loop.controllers, sensors, _models(buses))
+        packages=plugins.packages_of(loop.controllers, _models(buses))
+        | {package: name for each in contributions for package, name in each.packages.items()}
         | _physics(simulation, buses)
         | _packages(features),
         mechanics=next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan()),

@@ -14,6 +14,7 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.urdf import TYPES
 from dxlrun.compile.problems import RobotFile
+from dxlrun.control.source_process import planned_processes
 from dxlrun.description.bus import SIMULATED, Bus
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan, SimulationPlan
@@ -208,8 +209,9 @@ def simulation_of(plan: Plan) -> SimulationConfig:
 
 
 def sensed_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies whose motion simulated sensors sense, whatever moves them; None: none does."""
-    return _bodies(plan) if any(one.links for one in plan.loop.sensors) else None
+    """Return the bodies that processes beside the loop sense, whatever moves them; None: none does."""
+    sensed = any(one.process.has_body for one in planned_processes(plan.loop))
+    return _bodies(plan) if sensed else None
 
 
 def _bodies(plan: Plan) -> UrdfBodies | None:

@@ -21,17 +21,11 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
+from dxlrun.control.source_process import SourceReader
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
 from dxlrun.plan.policy_plan import Last
-
-
-class Sensors(Protocol):
-    """Sensors whose newest samples can be copied into the record."""
-
-    def read(self) -> None:
-        """Fill their rows of the record's sources; never waits."""
 
 
 class CycleSink(Protocol):
@@ -77,7 +71,7 @@ class Loop:
         sink: CycleSink,
         *,
         overrun_hooks: tuple[OverrunHook, ...] = (),
-        sensors: Sensors | None = None,
+        readers: tuple[SourceReader, ...] = (),
     ) -> None:
         """Build everything of the control side but the controllers.
 
@@ -86,13 +80,13 @@ class Loop:
             manager: Its controllers, whether they are configured by now or not.
             sink: Takes its cycles.
             overrun_hooks: Plug-ins that decide what becomes of a late cycle.
-            sensors: None: the robot has none, or a replay's record has them already.
+            readers: Copy samples of processes beside the loop into the record; a replay's record has them.
         """
         self.context = context
         self.manager = manager
         self.gate = Gate(context.plan, context.record, context.events)
         self.sink = sink
-        self.sensors = sensors
+        self.readers = readers
         # read in each cycle
         self.plan, self.record = context.plan, context.record
         self.clock, self.hardware = context.clock, context.hardware
@@ -151,8 +145,8 @@ class Loop:
         period_ms = self.plan.period_ns / 1e6
         text = f"loop started, period {period_ms:g} ms"
         self.context.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
-        if self.sensors is not None:
-            self.sensors.read()
+        for reader in self.readers:
+            reader.read()
         self._take_servo_limits()
         self.gate.begin()
         self.gate.ease_in()
@@ -200,8 +194,8 @@ class Loop:
         if self._motion:
             self._motion.begin()
         self.hardware.read()
-        if self.sensors is not None:
-            self.sensors.read()
+        for reader in self.readers:
+            reader.read()
         read_ns = now_ns()
         if self.hardware.servo_limits is not self._servo_limits:
             self._take_servo_limits()

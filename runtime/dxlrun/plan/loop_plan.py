@@ -281,27 +281,6 @@ class SourcePlan(msgspec.Struct, frozen=True):
     """SI unit of each command that has one, by its name."""
 
 
-class SensorPlan(msgspec.Struct, frozen=True):
-    """One sensor: what its process opens, and what the loop expects of it."""
-
-    name: str
-    type: str
-    distribution: str  # Publisher of the plug-in: `name version`
-    parameters: str  # JSON that `Parameters` accepts
-    states: tuple[str, ...]
-    period_ns: int  # Between two samples
-    timeout_ns: int  # Age at which its values are no longer valid
-    on_lost: Literal["continue", "stop"] = "continue"
-    """What becomes of the run when it brings nothing for that time."""
-    links: tuple[str, ...] = ()
-    """Of the URDF, whose simulated motion it senses; empty: it measures the real world."""
-    simulated: bool = False  # It can be stepped on virtual time
-    noisy: tuple[str, ...] = ()
-    """States that never stay the same together: as long as they do, the sensor is stuck."""
-    units: dict[str, str] = {}
-    """SI unit of each state that has one, by its name."""
-
-
 class ControllerPlan(msgspec.Struct, frozen=True):
     """One controller of the robot file."""
 
@@ -394,7 +373,6 @@ class LoopPlan(msgspec.Struct, frozen=True):
     schedule: ScheduleName = "absolute"
     sources: tuple[SourcePlan, ...] = ()  # Devices, then sensors
     urdf: str | None = None  # The robot's URDF as it was read; None: the robot file names none
-    sensors: tuple[SensorPlan, ...] = ()  # In the order of those of the sources that are sensors
     features: tuple[Feature, ...] = FEATURES
     """Features that take part in the run."""
     feature_plans: dict[str, bytes] = {}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from base64 import b64encode
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -127,4 +128,14 @@ def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
     """
     import msgspec  # not above: to check a robot needs no JSON
 
-    return msgspec.json.decode(data.replace(b'"linear":true', b'"unit":"m"'), type=parts)
+    return msgspec.json.decode(_move_sensors(data.replace(b'"linear":true', b'"unit":"m"')), type=parts)
+
+
+def _move_sensors(data: bytes) -> bytes:
+    """Return a plan with its sensors where they are today; logs of earlier versions have them in the loop."""
+    if b'"sensors":[{' not in data:
+        return data
+    tree = msgspec.json.decode(data, type=dict[str, Any])
+    sensors = msgspec.json.encode(tree["loop"].pop("sensors", []))
+    tree["loop"].setdefault("feature_plans", {})["sensors"] = b64encode(sensors).decode()
+    return msgspec.json.encode(tree)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -20,7 +20,7 @@ from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.loop import Loop, LoopResult
-from dxlrun.control.sensors.readings import Readings
+from dxlrun.control.source_process import Slots, build_readers
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
@@ -116,8 +116,8 @@ class LoopHost:
     inbox: Inbox = field(default_factory=NoInbox)
     activity: Activity = field(default_factory=Activity)
     """Shows which controller's code runs."""
-    slots: Sequence[memoryview] = ()
-    """What the plan's sensors write into."""
+    slots: Slots = field(default_factory=dict)
+    """What processes of features write into."""
 
 
 def assemble(
@@ -162,7 +162,7 @@ def assemble(
     )
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(context, plugins, activity=host.activity, topics=topics, kept=kept)
-    sensors = Readings(plan.loop, host.slots, record, host.clock.now_ns, sinks.events) if host.slots else None
-    loop = Loop(context, manager, sinks, overrun_hooks=plugins.overrun_hooks, sensors=sensors)
+    readers = build_readers(plan.loop, host.slots, record, host.clock.now_ns, sinks.events)
+    loop = Loop(context, manager, sinks, overrun_hooks=plugins.overrun_hooks, readers=readers)
     manager.configure()
     return AssembledRobot(context.hardware, manager, loop, record)

@@ -238,7 +238,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
         supervision=Pulse(heartbeat, stop, watch, sinks.events, report, clock.now_ns, pacing),
         inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),
         activity=Activity(heartbeat, realtime.thread_count),
-        slots=[mapped(descriptor) for descriptor in job.memory.sensors],
+        slots={name: [mapped(one) for one in slots] for name, slots in job.memory.slots.items()},
     )
     kept = msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates)
     robot = assemble(plan, plugins, host, take_over=job.take_over, kept=kept)

@@ -21,17 +21,18 @@ from dxlrun.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.realtime import Grant, guardian_priority, raise_share
+from dxlrun.control.source_process import PlannedProcess, planned_processes
 from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.guardian import GuardianJob, GuardianMessage, GuardianPlan
 from dxlrun.run.loop_process import LoopOutcome
-from dxlrun.run.sensor_process import SensorJob
 from dxlrun.run.simulation_front import first_message, start_simulation
+from dxlrun.run.source_process import SourceJob
 from dxlsim.messages import SimulationJob, SimulationMessage
 
-SensorMessage = Ready | Failed
+SourceMessage = Ready | Failed
 RecorderMessage = Ready | Draining | Failed | LogClosed
 GatewayMessage = Listening | Failed
 
@@ -77,10 +78,19 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         stderr=process.memory_file("dxlrun-stderr"),
         kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
         span=process.memory_file("dxlrun-span"),
-        sensors=tuple(slot.create(f"sensor-{one.name}", len(one.states)) for one in plan.loop.sensors),
+        slots=_create_slots(plan),
         shafts=slot.create("shafts", 3 * sensed.servos) if sensed is not None else -1,
         simulation=heartbeat.create_progress(simulated) if simulated else -1,
     )
+
+
+def _create_slots(plan: Plan) -> dict[str, tuple[int, ...]]:
+    slots: dict[str, tuple[int, ...]] = {}
+    for one in planned_processes(plan.loop):
+        process, name = one.process, one.feature.name
+        created = slot.create(f"{process.kind}-{process.source}", process.values)
+        slots[name] = (*slots.get(name, ()), created)
+    return slots
 
 
 def _published(plan: Plan) -> float:
@@ -132,16 +142,16 @@ def start_simulated_buses(
         raise
 
 
-def start_sensor(
-    plan: Plan, index: int, memory: RunMemory, *, restarted: bool = False
-) -> Child[SensorMessage]:
-    """Start the process of a sensor; `ready` then waits until its device is open."""
-    sensor = plan.loop.sensors[index]
-    bodies = sensed_bodies(plan) if sensor.links else None
-    job = SensorJob(sensor, memory.sensors[index], os.getpid(), restarted, bodies, memory.shafts)
+def start_source(
+    plan: Plan, planned: PlannedProcess, memory: RunMemory, *, restarted: bool = False
+) -> Child[SourceMessage]:
+    """Start a process of a feature; `ready` then waits until its source is open."""
+    bodies = sensed_bodies(plan) if planned.process.has_body else None
+    slot_of = memory.slots[planned.feature.name][planned.index]
+    job = SourceJob(planned.feature, planned.process, slot_of, os.getpid(), restarted, bodies, memory.shafts)
     inherited = [job.slot, *([job.shafts] if bodies is not None else [])]
-    program = Program(f"sensor {sensor.name}", "dxlrun.run.sensor_process")
-    return _executed(program, job, inherited, memory, Decoder(SensorMessage))
+    program = Program(planned.process.title, "dxlrun.run.source_process")
+    return _executed(program, job, inherited, memory, Decoder(SourceMessage))
 
 
 def start_recorder(log: Path, header: LogHeader, memory: RunMemory, plan: Plan) -> Child[RecorderMessage]:

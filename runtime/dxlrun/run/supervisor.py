@@ -38,11 +38,12 @@ from dxlrun.channels.process import (
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.realtime import Grant
+from dxlrun.control.source_process import PlannedProcess, planned_processes
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed, epoch_offset_ns
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run import sensor_process
+from dxlrun.run import source_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
@@ -50,7 +51,7 @@ from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
-    SensorMessage,
+    SourceMessage,
     create_memory,
     guardian_job,
     loop_grants,
@@ -58,8 +59,8 @@ from dxlrun.run.run_processes import (
     start_gateway,
     start_guardian,
     start_recorder,
-    start_sensor,
     start_simulated_buses,
+    start_source,
 )
 from dxlrun.run.run_summary import (
     Progress,
@@ -88,7 +89,7 @@ if TYPE_CHECKING:
 
 _POLL_S = 0.1
 _RESTART_S = 2.0
-"""Between the end of a sensor's process and the start of another one."""
+"""Between the end of a source's process and the start of another one."""
 _LOOK_NS = 100_000_000
 """A look at another process counts for at most this: when this one did not run, that may not have either."""
 _GONE_POLL_S = 0.02
@@ -96,14 +97,13 @@ _GONE_POLL_S = 0.02
 
 
 @dataclass(slots=True)
-class _SensorProcess:
-    """The process of one sensor, started again a while after it ended by itself."""
+class _SourceProcess:
+    """A process of a feature, started again a while after it ended by itself."""
 
     plan: Plan
-    index: int
-    """Among the plan's sensors."""
+    planned: PlannedProcess
     memory: RunMemory
-    child: Child[SensorMessage] | None
+    child: Child[SourceMessage] | None
     restart_s: float = 0.0
     """When another one is started; of use only while there is none."""
 
@@ -113,14 +113,15 @@ class _SensorProcess:
             if time.monotonic() >= self.restart_s:
                 self.restart_s = time.monotonic() + _RESTART_S
                 with suppress(OSError):  # the system has no process left: later, perhaps
-                    self.child = start_sensor(self.plan, self.index, self.memory, restarted=True)
+                    self.child = start_source(self.plan, self.planned, self.memory, restarted=True)
         elif self.child.exited():
             self.child.kill()
             code = self.child.process.returncode
             self.child = None
             self.restart_s = time.monotonic() + _RESTART_S
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-            writer = SlotWriter(mapped(self.memory.sensors[self.index]))
+            slots = self.memory.slots[self.planned.feature.name]
+            writer = SlotWriter(mapped(slots[self.planned.index]))
             writer.say(SlotState.ENDED, f"its process ended ({how}), another one is started")
 
     def end(self) -> None:
@@ -128,7 +129,7 @@ class _SensorProcess:
         if self.child is None:
             return
         self.child.process.terminate()
-        self.child.exited(sensor_process.END_S)
+        self.child.exited(source_process.END_S)
         self.child.kill()
         self.child = None
 
@@ -156,7 +157,7 @@ class _Run:
         self.recorder: Child[RecorderMessage] | None = None
         self.guardian: Child[GuardianMessage] | None = None
         self.gateway: Child[GatewayMessage] | None = None
-        self.sensors: list[_SensorProcess] = []
+        self.sources: list[_SourceProcess] = []
         self.writer: KeptStateWriter | None = None
         self.socket: Path | None = None
         """Where the gateway listens; None before it does."""
@@ -202,15 +203,15 @@ class _Run:
         ports: dict[str, str] = {}
         if self.plan.simulated:
             self.simulation, ports = start_simulated_buses(self.plan, self.options.ledger, self.memory)
-        for index in range(len(self.plan.loop.sensors)):
-            sensor = start_sensor(self.plan, index, self.memory)
-            self.sensors.append(_SensorProcess(self.plan, index, self.memory, sensor))
+        for planned in planned_processes(self.plan.loop):
+            child = start_source(self.plan, planned, self.memory)
+            self.sources.append(_SourceProcess(self.plan, planned, self.memory, child))
         if self.log:
             header = log_header(self.plan, self.offset_ns, virtual=False, kept=self.kept)
             self.recorder = start_recorder(self.log, header, self.memory, self.plan)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
-        for each in self.sensors:
+        for each in self.sources:
             if each.child is not None:
                 each.child.ready()
         self.hold()
@@ -258,8 +259,8 @@ class _Run:
             self._look_after_gateway(heartbeat)
             heartbeat.set_steering(self.steering)
             self._look_after_simulation(guardian)
-            for sensor in self.sensors:
-                sensor.look()
+            for source in self.sources:
+                source.look()
             loop = () if gone or self.loop is None else (self.loop,)
             message = guardian.poll(_GONE_POLL_S if gone else _POLL_S, *loop)
             gone = gone or bool(select.select(loop, [], [], 0)[0])
@@ -392,8 +393,8 @@ class _Run:
             self.loop = None
             let_go(self.guardian.channel.descriptors)
             self.guardian.channel.descriptors.clear()
-        for sensor in self.sensors:
-            sensor.end()
+        for source in self.sources:
+            source.end()
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.writer:

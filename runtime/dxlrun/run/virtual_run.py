@@ -19,12 +19,18 @@ from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
-from dxlrun.contract.sensor import Sensor
 from dxlrun.control.context import StopFlag, Unsupervised
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.loop import LoopResult
-from dxlrun.control.sensors.sampling import SampledSensor, described
+from dxlrun.control.source_process import (
+    ProcessStage,
+    SampledSource,
+    SourceContext,
+    describe_error,
+    planned_processes,
+)
 from dxlrun.errors import DxlrunError, InputError, PortError
+from dxlrun.features import stages
 from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.plan.policy_plan import TORQUE_STAYS
@@ -80,7 +86,7 @@ class VirtualRobot:
         if simulated.sensed is not None:
             fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
         plugins = load_plugins(files=plan.included)
-        slots = self._start_sensors(plugins, mechanics)
+        slots = self._start_sources(plugins, mechanics)
         self.stop = StopFlag()
         self.inbox = QueueInbox()
         """Commands put here are taken at the start of a cycle."""
@@ -122,38 +128,37 @@ class VirtualRobot:
         )
         self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)
 
-    def _start_sensors(self, plugins: PlugIns, mechanics: Mechanics) -> list[memoryview]:
-        """Open the sensors and let the clock sample them; return their slots. Raises PortError."""
+    def _start_sources(self, plugins: PlugIns, mechanics: Mechanics) -> dict[str, list[memoryview]]:
+        """Open what processes sample, and let the clock do it; return the slots. Raises PortError."""
         bodies = sensed_bodies(self.plan)
-        body = None
-        if bodies is not None:
-            body = SensedBody(bodies, mechanics, self.clock.now_ns)
-        slots = []
-        self.sensors: dict[str, Sensor[Any]] = {}
-        """Those of the plan, by name, as their plug-ins made them."""
-        self._sampled: list[SampledSensor] = []
-        for sensor in self.plan.loop.sensors:
-            slots.append(slot.private(len(sensor.states)))
-            self.sensors[sensor.name] = built = plugins.built_sensor(sensor)
-            sampled = SampledSensor(
-                sensor, built, SlotWriter(slots[-1]), self.clock.now_ns, body if sensor.links else None
-            )
+        body = None if bodies is None else SensedBody(bodies, mechanics, self.clock.now_ns)
+        slots: dict[str, list[memoryview]] = {}
+        self.sensors: dict[str, Any] = {}
+        """What samples each source, as its plug-in made it, by the source's name."""
+        self._sampled: list[SampledSource] = []
+        for planned in planned_processes(self.plan.loop):
+            process, memory = planned.process, slot.private(planned.process.values)
+            slots.setdefault(planned.feature.name, []).append(memory)
+            own_body = body if process.has_body else None
+            context = SourceContext(plugins, SlotWriter(memory), self.clock.now_ns, own_body)
+            sampled = planned.stage.build(process.plan, context)
+            self.sensors[process.source] = sampled.driver
             try:
                 sampled.open_first()
             except Exception as error:  # a driver's fault is a sentence, whatever it is
-                raise PortError(f"sensor {sensor.name} cannot be opened: {described(error)}") from error
+                raise PortError(f"{process.title} cannot be opened: {describe_error(error)}") from error
             self._sampled.append(sampled)
-            self._sample(sampled, self.clock.now_ns())
+            self._sample(sampled, process.period_ns, self.clock.now_ns())
         return slots
 
-    def _sample(self, sampled: SampledSensor, due_ns: int) -> None:
-        """Let a sensor take a sample at a time, and one each period from then on."""
+    def _sample(self, sampled: SampledSource, period_ns: int, due_ns: int) -> None:
+        """Take a sample at a time, and one each period from then on."""
 
         def sample() -> None:
             for bus in self.buses:  # what is on the wire acts at its own time
                 bus.advance(due_ns)
             sampled.sample()
-            self._sample(sampled, due_ns + sampled.plan.period_ns)
+            self._sample(sampled, period_ns, due_ns + period_ns)
 
         self.clock.call_at(due_ns, sample)
 
@@ -199,8 +204,8 @@ class VirtualRobot:
             raise
         finally:
             self.sinks.packets.commit()
-            for sensor in self._sampled:
-                sensor.close()
+            for sampled in self._sampled:
+                sampled.close()
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error
@@ -216,12 +221,9 @@ def require_simulated(plan: Plan) -> None:
             f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
             "give the argument port:=sim"
         )
-    if measuring := [sensor for sensor in plan.loop.sensors if not sensor.simulated]:
-        names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
-        raise InputError(
-            f"virtual time needs simulated sensors, but {names} measures the real world: "
-            "leave --virtual out, or take the sensor and what reads it out of the file that runs so"
-        )
+    for feature, stage in stages(ProcessStage, plan.features):
+        if why := stage.refuse_virtual_time(plan.feature_plans.get(feature.name, b"")):
+            raise InputError(why)
 
 
 def _stop(stop: StopFlag) -> None:

@@ -3,9 +3,9 @@
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
 `Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
 `policy_key.py`, `CompileStage` in `compile.py`, `SettingsStage` in `settings.py`, `LayerStage` in `layer.py`,
-`BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `TableStage` in
-`table.py`. One of the first four is required. Forms are made of the names of `dxlrun.tooling.files`.
-The hook `dxlrun_features` registers the feature:
+`BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `ProcessStage` in
+`process.py`, `ReaderStage` in `reader.py`, `TableStage` in `table.py`. One of the first four is required.
+Forms are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature
@@ -39,6 +39,13 @@ if TYPE_CHECKING:
     from dxlrun.control.monitors.monitor import Monitor as Monitor
     from dxlrun.control.monitors.monitor import MonitorStage as MonitorStage
     from dxlrun.control.monitors.policy_actions import PolicyActions as PolicyActions
+    from dxlrun.control.source_process import ProcessStage as ProcessStage
+    from dxlrun.control.source_process import ReaderContext as ReaderContext
+    from dxlrun.control.source_process import ReaderStage as ReaderStage
+    from dxlrun.control.source_process import SampledSource as SampledSource
+    from dxlrun.control.source_process import SourceContext as SourceContext
+    from dxlrun.control.source_process import SourceProcess as SourceProcess
+    from dxlrun.control.source_process import SourceReader as SourceReader
     from dxlrun.description.robot import WrittenPolicy as WrittenPolicy
     from dxlrun.dynamixel.bus_part import BusContext as BusContext
     from dxlrun.dynamixel.bus_part import BusPart as BusPart

@@ -22,15 +22,14 @@ from pydantic import ValidationError
 from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Mismatch, RobotModel
 from dxlrun.contract.hookspecs import CONTRACT_VERSION, HookSpecs
 from dxlrun.contract.joint_controller import LAWS, JointController, laws_of
-from dxlrun.contract.sensor import Sensor
+from dxlrun.control.controllers.offers import Breach, DriverOffer, OfferStage, is_model, methods_breach
 from dxlrun.control.controllers.single_files import class_in_file, file_of, publisher_of
-from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.features import broken_features
+from dxlrun.features import FEATURES, broken_features, stages
 from dxlrun.installed_plugins import GROUP, InstalledPlugin, distribution_name, installed_plugins
 from dxlrun.messages.declared import WrongMessage, declared_message
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import add_control_table
 from dxlwire.control_table.device_table import is_device_table
@@ -92,7 +91,7 @@ class Offer(msgspec.Struct, frozen=True):
 
 Refuse: TypeAlias = Callable[[str, str], PlugInError]
 """Returns the error of one plug-in: what is wrong with it, and the fix."""
-Offered = TypeVar("Offered", Offer, SensorOffer)
+Offered = TypeVar("Offered", Offer, DriverOffer)
 Result = TypeVar("Result")
 Make: TypeAlias = Callable[[], Offered]
 """Imports and checks a class; raises PlugInError."""
@@ -154,8 +153,8 @@ class LoadedPlugIn(msgspec.Struct, frozen=True):
     servo_models: tuple[str, ...]
     overrun: Decide | None
     """What it decides about late cycles; None: nothing."""
-    sensors: Mapping[str, Make[SensorOffer]]
-    """By type."""
+    drivers: Mapping[str, Mapping[str, Make[DriverOffer]]]
+    """Classes for the sections of features, by feature and type."""
     verbs: tuple[str, ...]
     """Of the command line."""
 
@@ -176,8 +175,8 @@ class PlugIns(msgspec.Struct, frozen=True):
     """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
     after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
-    sensors: Mapping[str, SensorOffer] = msgspec.field(default_factory=dict)
-    """By type."""
+    drivers: Mapping[str, Mapping[str, DriverOffer]] = msgspec.field(default_factory=dict)
+    """Classes for the sections of features, by feature and type."""
 
     @property
     def overrun_hooks(self) -> tuple[OverrunHook, ...]:
@@ -188,35 +187,46 @@ class PlugIns(msgspec.Struct, frozen=True):
             if one.overrun is not None
         )
 
-    def packages_of(
-        self,
-        controllers: Sequence[ControllerPlan],
-        sensors: Sequence[SensorPlan],
-        models: Container[str],
-    ) -> dict[str, str]:
+    def drivers_of(self, feature: str) -> Mapping[str, DriverOffer]:
+        """Return the classes for the section of a feature, by type."""
+        return self.drivers.get(feature, {})
+
+    def packages_of(self, controllers: Sequence[ControllerPlan], models: Container[str]) -> dict[str, str]:
         """Return the packages that run in a robot with their distributions, by package.
 
-        Those that offer its controllers, sensors or servo models, those of the classes, where these are in
-        others, and those that decide about late cycles.
+        Those that offer its controllers or servo models, those of the classes, where these are in others, and
+        those that decide about late cycles.
         """
-        types = {one.type for one in controllers}, {one.type for one in sensors}
-        found = {
-            one.package: one.distribution
+        types = {one.type: one.distribution for one in controllers}
+        offering = [
+            one
             for one in self.loaded
-            if types[0] & one.controllers.keys()
-            or types[1] & one.sensors.keys()
+            if types.keys() & one.controllers.keys()
             or one.overrun is not None
             or any(model in models for model in one.servo_models)
-        }
-        known = {one.package: one.distribution for one in self.loaded}
-        classes = [
-            # the text of a single file has a hash of its own
-            *((self.controllers[kind].controller, kind) for kind in types[0] if file_of(kind) is None),
-            *((self.sensors[kind].sensor, kind) for kind in types[1]),
         ]
-        publishers = {one.type: one.distribution for one in controllers}
-        publishers |= {one.type: one.distribution for one in sensors}
-        for made, kind in classes:
+        # the text of a single file has a hash of its own
+        classes = {kind: self.controllers[kind].controller for kind in types if file_of(kind) is None}
+        return self._name_packages(offering, classes, types)
+
+    def packages_of_drivers(self, feature: str, types: Mapping[str, str]) -> dict[str, str]:
+        """Return the packages of classes for the section of a feature, with their distributions.
+
+        `types` has the publishers of the classes by type.
+        """
+        offering = [one for one in self.loaded if types.keys() & one.drivers.get(feature, {}).keys()]
+        classes = {kind: self.drivers_of(feature)[kind].driver for kind in types}
+        return self._name_packages(offering, classes, types)
+
+    def _name_packages(
+        self,
+        offering: Sequence[LoadedPlugIn],
+        classes: Mapping[str, type[Any]],
+        publishers: Mapping[str, str],
+    ) -> dict[str, str]:
+        found = {one.package: one.distribution for one in offering}
+        known = {one.package: one.distribution for one in self.loaded}
+        for kind, made in classes.items():
             package = _top(made.__module__)
             found.setdefault(package, known.get(package, publishers[kind]))
         return {package: distribution_name(publisher) for package, publisher in sorted(found.items())}
@@ -227,19 +237,6 @@ class PlugIns(msgspec.Struct, frozen=True):
             if self.controllers.get(name) is not None:
                 self.after_each(name)
 
-    def built_sensor(self, plan: SensorPlan) -> Sensor[Any]:
-        """Return a new sensor of the plan's type.
-
-        Raises PlugInError (the type is not available, or its class does not take the parameters).
-        """
-        offer = self.sensors.get(plan.type)
-        if offer is None:
-            raise self._unknown("sensor", plan)
-        try:
-            return offer.sensor(offer.sensor.Parameters.model_validate_json(plan.parameters))
-        except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
-            raise PlugInError(f"sensor {plan.name} cannot be built: {_one_line(error)}") from error
-
     def built(self, plan: ControllerPlan) -> Controller[Any]:
         """Return a new controller of the plan's type.
 
@@ -248,7 +245,7 @@ class PlugIns(msgspec.Struct, frozen=True):
         """
         offer = self.controllers.get(plan.type)
         if offer is None:
-            raise self._unknown("controller", plan)
+            raise self.unknown_type(f"controller {plan.name}", plan.type)
         try:
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
             return offer.controller(parameters)
@@ -262,9 +259,10 @@ class PlugIns(msgspec.Struct, frozen=True):
                 f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"
             ) from error
 
-    def _unknown(self, what: str, plan: SensorPlan | ControllerPlan) -> PlugInError:
+    def unknown_type(self, what: str, kind: str) -> PlugInError:
+        """Return the error of an entry whose type no plug-in offers."""
         why = f" ({'; '.join(self.broken.values())})" if self.broken else ""
-        return PlugInError(f"no plug-in offers the type {plan.type} of {what} {plan.name}{why}")
+        return PlugInError(f"no plug-in offers the type {kind} of {what}{why}")
 
 
 def load_plugins(
@@ -288,9 +286,15 @@ def load_plugins(
         after_each(named)
     broken = {**broken_features(), **broken}  # not above: it imports every plug-in
     controllers = _together("controller", [(one.distribution, one.controllers) for one in loaded], broken)
-    sensors = _together("sensor", [(one.distribution, one.sensors) for one in loaded], broken)
+    drivers = {
+        feature.name: Offers(
+            _together(stage.kind, [(one.distribution, one.drivers[feature.name]) for one in loaded], broken),
+            broken,
+        )
+        for feature, stage in stages(OfferStage, FEATURES)
+    }
     offers = Offers(controllers, broken, partial(_offer_of_file, files))
-    return PlugIns(offers, broken, tuple(loaded), after_each, Offers(sensors, broken))
+    return PlugIns(offers, broken, tuple(loaded), after_each, drivers)
 
 
 def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
@@ -347,10 +351,14 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     # pluggy says which hook there is not, and which argument a hook does not have
     _asked(refuse, "has a wrong hook", partial(manager.register, module, plugin.name))
     _asked(refuse, "has a wrong hook", manager.check_pending)
-    contracts, controllers, servo_models, sensors, commands = (
+    contracts, controllers, servo_models, commands = (
         _asked(refuse, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
-        for name in ("contract", "controllers", "servo_models", "sensors", "commands")
+        for name in ("contract", "controllers", "servo_models", "commands")
     )
+    offered = {
+        feature.name: (stage, _asked(refuse, "raised in a hook", getattr(manager.hook, stage.hook)))
+        for feature, stage in stages(OfferStage, FEATURES)
+    }
     if not contracts:
         raise refuse("does not declare its contract", "it must implement the hook dxlrun_contract")
     contract = contracts[0]
@@ -367,7 +375,10 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
         dict(_makes(controllers, "dxlrun_controllers", refuse, partial(_offer, publisher, refuse))),
         tuple(name for models in servo_models for name in _add_servo_models(models, refuse)),
         _overrun(manager),
-        dict(_makes(sensors, "dxlrun_sensors", refuse, partial(_sensor_offer, publisher, refuse))),
+        {
+            name: dict(_makes(found, stage.hook, refuse, partial(_driver_offer, stage, publisher, refuse)))
+            for name, (stage, found) in offered.items()
+        },
         tuple(str(verb.name) for added in commands for verb in added),
     )
 
@@ -451,9 +462,11 @@ def _add_servo_models(models: object, refuse: Refuse) -> list[str]:
     return names
 
 
-def _sensor_offer(publisher: str, refuse: Refuse, name: str, sensor: object) -> SensorOffer:
-    _check(sensor_breach(sensor), sensor, name, refuse)
-    return SensorOffer(name, cast("type[Sensor[Any]]", sensor), publisher)
+def _driver_offer(
+    stage: OfferStage, publisher: str, refuse: Refuse, name: str, driver: object
+) -> DriverOffer:
+    _check(stage.find_breach(driver), driver, name, refuse)
+    return DriverOffer(name, cast("type[Any]", driver), publisher)
 
 
 def _offer(publisher: str, refuse: Refuse, name: str, controller: object) -> Offer:

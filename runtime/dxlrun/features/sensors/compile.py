@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
 from dxlrun.compile.controller_entry import PlugInCode, where_to_get
 from dxlrun.compile.controllers import report_entry
 from dxlrun.compile.problems import RobotFile
+from dxlrun.control.controllers.offers import DriverOffer
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.sensors.offer import SensorOffer, names_breach
 from dxlrun.description.bus import SIMULATED
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.sensors import form
 from dxlrun.features.sensors.form import SensorEntry
-from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
+from dxlrun.features.sensors.offer import is_units, names_breach
+from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
+from dxlrun.plan.loop_plan import SourcePlan
 
 _LEAST_TIMEOUT_NS = 50_000_000  # A process without real time may wait so long for a processor
 _TIMEOUT_PERIODS = 5
@@ -35,7 +37,10 @@ def compile_sensors(compilation: Compilation) -> Contribution:
             for plan in sensors
         ),
         links={plan.name: plan.links[0] for plan in sensors if len(plan.links) == 1},
-        sensors=sensors,
+        plan=encode_sensors(sensors),
+        packages=compilation.plugins.packages_of_drivers(
+            "sensors", {sensor.type: sensor.distribution for sensor in sensors}
+        ),
     )
 
 
@@ -46,16 +51,16 @@ def _compiled(
     file: RobotFile, name: str, entry: SensorEntry, plugins: PlugIns, known: Collection[str] | None
 ) -> SensorPlan | None:
     marks = file.marks
-    offer = plugins.sensors.get(entry.type)
+    offer = plugins.drivers_of("sensors").get(entry.type)
     if offer is None:
         file.error(
             marks.value("sensors", name, "type"),
             f"no plug-in offers the sensor type {entry.type} of {name}",
-            where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
+            where_to_get(entry.type, tuple(plugins.drivers_of("sensors")), plugins.broken),
         )
         return None
     names = report_entry(
-        file, "sensor", name, entry, offer.sensor.Parameters, lambda: _names(name, entry, offer)
+        file, "sensor", name, entry, offer.driver.Parameters, lambda: _names(name, entry, offer)
     )
     if names is None:
         return None
@@ -80,20 +85,20 @@ def _compiled(
         timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
         on_lost=entry.on_lost,
         links=links,
-        simulated=offer.sensor.simulated,
+        simulated=offer.driver.simulated,
         noisy=noisy,
         units=units,
     )
 
 
 def _names(
-    name: str, entry: SensorEntry, offer: SensorOffer
+    name: str, entry: SensorEntry, offer: DriverOffer
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], dict[str, str]]:
     """Return the states of a sensor, its links, the states with noise, and the units of states.
 
     Raises ValidationError (parameters), and WrongEntry.
     """
-    sensor, code = offer.sensor, PlugInCode("sensor", name, offer.distribution)
+    sensor, code = offer.driver, PlugInCode("sensor", name, offer.distribution)
     parameters = code.parameters(entry.parameters, sensor.Parameters)
     with code.asked_to("name its states and links"):
         states, links = sensor.states(parameters), sensor.links(parameters)
@@ -107,15 +112,6 @@ def _names(
     if breach:
         raise code.broken(breach)
     return states, links, noisy, dict(units)
-
-
-def is_units(found: object, states: Collection[str]) -> bool:
-    """Check whether something has the unit of each of some states."""
-    return (
-        isinstance(found, Mapping)
-        and set(found) <= set(states)
-        and all(isinstance(unit, str) for unit in found.values())
-    )
 
 
 def _check_links(

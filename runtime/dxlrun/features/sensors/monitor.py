@@ -8,7 +8,8 @@ from typing import Self
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
-from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
+from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
+from dxlrun.plan.loop_plan import LoopPlan
 
 
 @dataclass(slots=True)
@@ -24,7 +25,9 @@ class NeededSensors:
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
         """Return a monitor of the sensors that the run needs; None: it needs none."""
         needed = tuple(
-            (record.layout.sources.index(one.name), one) for one in plan.sensors if one.on_lost == "stop"
+            (record.layout.sources.index(one.name), one)
+            for one in decode_sensors(plan.feature_plans.get("sensors", b""))
+            if one.on_lost == "stop"
         )
         return cls(needed, record, actions) if needed else None
 

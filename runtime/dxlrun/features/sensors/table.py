@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from dxlrun.compile.report import Row, TableStage
+from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 from dxlrun.output.quantity import names_with_units
 from dxlrun.output.table import Column, Table, Value
-from dxlrun.plan.loop_plan import SensorPlan
 from dxlrun.plan.robot_plan import Plan
 
 
 def sensor_rows(plan: Plan) -> Iterator[Row]:
     """Yield a row for each sensor, in the order of the file."""
-    return map(_sensor, plan.loop.sensors)
+    return map(_sensor, decode_sensors(plan.feature_plans.get("sensors", b"")))
 
 
 def sensor_table(sensors: Sequence[Row]) -> Table:

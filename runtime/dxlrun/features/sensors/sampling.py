@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +9,12 @@ import numpy as np
 
 from dxlrun.channels.slot import Floats, SlotState, SlotWriter
 from dxlrun.contract.sensor import Sensor, SensorContext
-from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.source_process import describe_error
+from dxlrun.errors import PlugInError
+from dxlrun.features.sensors.plan import SensorPlan
 from dxlsim.motion.link_motion import Body
 
-_NUMBER = re.compile(r"\[Errno -?\d+\] ")
 REOPEN_NS = 1_000_000_000
 """A sensor that failed is opened again after this time."""
 
@@ -30,7 +31,7 @@ class SampledSensor:
         body: Body | None,
     ) -> None:
         self.plan = plan
-        self.sensor = sensor
+        self.driver = sensor
         self._writer = writer
         self._now_ns = now_ns
         self._values: Floats = np.full(len(plan.states), np.nan)
@@ -40,6 +41,11 @@ class SampledSensor:
         """When it is opened again; of use only while it is not `open`."""
 
     @property
+    def waits(self) -> bool:
+        """True if the sensor waits for the next sample of its device."""
+        return self.driver.waits
+
+    @property
     def open(self) -> bool:
         """True while its device is open."""
         return self._open
@@ -47,7 +53,7 @@ class SampledSensor:
     def open_first(self) -> None:
         """Open the device at the start of a run; raises whatever the sensor raises."""
         try:
-            self.sensor.open(self._context)
+            self.driver.open(self._context)
         except BaseException:
             self.close()
             raise
@@ -60,7 +66,7 @@ class SampledSensor:
             return False
         self._values.fill(np.nan)
         try:
-            t_ns = self.sensor.read(self._values)
+            t_ns = self.driver.read(self._values)
             if t_ns is None:
                 return False
             now_ns = self._now_ns()
@@ -78,15 +84,15 @@ class SampledSensor:
         """Close the device, whatever it raises."""
         self._open = False
         try:
-            self.sensor.close()
+            self.driver.close()
         except Exception as error:  # as above
-            self._writer.say(SlotState.FAILED, f"cannot be closed: {described(error)}")
+            self._writer.say(SlotState.FAILED, f"cannot be closed: {describe_error(error)}")
 
     def _reopen(self) -> bool:
         if self._now_ns() < self.reopen_ns:
             return False
         try:
-            self.sensor.open(self._context)
+            self.driver.open(self._context)
         except Exception as error:  # as above
             self.fail(error)
             return False
@@ -98,13 +104,23 @@ class SampledSensor:
         """Close the device for what was raised, and open it again after a while."""
         self.close()
         self.reopen_ns = self._now_ns() + REOPEN_NS
-        self._writer.say(SlotState.FAILED, described(error))
+        self._writer.say(SlotState.FAILED, describe_error(error))
 
     def _say(self, text: str) -> None:
         self._writer.say(SlotState.OPEN if self._open else SlotState.STARTING, text)
 
 
-def described(error: BaseException) -> str:
-    """Return an error in one line."""
-    text = _NUMBER.sub("", " ".join(str(error).split()))
-    return text if isinstance(error, OSError) and text else f"{type(error).__name__}: {text}"
+def build_sensor(plugins: PlugIns, plan: SensorPlan) -> Sensor[Any]:
+    """Return a new sensor of the plan's type.
+
+    Raises PlugInError: the type is not available, or its class does not take the parameters.
+    """
+    offer = plugins.drivers_of("sensors").get(plan.type)
+    if offer is None:
+        raise plugins.unknown_type(f"sensor {plan.name}", plan.type)
+    try:
+        sensor: Sensor[Any] = offer.driver(offer.driver.Parameters.model_validate_json(plan.parameters))
+    except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise PlugInError(f"sensor {plan.name} cannot be built: {what}") from error
+    return sensor

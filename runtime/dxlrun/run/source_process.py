@@ -1,4 +1,4 @@
-"""The process of one sensor: opens its device, and leaves its samples in the slot that the loop reads.
+"""A process of a feature: opens a source, and leaves its samples in the slot that the loop reads.
 
 Executed afresh, in a session of its own; it ends by SIGTERM, or with the supervisor.
 """
@@ -21,24 +21,32 @@ from dxlrun.channels.process import Failed, MessageChannel, Ready
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.sensors.sampling import SampledSensor, described
+from dxlrun.control.source_process import (
+    ProcessStage,
+    SampledSource,
+    SourceContext,
+    SourceProcess,
+    describe_error,
+)
 from dxlrun.errors import PlugInError
-from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.features import stages
+from dxlrun.features.feature import Feature
 from dxlsim.motion.body import SimulatedBody
 from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.simulation_plan import UrdfBodies
 
 END_S = 1.0
-"""How long a sensor may take to close its device."""
+"""How long a source may take to close its device."""
 _SHORTEST_NAP_S = 0.001
 """A device that should wait for a sample and does not must not take a whole core."""
 
 
 @dataclass(frozen=True, slots=True)
-class SensorJob:
-    """What the process of a sensor is executed for."""
+class SourceJob:
+    """Job of a process that samples a source."""
 
-    plan: SensorPlan
+    feature: Feature
+    process: SourceProcess
     slot: int
     """Descriptor."""
     supervisor: int
@@ -87,8 +95,8 @@ def _stop(*_: object) -> None:
 
 
 def main() -> int:
-    """Run the process of a sensor: `--job-fd N --control-fd M`."""
-    job, channel = process.begun(SensorJob, msgspec.json.Decoder(msgspec.Struct))
+    """Run the process of a source: `--job-fd N --control-fd M`."""
+    job, channel = process.begun(SourceJob, msgspec.json.Decoder(msgspec.Struct))
     signal.signal(signal.SIGTERM, _stop)
     process.hold_foreign_code(signal.SIGTERM)
     if os.getppid() != job.supervisor:
@@ -102,44 +110,43 @@ def main() -> int:
             os.killpg(0, signal.SIGKILL)  # nothing else ends what the driver has started
 
 
-def _run(job: SensorJob, channel: MessageChannel[msgspec.Struct]) -> int:
-    plan, writer = job.plan, SlotWriter(mapped(job.slot))
+def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
+    process, writer = job.process, SlotWriter(mapped(job.slot))
     body = None
     if job.bodies is not None:
         body = RemoteBody(job.bodies, SlotReader(mapped(job.shafts)))
+    ((_, stage),) = stages(ProcessStage, [job.feature])
     try:
-        sensor = load_plugins().built_sensor(plan)
+        sampled = stage.build(process.plan, SourceContext(load_plugins(), writer, time.monotonic_ns, body))
     except PlugInError as error:
         channel.send(Failed(str(error)))
         return 1
-    sampled = SampledSensor(plan, sensor, writer, time.monotonic_ns, body)
     try:
         sampled.open_first()
     except _Stop:
         raise
     except Exception as error:  # a driver's fault is a sentence, whatever it is
         if not job.restarted:
-            channel.send(Failed(f"sensor {plan.name} cannot be opened: {described(error)}"))
+            channel.send(Failed(f"{process.title} cannot be opened: {describe_error(error)}"))
             return 1
         sampled.fail(error)
     try:
         channel.send(Ready())
-        _sample_for_ever(sampled)
+        _sample_for_ever(sampled, process.period_ns)
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is being stopped already
         sampled.close()
         writer.say(SlotState.ENDED, "")
 
 
-def _sample_for_ever(sampled: SampledSensor) -> NoReturn:
-    period_ns = sampled.plan.period_ns
+def _sample_for_ever(sampled: SampledSource, period_ns: int) -> NoReturn:
     due_ns = time.monotonic_ns()
     while True:
         came = sampled.sample()
         now_ns = time.monotonic_ns()
         if not sampled.open:
             time.sleep(max(_SHORTEST_NAP_S, (sampled.reopen_ns - now_ns) * 1e-9))
-        elif sampled.sensor.waits:
+        elif sampled.waits:
             if not came:
                 time.sleep(_SHORTEST_NAP_S)
         else:

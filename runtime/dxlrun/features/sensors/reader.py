@@ -1,16 +1,16 @@
-"""Readings: the newest samples of all sensors into the cycle's record; it copies, and never waits."""
+"""Reader of the sensors: copies their newest samples into the cycle's record, and never waits."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.slot import Floats, SlotReader, SlotState
-from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
+from dxlrun.control.source_process import ReaderContext, ReaderStage
+from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
 _GONE = (SlotState.FAILED, SlotState.ENDED)
 """The device is not there, or the process is not."""
@@ -38,19 +38,11 @@ class Readings:
     values stay the same, are as old as the first of them. What changes is an event, once.
     """
 
-    def __init__(
-        self,
-        plan: LoopPlan,
-        slots: Sequence[memoryview],
-        record: CycleRecord,
-        now_ns: Callable[[], int],
-        events: EventSink,
-    ) -> None:
-        """`slots` in the order of the plan's sensors; `now_ns` is the clock by which they give times."""
-        self._now_ns = now_ns
+    def __init__(self, context: ReaderContext) -> None:
+        self._now_ns = context.now_ns
         self._rows = tuple(
-            _Row(sensor, SlotReader(memory), record, events)
-            for sensor, memory in zip(plan.sensors, slots, strict=True)
+            _Row(sensor, SlotReader(memory), context.record, context.events)
+            for sensor, memory in zip(decode_sensors(context.plan), context.slots, strict=True)
         )
 
     def read(self) -> None:
@@ -58,6 +50,9 @@ class Readings:
         now_ns = self._now_ns()
         for row in self._rows:
             row.read(now_ns)
+
+
+STAGE = ReaderStage(Readings)
 
 
 class _Row:

@@ -1,0 +1,57 @@
+"""Sensor classes of plug-ins, checked against the contract when they are loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import cast
+
+from dxlrun.contract.sensor import Sensor
+from dxlrun.control.controllers.offers import Breach, OfferStage, is_model, methods_breach
+from dxlrun.description.form import ParametersModel
+
+_METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")
+"""Called by dxlrun, all by position."""
+
+
+def sensor_breach(sensor: object) -> Breach | None:
+    """Check a class that is offered as a sensor."""
+    if not is_model(sensor, Sensor):
+        return "which is no sensor", "derive a class from dxlrun.Sensor"
+    if breach := methods_breach(sensor, Sensor, _METHODS):
+        return breach
+    if not is_model(getattr(sensor, "Parameters", None), ParametersModel):
+        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+    for flag in ("waits", "simulated"):
+        if not isinstance(getattr(sensor, flag), bool):
+            return f"whose {flag} is neither True nor False", "write one of them"
+    return None
+
+
+def names_breach(states: object, links: object) -> Breach | None:
+    """Check what a sensor's `states` and `links` returned."""
+    for what, names in (("states", states), ("links", links)):
+        if not isinstance(names, tuple) or not all(isinstance(one, str) for one in names):
+            return f"returns {names!r} from {what}", "return a tuple of names, such as angular_velocity.x"
+    found = cast("tuple[str, ...]", states)
+    if not found:
+        return "returns () from states", "return a tuple of names, such as angular_velocity.x"
+    if wrong := [one for one in found if not one or "/" in one or one == "age"]:
+        return (
+            f"has a state {wrong[0]!r}",
+            "name a state as angular_velocity.x; each source has an age already",
+        )
+    if len(set(found)) < len(found):
+        return f"has a state twice: {', '.join(found)}", "name each once"
+    return None
+
+
+def is_units(found: object, states: Collection[str]) -> bool:
+    """Check whether something has the unit of each of some states."""
+    return (
+        isinstance(found, Mapping)
+        and set(found) <= set(states)
+        and all(isinstance(unit, str) for unit in found.values())
+    )
+
+
+STAGE = OfferStage("dxlrun_sensors", "sensor", sensor_breach, lambda driver: {"simulated": driver.simulated})
