@@ -169,8 +169,9 @@ class ServoPlan(msgspec.Struct, frozen=True):
     hardware_error_address: int | None
     """Address of the byte that reports hardware errors; None in Protocol 1.0, whose replies contain them."""
     torque_limit: TorqueLimit | None = None  # None where the model has none that limits position control
-    registers: tuple[RegisterValue, ...] = ()
-    """What the robot file declares, in the order in which it is written: EEPROM first."""
+    settings: tuple[RegisterValue, ...] = msgspec.field(default=(), name="registers")
+    """What its memory shall hold, in the order in which it is written: EEPROM first. Logs have the name of
+    the key that most of it comes from."""
     modes: tuple[ModePlan, ...] = ()  # The modes in which the servo can be
     start_mode: Mode = Mode.POSITION  # In which it is brought at the start; one of `modes`
     own_limits: tuple[OwnLimit, ...] = ()
@@ -193,7 +194,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
     @property
     def declared(self) -> dict[str, int]:
         """The integer on the wire that the robot file gives an item, by item, in the order of the writes."""
-        return {register.name: register.value for register in self.registers}
+        return {setting.name: setting.value for setting in self.settings}
 
     @property
     def position_per_tick(self) -> float:

@@ -75,7 +75,7 @@ def look(protocol, change, *, take_over=False, refused=()):
     table = find_table(model, protocol)
     if "declared" in change:
         item = table.items[change["declared"]]
-        servo = replace(servo, registers=(RegisterValue(item.address, item.size, 0, item.name),))
+        servo = replace(servo, settings=(RegisterValue(item.address, item.size, 0, item.name),))
     values = {name: item.initial or 0 for name, item in table.items.items()}
     values |= {"torque_limit": 1023, "goal_pwm": 885}
     values |= {"model_number": servo.model_number, "firmware_version": 52 if protocol == 2.0 else 24}

@@ -194,7 +194,7 @@ def test_a_reported_setting_that_the_robot_file_then_declares_is_no_longer_repor
         if value == start or (item.initial is None and not rule.limited_by):
             continue
         declared = register_value(table, item.name, value)
-        servo = replace(bench.plan.servos[0], registers=(declared,))
+        servo = replace(bench.plan.servos[0], settings=(declared,))
         bench.one = first_reach(bench.plan, servo)
         assert said(bench.inspect(**{item.name: value})) == [], item.name
 
@@ -318,7 +318,7 @@ def test_what_the_robot_file_declares_is_no_event():
     plan = make_x((4,))
     item = plan_item(plan, "position_p_gain")
     register = RegisterValue(item.address, item.size, 50, item.name)
-    rig = make_rig(replace(plan, servos=(replace(plan.servos[0], registers=(register,)),)))
+    rig = make_rig(replace(plan, servos=(replace(plan.servos[0], settings=(register,)),)))
     rig.servo(4).poke(item.name, 50)
     rig.hardware.start()
     assert rig.events.of(EventCode.REGISTER_DIFFERS) == []

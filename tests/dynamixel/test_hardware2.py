@@ -118,7 +118,7 @@ def test_older_firmware_is_not_asked_for_what_it_does_not_have():
 def test_a_declared_register_that_older_firmware_does_not_have_is_refused():
     plan = make_x((11, 12))
     wanted = RegisterValue(60, 1, 0, "startup_configuration", True)
-    servos = tuple(replace(servo, registers=(wanted,)) for servo in plan.servos)
+    servos = tuple(replace(servo, settings=(wanted,)) for servo in plan.servos)
     rig = make_rig(replace(plan, servos=servos), firmware=44)
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()

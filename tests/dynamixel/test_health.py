@@ -275,7 +275,7 @@ def test_a_servo_that_is_not_certain_to_be_in_order_does_not_come_back_and_is_re
 
 def test_registers_that_a_reboot_took_are_written_again():
     gain = RegisterValue(84, 2, 555, "position_p_gain")
-    rig = start_rig(every_servo(make_x((11, 12, 13, 14)), registers=(gain,)))
+    rig = start_rig(every_servo(make_x((11, 12, 13, 14)), settings=(gain,)))
     assert rig.registers(gain.name) == [555] * 4
     with rig.away(13) as servo:
         servo.reset()
@@ -305,7 +305,7 @@ def test_returned_wheel_is_given_torque_at_rest(hears_stop):
 
 def test_returned_servo_reports_settings_that_differ_but_those_of_the_run():
     gain = RegisterValue(84, 2, 555, "position_p_gain")
-    rig = start_rig(every_servo(make_x((11, 12)), registers=(gain,)))
+    rig = start_rig(every_servo(make_x((11, 12)), settings=(gain,)))
     with rig.away(12) as servo:
         servo.poke("temperature_limit", 70)
     ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)

@@ -190,7 +190,7 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
         RegisterValue(items[name].address, items[name].size, value, name)
         for name, value in (("position_p_gain", items["position_p_gain"].initial), ("led", 1))
     )
-    rig = make_rig(replace(plan, servos=(replace(plan.servos[0], registers=declared), plan.servos[1])))
+    rig = make_rig(replace(plan, servos=(replace(plan.servos[0], settings=declared), plan.servos[1])))
     for servo in rig.buses[0].servos:
 
         def reset(servo=servo, before=servo._change_mode):

@@ -51,7 +51,7 @@ def storm(protocol, seed):
     registers = tuple(RegisterValue(*places[name], value, name) for name, value in declared.items())
     change = {"model": "XM430-W350", "reference": math.pi} if protocol == 2.0 else {"model": "MX-64"}
     plan = make_plan((1, 2, 3), protocol=protocol, return_delay_ns=0, **change)
-    plan = replace(plan, servos=tuple(replace(one, registers=registers) for one in plan.servos))
+    plan = replace(plan, servos=tuple(replace(one, settings=registers) for one in plan.servos))
     rig = start_rig(plan)
     started, wishes = len(rig.into_bus()), Wishes(rig, declared)
     chance = random.Random(f"{protocol} {seed}")

@@ -28,7 +28,7 @@ def declared(plan, index=0, **values):
     table = find_table(servo.model, plan.protocol)
     wanted = sorted((register(table, *one) for one in values.items()), key=lambda one: not one.eeprom)
     servos = list(plan.servos)
-    servos[index] = replace(servo, registers=tuple(wanted))
+    servos[index] = replace(servo, settings=tuple(wanted))
     return replace(plan, servos=tuple(servos))
 
 
@@ -47,7 +47,7 @@ def bench(plan, **change):
 def settled(execute, plan):
     """Settle the declared registers of the first servo; return what was found."""
     found = Findings()
-    execute(settle(first_reach(plan, plan.servos[0]), plan.servos[0].registers, found))
+    execute(settle(first_reach(plan, plan.servos[0]), plan.servos[0].settings, found))
     return found
 
 
@@ -55,7 +55,7 @@ def rejoined(execute, plan, torque):
     """Take the first servo back; return whether it has torque, and what was found."""
     found, servo = Findings(), plan.servos[0]
     one = reach(plan, servo)
-    return execute(rejoin(one, found, servo.start_mode, servo.registers, torque=torque)), found
+    return execute(rejoin(one, found, servo.start_mode, servo.settings, torque=torque)), found
 
 
 def written(found):
@@ -86,7 +86,7 @@ def test_only_what_differs_is_written_and_it_is_read_back():
 def test_comparing_writes_nothing():
     plan = declared(make_x((11, 12)), position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
-    found = execute(compare(first_reach(plan, plan.servos[0]), plan.servos[0].registers))
+    found = execute(compare(first_reach(plan, plan.servos[0]), plan.servos[0].settings))
     assert [(one.register.name, one.found, one.differs) for one in found] == [
         ("position_p_gain", 800, True),
         ("position_d_gain", 0, False),
@@ -238,7 +238,7 @@ def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(pr
     for table in [table for table in all_tables() if table.protocol == protocol]:
         plan = make_plan((5,), protocol=protocol, model=table.model, reference=1.5, lower=-0.1, upper=0.1)
         wanted = sorted(others(table), key=lambda one: not one.eeprom)
-        plan = replace(plan, servos=(replace(plan.servos[0], registers=tuple(wanted)),))
+        plan = replace(plan, servos=(replace(plan.servos[0], settings=tuple(wanted)),))
         rig, execute = bench(plan, position=1.5)
         found = settled(execute, plan)
         assert found.problems == []

@@ -264,7 +264,7 @@ def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(sta
 
 def test_a_ramp_that_the_watchdog_reset_is_written_again():
     item = find_table("XM430-W350").items["profile_acceleration"]
-    rig = start_rig(every_servo(arm(), registers=(RegisterValue(item.address, item.size, 100, item.name),)))
+    rig = start_rig(every_servo(arm(), settings=(RegisterValue(item.address, item.size, 100, item.name),)))
     rig.cycles(5)
     rig.wait(300_000_000)
     assert rig.registers(item.name) == [0] * 4

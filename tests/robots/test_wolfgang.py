@@ -46,7 +46,7 @@ def test_it_has_the_servos_and_boards_of_the_team_and_runs():
             servo.servo_id,
             find_table(servo.model, 2.0).model_number,
             bus.name,
-            next(one.value for one in servo.registers if one.name == "position_p_gain"),
+            servo.declared["position_p_gain"],
         )
         for bus in robot.plan.buses
         for servo in bus.servos

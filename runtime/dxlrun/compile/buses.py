@@ -131,7 +131,7 @@ def _wiring(
         direction=described.direction,
         lower=within.lower,
         upper=within.upper,
-        registers=servo.registers,
+        settings=servo.settings,
         continuous=described.continuous,
         start_mode=modes[described.joints[0]],
         ratio=described.ratio,

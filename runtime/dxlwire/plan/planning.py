@@ -52,7 +52,7 @@ class Wiring(msgspec.Struct, frozen=True):
     direction: int
     lower: float  # rad or m, as the joint counts
     upper: float  # rad or m, as the joint counts
-    registers: tuple[RegisterValue, ...] = ()
+    settings: tuple[RegisterValue, ...] = ()
     """What its memory shall hold, in the order in which it is written."""
     continuous: bool = False
     """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
@@ -205,7 +205,7 @@ def _servo(joint: Wiring) -> ServoPlan:
         start_mode=_start_mode(joint, modes),
         own_limits=own_limits(table),
         continuous=joint.continuous,
-        registers=joint.registers,
+        settings=joint.settings,
         ratio=joint.ratio,
         unit=joint.unit,
         name=joint.name,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,6 @@ from dxlrun.compile.joints.described_servos import DescribedServo, described_ser
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.errors import InputError, Mark
 from dxlsim.motor_model import MotorModel
-from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import ControlTable
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ def compile_motor(
     file: RobotFile,
     servo: DescribedServo,
     table: ControlTable,
-    registers: Sequence[RegisterValue],
+    declared: Mapping[str, int],
     found: MotorDescription | None,
 ) -> MotorModel | None:
     """Return a servo's motor, with the P gain that it will have."""
@@ -125,11 +124,11 @@ def compile_motor(
         return None
     if item is None or motor.p_gain is None:
         return motor
-    declared = next((each.value for each in registers if each.name == item.name), None)
-    if declared is None and item.initial not in (None, motor.p_gain):
+    gain = declared.get(item.name)
+    if gain is None and item.initial not in (None, motor.p_gain):
         file.warning(
             mark,
             f"{name} was identified with {item.name} = {motor.p_gain}, and servos begin with {item.initial}",
             f"write `registers: {{{item.name}: {motor.p_gain}}}` for {name}",
         )
-    return replace(motor, p_gain=motor.p_gain if declared is None else declared)
+    return replace(motor, p_gain=motor.p_gain if gain is None else gain)

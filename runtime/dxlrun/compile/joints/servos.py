@@ -36,7 +36,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     described: DescribedServo
     table: ControlTable
-    registers: tuple[RegisterValue, ...]  # Of features, in the order in which they are written
+    settings: tuple[RegisterValue, ...]  # Of features, in the order in which they are written
     motor: MotorModel | None
     known_bus: bool
     certain: bool  # False while its model is still to be read, so that what does not fit it is no error yet
@@ -44,7 +44,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
     @property
     def declared(self) -> dict[str, int]:
         """The integer on the wire that the robot file gives an item, by item."""
-        return {register.name: register.value for register in self.registers}
+        return {setting.name: setting.value for setting in self.settings}
 
     @property
     def reach(self) -> Interval:
@@ -126,13 +126,14 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
         found = file if certain else RobotFile(file.description)
         settings = {
-            register.name: register
+            setting.name: setting
             for _, stage in stages(SettingsStage, installed_features())
-            for register in stage.compile(found, servo, table)
+            for setting in stage.compile(found, servo, table)
         }
-        registers = tuple(settings.values())
-        motor = compile_motor(found, servo, table, registers, motors.of_servo(servo.name))
-        compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus, certain)
+        declared = {name: setting.value for name, setting in settings.items()}
+        motor = compile_motor(found, servo, table, declared, motors.of_servo(servo.name))
+        made = CompiledServo(servo, table, tuple(settings.values()), motor, known_bus, certain)
+        compiled[servo.name] = made
     return compiled
 
 

@@ -48,7 +48,7 @@ class DesiredState:
         self._mode = mode
         self._modes = [servo.start_mode for servo in self._servos]
         self._changing = [False] * len(self._servos)
-        self._registers = [servo.registers for servo in self._servos]
+        self._settings = [servo.settings for servo in self._servos]
 
     def mode(self, index: int) -> Mode:
         """Return the mode in which a servo is, or shall be as soon as it can."""
@@ -64,9 +64,9 @@ class DesiredState:
         goal = None if mode is Mode.UNKNOWN else self._servos[index].mode_plan(mode).goals[-1]
         return None if goal is None or goal.position is not None else (goal.address, bytes(goal.length))
 
-    def registers(self, index: int) -> tuple[RegisterValue, ...]:
+    def settings(self, index: int) -> tuple[RegisterValue, ...]:
         """Return what a servo that was reset shall hold again, in the order in which it is written."""
-        return self._registers[index]
+        return self._settings[index]
 
     def change_modes(self, requested: NDArray[np.uint8]) -> None:
         """Let servos change into modes, shape (joints,), UNKNOWN: none; a later request replaces this one."""
@@ -205,7 +205,7 @@ class DesiredState:
         if problem := "; ".join(found.problems):
             life.events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.servo.joint, problem)
         else:
-            self._registers[index] = merged(self._registers[index], register)
+            self._settings[index] = merged(self._settings[index], register)
         found.log(life.events)
         done(problem, before.get(register.name))
 

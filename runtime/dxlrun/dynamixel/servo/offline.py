@@ -150,7 +150,7 @@ class Offline:
                     f"there; `dxlrun torque on {servo.joint}` gives it torque"
                 )
                 life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
-        torqued = yield from rejoin(one, found, mode, self.desired.registers(index), torque=torque)
+        torqued = yield from rejoin(one, found, mode, self.desired.settings(index), torque=torque)
         if not found.problems:
             yield from self.desired.read_limits(index)
             yield from self.desired.restore_torque_limit(index, mode, found)

@@ -68,9 +68,9 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
 
 
 def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
-    """Write what the robot file declares for the servos of a bus, each whatever became of the one before."""
+    """Write the settings of the servos of a bus, each whatever became of the one before."""
     for servo in plan.servos:
-        yield from settle(first_reach(plan, servo), servo.registers, found)
+        yield from settle(first_reach(plan, servo), servo.settings, found)
 
 
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:

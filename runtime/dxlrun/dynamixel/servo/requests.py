@@ -100,7 +100,7 @@ class Requests:
         yield from self._reboots.tick(index)
         yield from watchdog.disarm(one)
         mode = self._desired.mode(index)
-        yield from rejoin(one, found, mode, self._desired.registers(index), torque=False)
+        yield from rejoin(one, found, mode, self._desired.settings(index), torque=False)
         found.log(self._life.events)
         if found.problems:
             return "; ".join(problem.removeprefix(name) for problem in found.problems), mode

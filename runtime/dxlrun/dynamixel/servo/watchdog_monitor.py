@@ -79,7 +79,7 @@ class WatchdogMonitor:
     def _revive(self, index: int) -> Program[None]:
         """Write again what the watchdog reset of the desired registers, then clear and arm it."""
         life, one, found = self._life, self._life.reach(index), Findings()
-        ramp = [each for each in self._desired.registers(index) if each.name == watchdog.RAMP]
+        ramp = [each for each in self._desired.settings(index) if each.name == watchdog.RAMP]
         yield from settle(one, ramp, found)
         found.log(life.events)
         problem = "; ".join(found.problems) or (yield from watchdog.revive(one))

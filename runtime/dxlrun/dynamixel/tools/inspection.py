@@ -169,7 +169,7 @@ def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tu
 
     Registers in the RAM are written by each run.
     """
-    declared = [one for one in servo.registers if one.eeprom]
+    declared = [one for one in servo.settings if one.eeprom]
     item = table.items.get("return_delay_time")
     if item is not None and all(one.name != item.name for one in declared):
         raw = round(plan.return_delay_ns / 2_000)
@@ -217,9 +217,9 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
     found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
     found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:
-        differences = [RegisterDifference(register, None) for register in servo.registers]
+        differences = [RegisterDifference(register, None) for register in servo.settings]
         if servo.joint in answered:
-            differences = list((yield from compare(first_reach(plan, servo), servo.registers)))
+            differences = list((yield from compare(first_reach(plan, servo), servo.settings)))
             found.remarks += yield from _tighter_limits(first_reach(plan, servo), joints.get(servo.row))
         found.registers += [_row(plan, servo, one) for one in differences]
     return found

@@ -75,7 +75,7 @@ def _place(description: Description, servo: ServoPlan, register: str) -> Mark:
 
 
 def _narrow(servo: ServoPlan) -> Iterator[tuple[RegisterValue, int]]:
-    for register in servo.registers:
+    for register in servo.settings:
         if register.name in _LOWER and register.value > servo.lower_tick:
             yield register, servo.lower_tick
         if register.name in _UPPER and register.value < servo.upper_tick:
