@@ -6,6 +6,7 @@ On a real port none of these keys is used, so one that could not be simulated is
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -220,21 +221,19 @@ def _bodies(plan: Plan) -> UrdfBodies | None:
 
 
 def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
-    """Return what the simulated servos move, first those with a joint of their own.
-
-    What a servo on a real port does cannot be simulated: those that share its joints move by themselves.
-    """
+    """Return what the simulated servos move, first those with a joint of their own."""
     by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
-    shared: list[Mechanism] = []
-    alone = dict(by_row)
+    found: list[Mechanism] = []
     for one in plan.mechanics.mechanisms(len(plan.loop.joints)):
-        if one.own or not by_row.keys() >= {*one.servos}:
-            continue
-        servos = [alone.pop(row) for row in one.servos]
+        servos = [by_row[row] for row in one.servos if row in by_row]
         names = tuple(plan.loop.joints[row].name for row in one.joints)
         loads = tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names)
-        shared.append(_mechanism(servos, names, one.matrix, loads))
-    return (*(_mechanism([each], (each[1].joint,)) for each in alone.values()), *shared)
+        if len(servos) < len(one.servos):
+            # what a servo on a real port does cannot be simulated: the others move by themselves
+            found += (_mechanism([each], (each[1].joint,)) for each in servos)
+        else:
+            found.append(_mechanism(servos, names, one.matrix, () if one.own else loads))
+    return tuple(sorted(found, key=lambda one: one.servos[0].index if one.is_single else math.inf))
 
 
 def _mechanism(
