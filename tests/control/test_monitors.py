@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Self
 
@@ -56,22 +58,45 @@ class FarJoints:
             self.actions.end_run("on_exit", "the first reason counts")
 
 
-class FarJointsFeature(Feature):
+class Broken(FarJoints):
+    """Raises in one of the cycles."""
+
+    def check(self, time_ns: int) -> None:
+        """Raise by the time."""
+        if time_ns > 1e9 * ENDS_S:
+            raise ValueError("no such joint")
+
+
+@dataclass(frozen=True)
+class OneMonitor(Feature):
     """A feature that has a monitor only."""
+
+    monitor: type[FarJoints] = FarJoints
 
     def stage(self, kind: type[S]) -> S | None:
         """Return the monitor."""
-        found = MonitorStage(FarJoints)
+        found = MonitorStage(self.monitor)
         return found if isinstance(found, kind) else None
 
 
-def test_monitor_of_a_package_acts_in_the_loop(tmp_path) -> None:
-    path = tmp_path / "pair.yaml"
-    path.write_text(ROBOT)
-    plan = plan_of(path, duration_s=2.0)
-    features = (*plan.features, FarJointsFeature("far_joints", "", "tests 1"))
-    plan = replace(plan, loop=replace(plan.loop, features=features))
-    robot, torque = VirtualRobot(plan), list[bool]()
+def robot_with(monitor: type[FarJoints], path: Path) -> VirtualRobot:
+    file = path / "pair.yaml"
+    file.write_text(ROBOT)
+    plan = plan_of(file, duration_s=2.0)
+    features = (*plan.features, OneMonitor("far_joints", "", "tests 1", monitor))
+    return VirtualRobot(replace(plan, loop=replace(plan.loop, features=features)))
+
+
+def test_monitor_that_raises_ends_the_run_by_on_fault(tmp_path: Path) -> None:
+    robot = robot_with(Broken, tmp_path)
+    result = robot.run()
+    detail = f"the monitor Broken of {__name__} raised ValueError: no such joint; on_fault: limp"
+    assert (result.reason, result.detail) == ("fault", detail)
+    assert not any(servo.torque_on for servo in robot.buses[0].servos)
+
+
+def test_monitor_of_a_package_acts_in_the_loop(tmp_path: Path) -> None:
+    robot, torque = robot_with(FarJoints, tmp_path), list[bool]()
     bus = robot.buses[0]
     bus.at(int(0.9e9 * ENDS_S), lambda: torque.extend(bus.servo(one).torque_on for one in (3, 7)))
     result = robot.run()

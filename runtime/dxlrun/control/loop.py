@@ -227,7 +227,13 @@ class Loop:
             self.schedule.grid_ns += behind_ns
         time_ns = self.schedule.time_ns
         for monitor in self._monitors:
-            monitor.check(time_ns)
+            try:
+                monitor.check(time_ns)
+            except PortError:
+                raise
+            except Exception as error:  # foreign code: the run ends by the steps of its policy
+                kind, what = type(monitor), f"raised {type(error).__name__}: {error}"
+                self._actions.end_run("on_fault", f"the monitor {kind.__name__} of {kind.__module__} {what}")
         commands = steering.inbox.take()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
             record.command_count = steering.execute_commands(commands)
