@@ -214,7 +214,9 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
     elif kind == "motor":
         made = motor_schema()
     else:
+        from dxlrun.control.controllers.offers import OfferStage
         from dxlrun.control.controllers.plugins import load_plugins
+        from dxlrun.features import FEATURES, stages
 
         found = load_plugins()  # one whose class cannot be imported has no parameters to show
         controllers = {
@@ -222,12 +224,10 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
             for name in found.controllers
             if (offer := found.controllers.get(name)) and offer.distribution.startswith(only)
         }
-        offers = found.drivers_of("sensors")
-        sensors = {
-            name: sensor.driver.Parameters
-            for name in offers
-            if (sensor := offers.get(name)) and sensor.distribution.startswith(only)
+        entries = {
+            stage.form: (stage.kind, found.parameters_of_drivers(feature.name, only))
+            for feature, stage in stages(OfferStage, FEATURES)
         }
         of_kind = robot_schema if kind == "robot" else fragment_schema
-        made = of_kind(controllers, sensors)
+        made = of_kind(controllers, entries)
     return json.dumps(made, indent=2, ensure_ascii=False) + "\n"

@@ -56,11 +56,13 @@ _ABOUT = ("description", "default", "examples")
 
 
 Models = Mapping[str, type[BaseModel]]  # Models of parameters, by the type that has them
+Entries = Mapping[str, tuple[str, Models]]
+"""Form of the entries of a section whose types plug-ins offer -> word for one of them, and the models."""
 
 
-def robot_schema(controllers: Models, sensors: Models) -> Schema:
-    """Return the schema of robot files, with the parameters of the types of controllers and sensors."""
-    robot = _robot(controllers, sensors)
+def robot_schema(controllers: Models, entries: Entries) -> Schema:
+    """Return the schema of robot files, with the parameters of the types that plug-ins offer."""
+    robot = _robot(controllers, entries)
     lenient = _without_required(robot)
     needed = _Needs(robot).of_root()
     joints = {"properties": {"joints": needed["properties"].pop("joints")}}  # but what others may give them
@@ -68,9 +70,9 @@ def robot_schema(controllers: Models, sensors: Models) -> Schema:
     return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
 
 
-def fragment_schema(controllers: Models, sensors: Models) -> Schema:
+def fragment_schema(controllers: Models, entries: Entries) -> Schema:
     """Return the schema of files that a robot file includes: any part of one."""
-    return {**_without_required(_robot(controllers, sensors)), "title": "dxlrun fragment of a robot file"}
+    return {**_without_required(_robot(controllers, entries)), "title": "dxlrun fragment of a robot file"}
 
 
 def motion_schema() -> Schema:
@@ -92,7 +94,7 @@ def _without_arguments(model: type[BaseModel], title: str) -> Schema:
     return {"$schema": DIALECT, **top, "title": title, "$defs": definitions | shaped.used}
 
 
-def _robot(controllers: Models, sensors: Models) -> Schema:
+def _robot(controllers: Models, entries: Entries) -> Schema:
     """Return the schema of a robot file that includes nothing."""
     schema = robot_form().model_json_schema()
     shaped = _Shaper(arguments=True)
@@ -107,7 +109,8 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
     definitions["Group"]["properties"] |= shared
     before = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), DEFAULTS: defaults}
     top["properties"] = before | own
-    for form, models, room in (("ControllerEntry", controllers, ""), ("SensorEntry", sensors, "sensor.")):
+    others = ((form, models, f"{kind}.") for form, (kind, models) in entries.items())
+    for form, models, room in (("ControllerEntry", controllers, ""), *others):
         entry = definitions[form]
         entry["properties"].pop("parameters")
         for kind, model in sorted(models.items()):

@@ -36,6 +36,8 @@ class OfferStage:
     """Hook that returns them, by type: `dxlrun_sensors`."""
     kind: str
     """Word for one of them in sentences: `sensor`."""
+    form: str
+    """Name of the form of an entry, in whose schema their parameters are."""
     find_breach: Callable[[object], Breach | None]
     """Checks a class against the contract when it is loaded."""
     facts: Callable[[DriverClass], Mapping[str, object]] = lambda driver: {}

@@ -191,6 +191,18 @@ class PlugIns(msgspec.Struct, frozen=True):
         """Return the classes for the section of a feature, by type."""
         return self.drivers.get(feature, {})
 
+    def parameters_of_drivers(self, feature: str, publisher: str = "") -> dict[str, type[ParametersModel]]:
+        """Return the models of parameters of the classes for the section of a feature, by type.
+
+        `publisher` is how the name of the distribution begins.
+        """
+        offers = self.drivers_of(feature)
+        return {
+            name: offer.driver.Parameters
+            for name in offers
+            if (offer := offers.get(name)) and offer.distribution.startswith(publisher)
+        }
+
     def packages_of(self, controllers: Sequence[ControllerPlan], models: Container[str]) -> dict[str, str]:
         """Return the packages that run in a robot with their distributions, by package.
 

@@ -8,6 +8,7 @@ from typing import cast
 from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.offers import Breach, OfferStage, is_model, methods_breach
 from dxlrun.description.form import ParametersModel
+from dxlrun.features.sensors.form import SensorEntry
 
 _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")
 """Called by dxlrun, all by position."""
@@ -54,4 +55,10 @@ def is_units(found: object, states: Collection[str]) -> bool:
     )
 
 
-STAGE = OfferStage("dxlrun_sensors", "sensor", sensor_breach, lambda driver: {"simulated": driver.simulated})
+STAGE = OfferStage(
+    "dxlrun_sensors",
+    "sensor",
+    SensorEntry.__name__,
+    sensor_breach,
+    lambda driver: {"simulated": driver.simulated},
+)
