@@ -54,6 +54,9 @@ def test_packages_that_the_import_linter_does_not_see_import_only_the_faces() ->
     assert own >= {"dxlrun_ros2", "dxlrun_view"}
     inside = [f"{path}: {name}" for path, name, of_face in names if "/src/" in path and not of_face]
     assert inside == []
+    for path in ROOT.glob("plugins/*/src/**/*.py"):
+        others = re.findall(r"from (dxlrun_(?:analysis|controllers)\S*) import", path.read_text("utf-8"))
+        assert [name for name in others if not name.startswith("dxlrun_controllers.laws.")] == []
 
 
 SKIPS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,6 @@ NotNegative = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 
 T = TypeVar("T")
-
-CLOSING_SPEED: Final = 0.5
-"""rad/s, posvel: the least speed for the rest of the way of a servo that lags; with the speed 0 of an end it
-would creep there at one tick (0.012 rad/s)."""
-
-
 CommandInterface = Literal["position", "posvel", "poseffort", "velocity", "effort", "pwm"]
 """Values of `command_interface`"""
 

@@ -24,13 +24,13 @@ from dxlrun import (
 )
 from dxlrun_controllers.group import PositionsCommand
 from dxlrun_controllers.joints import (
-    CLOSING_SPEED,
     clamped,
     commanded_by,
     hold,
     take_shorter_way,
     take_where_heard,
 )
+from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 
 class Pair(ParametersModel):

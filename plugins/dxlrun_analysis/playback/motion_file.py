@@ -16,7 +16,7 @@ from dxlrun.tooling.plans import ControllerPlan, LoopPlan, from_json
 from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins, parse_motion
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, SplinePath, fit
-from dxlrun_controllers.joints import CLOSING_SPEED
+from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 LEAD_S = 1.0  # Before the first point: controllers lead their joints there meanwhile, as in the thesis
 _STEP_S = 0.02  # Between two points of a controller that takes single positions

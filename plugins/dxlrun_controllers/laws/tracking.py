@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
@@ -10,6 +10,10 @@ from dxlrun import LIVE, Context, Floats
 from dxlrun_controllers.joints import NotNegative, PerJoint, finite_or, row_of
 from dxlrun_controllers.laws.pid import Gains, Pid
 from dxlrun_controllers.laws.spline import SplineSample
+
+CLOSING_SPEED: Final = 0.5
+"""rad/s, posvel: the least speed for the rest of the way of a servo that lags; with the speed 0 of an end it
+would creep there at one tick (0.012 rad/s)."""
 
 
 class TrackingGains(Gains):

@@ -28,7 +28,6 @@ from dxlrun import (
     Tolerance,
 )
 from dxlrun_controllers.joints import (
-    CLOSING_SPEED,
     JointsParameters,
     PerJoint,
     commanded_by,
@@ -48,7 +47,7 @@ from dxlrun_controllers.laws.spline import (
     flat_size,
     whole_turns,
 )
-from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
+from dxlrun_controllers.laws.tracking import CLOSING_SPEED, Tracking, TrackingGains
 from dxlrun_controllers.laws.tracks import Track, Tracks
 from dxlrun_controllers.motions.trajectory_command import (
     SPLICED,

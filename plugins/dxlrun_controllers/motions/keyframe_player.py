@@ -34,7 +34,6 @@ from dxlrun import (
     nearest_turn,
 )
 from dxlrun_controllers.joints import (
-    CLOSING_SPEED,
     JointNames,
     commanded_by,
     ends_unheard,
@@ -55,6 +54,7 @@ from dxlrun_controllers.laws.spline import (
     peak_velocities,
     solve,
 )
+from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 HIGHEST_RATE = 10.0
 """Of a motion's own time over the loop's: so few steps at most are passed in a period."""

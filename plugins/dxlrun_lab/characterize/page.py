@@ -10,16 +10,16 @@ import numpy as np
 
 from dxlrun.tooling.html import document, footer, header, paragraph, section, table_element
 from dxlrun.tooling.output import counted
-from dxlrun_analysis.figures.servos import (
+from dxlrun_lab.characterize import dead_band, rates, response, speeds
+from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize.procedure import Characterized, Found
+from dxlrun_lab.characterize.tables import results, shown, table
+from dxlrun_lab.figures.servos import (
     Mark,
     Points,
     curves_drawing,
     points_drawing,
 )
-from dxlrun_lab.characterize import dead_band, rates, response, speeds
-from dxlrun_lab.characterize.measured import Measured
-from dxlrun_lab.characterize.procedure import Characterized, Found
-from dxlrun_lab.characterize.tables import results, shown, table
 
 _TITLE = "What the servos can do"
 

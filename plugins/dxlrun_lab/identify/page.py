@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from dxlrun.tooling.html import document, footer, header, paragraph, section, table_element
 from dxlrun.tooling.output import Sentence
-from dxlrun_analysis.figures.drawing import (
+from dxlrun_lab.figures.drawing import (
     BLUE,
     MUTED,
     ORANGE,

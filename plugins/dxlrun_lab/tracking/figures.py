@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from dxlrun import Floats
 from dxlrun.tooling.output import counted, microseconds
-from dxlrun_analysis.figures.drawing import (
+from dxlrun_lab.figures.drawing import (
     BLUE,
     DASHED,
     ERROR,

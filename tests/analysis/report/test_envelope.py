@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun_analysis.figures import drawing
 from dxlrun_analysis.page.envelope import Envelope, Rows
+from dxlrun_lab.figures import drawing
 
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
 

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dxlrun import Floats
-from dxlrun_analysis.figures.drawing import (
+from dxlrun_lab.figures.drawing import (
     BLUE,
     DASHED,
     ERROR,
