@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
-    from dxlrun.channels.cycle import Commands as Commands
-    from dxlrun.channels.cycle import States as States
     from dxlrun.channels.events import EventSink as EventSink
     from dxlrun.compile.contribution import BusDevice as BusDevice
     from dxlrun.compile.contribution import Compilation as Compilation
