@@ -63,7 +63,7 @@ def test_a_joint_without_limits_gets_what_the_others_leave_on_either_side(pitch:
 def test_a_servo_of_a_joint_may_have_registers_of_its_own() -> None:
     own = "{id: 3, direction: -1, registers: {position_p_gain: 900}}"
     plan = compile_text(changed(("{id: 3, direction: -1}", own))).plan
-    declared = {servo.own_name: servo.registers for bus in plan.buses for servo in bus.servos}
+    declared = {servo.own_name: servo.settings for bus in plan.buses for servo in bus.servos}
     assert declared["hip/1"] == ()
     assert [(one.name, one.value) for one in declared["hip/2"]] == [("position_p_gain", 900)]
 
