@@ -20,6 +20,8 @@ def compile_hot_servo(compilation: Compilation) -> Contribution:
             if hot.above > MOST:
                 place = file.at("policies", "on_hot_servo", "above")
                 file.error(place, f"no servo works at {hot.above:g} degC", f"write {MOST:g} degC at most")
+    if not plan:
+        return Contribution()
     does = ", ".join(f"{joint} above {above:g} degC: {do}" for joint, (above, do) in plan.items())
     return Contribution(policies=(PolicyEntry("on_hot_servo", does),), plan=msgspec.json.encode(plan))
 

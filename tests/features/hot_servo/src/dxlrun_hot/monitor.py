@@ -11,10 +11,12 @@ from dxlrun.tooling.features import MonitorStage, PolicyActions
 from dxlrun.tooling.plans import LoopPlan
 from dxlrun.tooling.records import CycleRecord, Severity
 
+NAME = "on_hot_servo"
+
 
 class HotServos:
     def __init__(self, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> None:
-        own = msgspec.json.decode(plan.feature_plans["on_hot_servo"])
+        own = msgspec.json.decode(plan.feature_plans[NAME])
         self._joints = [joint.name for joint in plan.joints]
         self._above = np.array([own.get(name, (np.inf, ""))[0] for name in self._joints])
         self._do = [own.get(name, (np.inf, ""))[1] for name in self._joints]
@@ -23,7 +25,7 @@ class HotServos:
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
-        return cls(plan, record, actions)
+        return cls(plan, record, actions) if NAME in plan.feature_plans else None
 
     def check(self, time_ns: int) -> None:
         hot = frozenset(np.flatnonzero(self._states.temperature > self._above).tolist())
