@@ -83,11 +83,18 @@ def test_help_names_every_command_and_option(dxlrun):
         assert word in said.out
 
 
-def test_nothing_to_do_shows_the_help_and_is_wrong_input(dxlrun):
+def test_nothing_to_do_shows_ten_commands_and_is_wrong_input(dxlrun):
     said = dxlrun()
 
     assert said.code == 2
-    assert "Usage: dxlrun" in said.out
+    assert said.out.startswith("Usage: dxlrun")
+    commands = said.out.partition("\nEvery day\n")[2].partition("\n\n")[0].splitlines()
+    assert [line.split()[0] for line in commands] == [
+        *("demo", "examples", "doctor", "scan", "check", "list", "watch", "play", "stop", "analyze")
+    ]
+    assert said.out.endswith(
+        "`dxlrun --help` lists all commands, `dxlrun help COMMAND` shows one with examples.\n"
+    )
 
 
 def test_a_value_may_hold_the_sign(torso):

@@ -81,7 +81,7 @@ def test_help_without_a_verb_lists_them_and_an_unknown_one_is_refused(dxlrun: Dx
 
 def test_a_verb_of_each_package_has_a_heading_of_the_help() -> None:
     assert {one.group for one in verbs.packaged().values()} <= set(verbs.GROUPS)
-    assert len(verbs.GROUPS[verbs.EVERY_DAY]) == 9  # and `analyze`
+    assert len(verbs.GROUPS[verbs.EVERY_DAY]) == 10  # `help`, and with `analyze` ten more
 
 
 def test_a_foreign_verb_stands_in_the_group_that_it_names_or_behind_all(

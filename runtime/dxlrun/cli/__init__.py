@@ -37,9 +37,9 @@ def _run(tokens: tuple[str, ...]) -> int:
             sys.stdout.write(f"{version()}\n")
             return 0
         if not tokens or tokens in (("--help",), ("-h",), ("help",)):
-            from dxlrun.cli.help import print_help
+            from dxlrun.cli.help import print_help, print_short_help
 
-            print_help()
+            (print_help if tokens else print_short_help)()
             return 0 if tokens else 2
         from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 TEXT = Path(__file__).with_name("help.txt")
 _COLUMNS = 80
+_EVERY_DAY = "Every day"
+_MORE = "`dxlrun --help` lists all commands, `dxlrun help COMMAND` shows one with examples."
 _BEHIND = "Arguments"
 """The heading behind those of verbs."""
 
@@ -30,6 +32,14 @@ def print_help() -> None:
             if not re.search(rf"^{command.name} ", text, re.MULTILINE):
                 text = _with_verb(text, command)
     sys.stdout.write(text)
+
+
+def print_short_help() -> None:
+    """Print the usage, and the commands of every day."""
+    parts = TEXT.read_text("utf-8").split("\n\n")
+    (commands,) = (part for part in parts if part.startswith(f"{_EVERY_DAY}\n"))
+    lines = [line for line in commands.splitlines() if not line.startswith("help ")]
+    sys.stdout.write("\n".join([parts[0], "", *lines, "", _MORE]) + "\n")
 
 
 def _with_verb(text: str, command: Command) -> str:

@@ -44,6 +44,7 @@ WaitFlag = Annotated[bool, _switch("wait")]
 RecordFlag = Annotated[bool, _switch("record")]
 StressFlag = Annotated[bool, _switch("stress")]
 GatewayFlag = Annotated[bool, _switch("gateway")]
+PageFlag = Annotated[bool, _switch("page")]
 GraphFile = Annotated[
     tuple[Path, ...] | None, Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 ]

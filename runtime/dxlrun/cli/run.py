@@ -1,19 +1,26 @@
-"""`dxlrun ROBOT.yaml`: run a robot."""
+"""`dxlrun ROBOT.yaml` and `dxlrun demo`: run a robot."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.inputs import (
     Assignment,
+    DebugFlag,
     Flag,
     GatewayFlag,
     Motions,
+    PageFlag,
     RecordFlag,
     Seconds,
     compiled,
+    examples_directory,
     read_models,
 )
 from dxlrun.errors import InputError, counted
@@ -29,6 +36,13 @@ if TYPE_CHECKING:
     from dxlrun.run.run_summary import RunSummary
 
 
+DEMO = ("bioloid_torso.yaml", "motions/three_parts.yaml")
+"""Robot and motion of `dxlrun demo`, in the directory of the examples."""
+_START_S = 60.0  # A run on a busy machine takes some seconds until it can be steered
+_POLL_S = 0.1
+_SHOW_PAGE = (
+    "import sys; from dxlrun.cli import main, run; sys.exit(main(['view', run.await_robot(sys.argv[1:])]))"
+)
 _WORDS = {0: "done", 130: "interrupted"}
 _MOST_DELETED = 5
 """Logs that are named one by one."""
@@ -123,6 +137,54 @@ def run(
 
         summary = run_robot(result.plan, options, console)
     return show_summary(summary, result.plan, console)
+
+
+def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = False) -> int:
+    """Run a simulated torso that plays a motion of 35 s: no hardware, no files.
+
+    Parameters
+    ----------
+    page
+        Show it on the page of `dxlrun view`, where that is installed; --no-page: run without.
+    virtual
+        Run on virtual time, as fast as the processor can.
+    """
+    robot, motion = (examples_directory() / name for name in DEMO)
+    with _page_beside(shown=page and not virtual):
+        return run(robot, play=(motion,), virtual=virtual, debug=debug)
+
+
+@contextmanager
+def _page_beside(*, shown: bool) -> Iterator[None]:
+    """Serve the page of the next run from a process of its own while the block runs."""
+    from dxlrun.cli.verbs import packaged
+
+    if not shown:
+        yield
+        return
+    if "view" not in packaged():
+        show("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
+        yield
+        return
+    from dxlrun.remote.sockets import running
+
+    served = subprocess.Popen([sys.executable, "-P", "-c", _SHOW_PAGE, *running()])
+    try:
+        yield
+    finally:
+        served.terminate()
+        served.wait()
+
+
+def await_robot(others: Collection[str]) -> str:
+    """Return the first robot that starts, but for `others`, which run already; exit with 1 when none does."""
+    from dxlrun.remote.sockets import running
+
+    for _ in range(round(_START_S / _POLL_S)):
+        if started := set(running()) - set(others):
+            return min(started)
+        time.sleep(_POLL_S)
+    sys.exit(1)
 
 
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:

@@ -20,6 +20,7 @@ _CLI, _STEERING, _TOOLS = "dxlrun.cli", "dxlrun.cli.steering", "dxlrun.cli.tools
 GROUPS: Mapping[str, Mapping[str, str]] = {
     EVERY_DAY: {  # in the order in which they are needed
         "help": f"{_CLI}.verb_help:show_help",
+        "demo": f"{_CLI}.run:demo",
         "examples": f"{_CLI}.examples:examples",
         "doctor": f"{_CLI}.doctor:doctor",
         "scan": f"{_TOOLS}.scan:scan",
