@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.kit.robots import PAIR, compile_text
 
-from dxlrun.description.robot import Recording
+from dxlrun.features.recording.form import Recording
 from dxlrun.plan.recording_plan import RecordingPlan
 
 SECOND = 1_000_000_000

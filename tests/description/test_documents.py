@@ -26,7 +26,6 @@ from dxlrun.description.robot import (
     Loop,
     Policies,
     PoseStep,
-    Recording,
     RobotModel,
     Scheduler,
     Simulation,
@@ -35,6 +34,7 @@ from dxlrun.description.robot import (
 )
 from dxlrun.features.devices.form import Device, DeviceSimulation
 from dxlrun.features.mechanics.form import Transmission, TransmissionServo
+from dxlrun.features.recording.form import Recording
 from dxlrun.features.sensors.form import SensorEntry
 
 PAGE = page_text("robot-file.md")

@@ -148,9 +148,9 @@ def newest_log() -> Path:
     there is none.
     """
     from dxlrun.tooling.logs import is_being_written, is_log_directory
-    from dxlrun.tooling.robots import Recording
+    from dxlrun.tooling.plans import RecordingPlan
 
-    directory = Path(Recording().directory)
+    directory = Path(RecordingPlan().directory)
     found = [*directory.glob("*.mcap"), *(path for path in directory.glob("*/") if is_log_directory(path))]
     logs = sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
     ended = next((log for log in logs if not is_being_written(log) and log.stat().st_size), None)

@@ -221,9 +221,9 @@ def _log_place(log: Path | None, record: bool) -> Path | None:
     if not record:
         return None
     if log is None:
-        from dxlrun.tooling.robots import Recording
+        from dxlrun.tooling.plans import RecordingPlan
 
-        return Path(Recording().directory)
+        return Path(RecordingPlan().directory)
     if log.suffix == ".mcap":
         check_target(log)
     elif log.exists() and not log.is_dir():

@@ -16,6 +16,7 @@ from dxlrun.description.robot import WrittenPolicy
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.policy_plan import GroupPolicy
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlsim.simulation_plan import Shown
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import DeviceTable
@@ -76,6 +77,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Packages of plug-ins whose code runs for it, with their distributions."""
     mechanics: MechanicsPlan | None = None
     """Which servos move which joints, of the feature that knows."""
+    recording: RecordingPlan | None = None
+    """Where the log is written, of the feature that knows."""
     policies: tuple[PolicyEntry, ...] = ()
     """Its policies, as `dxlrun check` shows them."""
     group_policies: tuple[GroupPolicy, ...] = ()

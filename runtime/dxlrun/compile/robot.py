@@ -31,7 +31,6 @@ from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import RobotFile
-from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.bus import SIMULATED
@@ -45,6 +44,7 @@ from dxlrun.features.feature import Feature
 from dxlrun.installed_plugins import PHYSICS_GROUP, distribution_name, installed_plugins
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 from dxlwire.bus_plan import BusPlan
 
@@ -179,7 +179,6 @@ def compile_robot(
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, contributions, modes)
     policies = compile_policies(file, joints, buses, contributions)
-    recording = compile_recording(file)
     parts: list[MotionPart] = []
     if motions:
         from dxlrun.compile.motions import check_times, compile_motion  # as above
@@ -219,7 +218,7 @@ def compile_robot(
         loop=loop,
         buses=tuple(buses),
         exit_timeout_ns=robot.policies.exit_timeout,
-        recording=recording,
+        recording=next((each.recording for each in contributions if each.recording), RecordingPlan()),
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),

@@ -28,7 +28,6 @@ from dxlrun.description.units import (
     Position,
     Rate,
     Share,
-    SizeOrDuration,
 )
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import PolicyKey, Section
@@ -206,21 +205,6 @@ class ControllerEntry(PlugInEntry):
     )
 
 
-class Recording(Form):
-    """The log."""
-
-    directory: str = key("Where logs are written, from the working directory.", "logs", "logs", min_length=1)
-    split: SizeOrDuration | None = key(
-        "Size or duration, 1 MB or 1 s at least, after which a log goes on in another file.", "100 MB", None
-    )
-    keep: SizeOrDuration | None = key(
-        "A size: a run deletes the oldest logs in the directory beyond it at its end. A duration (needs "
-        "split): files whose newest record is older are deleted while the run goes on.",
-        "10 GB",
-        None,
-    )
-
-
 class Gateway(Form):
     """The process by which others steer the run."""
 
@@ -291,7 +275,6 @@ class Robot(Form):
         "Positions of some or all joints, by name, for policies.", "{home: {head_joint: 0 deg}}", {}
     )
     policies: Policies = key(*_POLICIES, Policies())
-    recording: Recording = key("The log.", "{directory: logs}", Recording())
     processes: Processes = key("Processes beside the loop.", "{gateway: {enabled: false}}", Processes())
     model: RobotModel | None = key("The robot's body.", "{urdf: torso.urdf}", None)
     simulation: Simulation = key(

@@ -21,6 +21,7 @@ FEATURES = (
     Feature("sensors", "dxlrun.features.sensors"),
     Feature("transmissions", "dxlrun.features.mechanics"),
     Feature("registers", "dxlrun.features.registers"),
+    Feature("recording", "dxlrun.features.recording"),
 )
 """In the order in which every stage asks them; their states are in the cycle's record in this order.
 

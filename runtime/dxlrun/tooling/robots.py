@@ -38,6 +38,5 @@ if TYPE_CHECKING:
     from dxlrun.description.reading import Description as Description
     from dxlrun.description.reading import Replacement as Replacement
     from dxlrun.description.reading import read_robot as read_robot
-    from dxlrun.description.robot import Recording as Recording
 else:
     __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dxlrun.compile.problems import RobotFile
+from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
+from dxlrun.features.recording import form
 from dxlrun.plan.recording_plan import RecordingPlan
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
 """Of a part: each has the robot file and the plan once more."""
 
 
-def compile_recording(file: RobotFile) -> RecordingPlan:
+def compile_recording(compilation: Compilation) -> Contribution:
     """Return what the robot file says about the log. What cannot be done becomes a problem."""
-    written, marks = file.robot.recording, file.marks
+    file, marks = compilation.file, compilation.file.marks
+    written = form.STAGE.of(file.robot)
     amount = {} if written.split is None else dict([written.split])
     if amount.get("bytes", _LEAST_BYTES) < _LEAST_BYTES or amount.get("ns", _LEAST_NS) < _LEAST_NS:
         file.error(
@@ -26,6 +28,8 @@ def compile_recording(file: RobotFile) -> RecordingPlan:
             "keep needs parts: a log in one file is kept whole",
             "write `split: 1 min` beside it, or a size, or take keep out",
         )
-    return RecordingPlan(
-        written.directory, amount.get("bytes"), amount.get("ns"), kept.get("ns"), kept.get("bytes")
-    )
+    limits = amount.get("bytes"), amount.get("ns"), kept.get("ns"), kept.get("bytes")
+    return Contribution(recording=RecordingPlan(written.directory, *limits))
+
+
+STAGE = CompileStage(compile_recording)
