@@ -21,8 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_standard_streams()
     if arguments is not None:
         return _run(tuple(arguments))
-    # A process of our own: a start makes 100,000 to 150,000 objects that stay. One collection among them takes
-    # 30 ms; the default threshold, 700, costs a tenth of the start-up.
+    # A process of our own: a start makes 100,000 to 150,000 objects that stay. One collection among them
+    # takes 30 ms; the default threshold, 700, costs a tenth of the start-up.
     gc.set_threshold(200_000, 20, 20)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # it would read all entry points once more
     code = _run(tuple(sys.argv[1:]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import msgspec
@@ -85,8 +84,7 @@ class Contribution(msgspec.Struct, frozen=True):
     """Groups of joints with a policy of their own for lost servos."""
 
 
-@dataclass(frozen=True)
-class CompileStage:
+class CompileStage(msgspec.Struct, frozen=True):
     """`STAGE` of `compile.py`: called once, when the joints are compiled and before the controllers are.
 
     It checks the feature's section against the rest of the file, and adds every problem to the file.

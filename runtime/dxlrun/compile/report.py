@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import msgspec
@@ -32,8 +31,7 @@ Source = Literal["file", "servo", "none"]
 Row = dict[str, Any]  # What JSON has of one thing
 
 
-@dataclass(frozen=True)
-class TableStage:
+class TableStage(msgspec.Struct, frozen=True):
     """`STAGE` of `table.py`: what `dxlrun check` shows of a feature."""
 
     FILE: ClassVar[str] = "table"

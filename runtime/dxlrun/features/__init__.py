@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
+
+from msgspec.structs import replace
 
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, S, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins

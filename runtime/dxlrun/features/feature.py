@@ -9,12 +9,12 @@ stage that asks for a file imports it, so `dxlrun check` imports nothing of the 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
+
+import msgspec
 
 from dxlwire.joint_unit import JointUnit
 
@@ -31,8 +31,7 @@ class Stage(Protocol):
 S = TypeVar("S", bound=Stage)
 
 
-@dataclass(frozen=True)
-class Section(Generic[T]):
+class Section(msgspec.Struct, Generic[T], frozen=True):
     """Section of the robot file: `STAGE` of `form.py`, asked for before a file is read.
 
     The form is built of the sections of all features, so none of them is named anywhere else.
@@ -67,8 +66,7 @@ class KeyedJoint(Protocol):
         """Values by key, as JSON has them."""
 
 
-@dataclass(frozen=True)
-class JointKey(Generic[T]):
+class JointKey(msgspec.Struct, Generic[T], frozen=True):
     """Key of a joint: `STAGE` of `joint_key.py`, asked for before a file is read.
 
     Every joint may have it, and so may `groups` and `joint_defaults`. The plan of a joint has the value that
@@ -87,14 +85,12 @@ class JointKey(Generic[T]):
     """Type of the value in the plan: `float`, or a struct of msgspec for a form."""
     before: str = ""
     """Key of a joint that follows it in lists of all keys; empty: it is the last."""
-    examples: Mapping[JointUnit, str] = dataclasses.field(default_factory=dict)
+    examples: Mapping[JointUnit, str] = {}
     """How a value is written where the joint turns, and where it is linear; one of the other kind is refused.
     Empty: its unit has nothing to do with that of the joint."""
 
     def of(self, joint: KeyedJoint) -> T | None:
         """Return the value of a joint in a plan; None: the robot file gives none."""
-        import msgspec  # not above: a file is checked without JSON
-
         return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
 
 
@@ -106,8 +102,7 @@ class KeyedServo(Protocol):
         """Values by key, as the form of the key has read them."""
 
 
-@dataclass(frozen=True)
-class ServoKey(Generic[T]):
+class ServoKey(msgspec.Struct, Generic[T], frozen=True):
     """Key of a servo: `STAGE` of `servo_key.py`, asked for before a file is read.
 
     A joint with servos of its own has it for all of them, and one of its servos for itself; so have `groups`,
@@ -134,8 +129,7 @@ class ServoKey(Generic[T]):
         return cast("T", servo.keys[self.name])
 
 
-@dataclass(frozen=True)
-class PolicyKey(Generic[T]):
+class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
     """Key of the section `policies`: `STAGE` of `policy_key.py`, asked for before a file is read."""
 
     FILE: ClassVar[str] = "policy_key"
@@ -157,8 +151,7 @@ class PolicyKey(Generic[T]):
         return value
 
 
-@dataclass(frozen=True)
-class Feature:
+class Feature(msgspec.Struct, frozen=True):
     """A feature by its name and the package that has its files."""
 
     name: str
