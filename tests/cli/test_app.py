@@ -40,7 +40,7 @@ def test_a_command_is_imported_alone():
 
     assert {name for name in modules if name.startswith("dxlrun.")} == {
         *("dxlrun.cli", "dxlrun.cli.app", "dxlrun.cli.inputs", "dxlrun.cli.run", "dxlrun.cli.check"),
-        "dxlrun.cli.verbs",
+        *("dxlrun.cli.verbs", "dxlrun.installed_plugins"),
         *("dxlrun.cli.tools", "dxlrun.cli.tools.tool_log"),
         *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
         *("dxlrun.output.escaping", "dxlrun.output.target"),
