@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -166,6 +165,8 @@ def _page_beside(*, shown: bool) -> Iterator[None]:
         show("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
         yield
         return
+    import subprocess  # not above: it takes 5 ms of every command
+
     from dxlrun.remote.sockets import running
 
     served = subprocess.Popen([sys.executable, "-P", "-c", _SHOW_PAGE, *running()])
