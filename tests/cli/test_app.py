@@ -45,7 +45,6 @@ def test_a_command_is_imported_alone():
         *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
         *("dxlrun.output.escaping", "dxlrun.output.target"),
         "dxlrun.output.unblocked",
-        *("dxlrun.features", "dxlrun.features.feature"),
         "dxlrun.errors",
     }
     assert "rich.markdown" not in modules

@@ -22,7 +22,6 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
-from dxlrun.features import stages
 from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 from dxlwire.joint_unit import LINEAR, ROTARY
@@ -154,7 +153,9 @@ def _verdict(result: Compiled) -> str:
 
 
 def _tables(result: Compiled) -> Iterator[Table]:
-    from dxlrun.compile.report import TableStage  # not above: the help of the verb needs none of it
+    # not above: the help of the verb needs none of it
+    from dxlrun.compile.report import TableStage
+    from dxlrun.features import stages
 
     report = result.report
     joints, rate = report["joints"], result.rate
