@@ -11,7 +11,9 @@ from tests.analysis.judged import BUSY, REAL, SIMULATED, accusing, lost, on_bus,
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.remedies import INJECTED
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
+from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.latency import Latency, Periods
 from dxlrun_analysis.evidence import accused
@@ -69,7 +71,10 @@ def test_joint_is_not_accused_where_the_replies_of_its_bus_are_spoilt(code: str)
 
 def test_joint_of_two_servos_is_not_accused_beside_the_noise_of_their_bus() -> None:
     two = plan(REAL)
-    two.buses[0].servos = [LoggedServo("hip", number, name=f"hip_{number}") for number in (1, 2)]
+    two.buses[0].servos = [LoggedServo("hip", row + 1, row=row, name=f"hip_{row + 1}") for row in (0, 1)]
+    two.loop = structs.replace(two.loop, joints=(JointPlan("hip", -1.0, 1.0, None),))
+    pair = CouplingPlan("hip", (0,), (0, 1), ((0.5, 0.5),), ((1.0,), (1.0,)))
+    two.mechanics = MechanicsPlan(couplings=(pair,), servos=("hip_1", "hip_2"))
     run = totals(servos=on_bus("hip_1", "hip_2"), plan=two)
     assert [one.code for one in accused(run, [accusing("noise"), accusing("follows_worse", "hip")])] == [
         "noise"
