@@ -43,7 +43,7 @@ from dxlrun_fleet.fleet_view import SILENT_S, RobotView, Seen, fleet_table
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
 Closing = TypeVar("Closing", RobotView, NetworkLink, socket.socket)
-INFO = RobotInfo("joint", 50.0, False, None, 0, 0, (), {}, {}, {}, {}, {}, (), (), "x.yaml", None)
+INFO = RobotInfo("joint", 50.0, False, None, 0, 0, (), {}, {}, {}, {}, {}, {}, (), (), "x.yaml", None)
 ADDRESS = Address("lab3", "127.0.0.1", 1)
 TERMINAL = {"TERM": "xterm", "COLUMNS": "120", "LINES": "30"}
 ROBOTS = Path(__file__).parents[2] / "robots"
