@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Self
@@ -67,8 +66,7 @@ class Broken(FarJoints):
             raise ValueError("no such joint")
 
 
-@dataclass(frozen=True)
-class OneMonitor(Feature):
+class OneMonitor(Feature, frozen=True, kw_only=False):
     """A feature that has a monitor only."""
 
     monitor: type[FarJoints] = FarJoints
@@ -138,6 +136,7 @@ def test_controllers_are_held_until_no_policy_holds_them() -> None:
     noted = HeldJoints()
     context = SimpleNamespace(plan=loop_plan([JointPlan("a", -1.0, 1.0, None)]))
     actions = PolicyActions(context, noted, noted)
-    for rows, until in (({0}, "answer"), ({0, 1}, "are cool"), (set(), "answer"), (set(), "are cool")):
-        actions.hold_controllers(rows, until)
-    assert noted.held == [({0}, "answer"), ({0, 1}, "are cool"), ({0, 1}, "answer"), (set(), "are cool")]
+    first, second = type("First", (), {})(), type("Second", (), {})()
+    for holder, rows in ((first, {0}), (second, {0, 1}), (first, set()), (second, set())):
+        actions.hold_controllers(holder, rows, "are cool")  # two monitors may have the same sentence
+    assert [rows for rows, _ in noted.held] == [{0}, {0, 1}, {0, 1}, set()]

@@ -283,7 +283,7 @@ class NotedActions:
     def make_limp(self, rows: frozenset[int]) -> None:
         self.done.append(("limp", set(rows)))
 
-    def hold_controllers(self, lost: frozenset[int], until: str) -> None:
+    def hold_controllers(self, holder: object, lost: frozenset[int], until: str) -> None:
         self.done.append(("hold", set(lost)))
 
     def report(self, severity: Severity, text: str) -> None:

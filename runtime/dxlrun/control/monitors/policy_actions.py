@@ -24,8 +24,8 @@ class PolicyActions:
         self._context = context
         self._manager = manager
         self._gate = gate
-        self._held: dict[str, Collection[int]] = {}
-        """Rows of the joints whose controllers are held, by what ends that."""
+        self._held: dict[type, Collection[int]] = {}
+        """Rows of the joints whose controllers are held, by the monitor that holds them."""
 
     def end_run(self, policy: str, why: str) -> None:
         """End the run after this cycle, by another policy than on_exit; the first reason counts."""
@@ -37,14 +37,15 @@ class PolicyActions:
         for row in sorted(rows):
             self._context.hardware.switch_torque(row, False, _ignore_answer)
 
-    def hold_controllers(self, rows: Collection[int], until: str) -> None:
-        """Hold the controllers of these joints, and let those go on slowly that no policy holds any more.
+    def hold_controllers(self, holder: object, rows: Collection[int], until: str) -> None:
+        """Hold the controllers of these joints, and let those continue slowly that no monitor holds any more.
 
         Args:
-            rows: Rows of all joints that the policy holds now; the other joints are free of it.
+            holder: The monitor itself. It releases only the joints that it holds itself.
+            rows: Rows of all joints that the monitor holds now; the other joints are free of it.
             until: What ends that, as a clause of all joints of a controller: `all its joints answer again`.
         """
-        self._held[until] = rows
+        self._held[type(holder)] = rows
         self._gate.ease_in(self._manager.hold_lost(frozenset().union(*self._held.values()), until))
 
     def report(

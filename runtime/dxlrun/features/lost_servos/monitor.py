@@ -48,7 +48,7 @@ class LostServos:
             names = ", ".join(self._joints[row] for row in ending_rows)
             actions.end_run(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
         if not ending:
-            actions.hold_controllers(rows, "all its joints answer again")
+            actions.hold_controllers(self, rows, "all its joints answer again")
 
     def _judge(self, policies: PolicyPlan) -> tuple[dict[str, list[int]], list[GroupPolicy]]:
         """Return which policies end the run, for which lost rows, and which groups become limp by now."""

@@ -40,7 +40,7 @@ class HotServos:
             if self._do[row] == "limp":
                 self._actions.make_limp([row])
         held = [row for row in hot if self._do[row] == "hold"]
-        self._actions.hold_controllers(held, "all its joints are cool")
+        self._actions.hold_controllers(self, held, "all its joints are cool")
         self._hot = hot
 
 
