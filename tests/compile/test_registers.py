@@ -31,7 +31,7 @@ AX = ROBOT.replace("2.0", "1.0").replace("180 deg", "150 deg")
 
 def declared(registers, text=ROBOT, model="XM430-W350"):
     compiled = compile_text(text.format(registers=registers, model=model))
-    return compiled.plan.buses[0].servos[0].registers, compiled.warnings
+    return compiled.plan.buses[0].servos[0].settings, compiled.warnings
 
 
 def test_registers_come_into_the_plan_the_eeprom_first():

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.kit.rigs import Events
 
 from dxlrun import InputError
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.cli import check
 from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.description.joints import joints
+from dxlrun.description.joints.joints import kind_of_joint
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.description.robot import robot_form
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
@@ -101,6 +104,15 @@ def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
 def test_joint_of_a_transmission_may_have_the_key(tmp_path: Path) -> None:
     joints = compiled(tmp_path, mechanics_with_backlash()).plan.loop.joints
     assert [joint.name for joint in joints if joint.keys] == ["wrist_roll"]
+
+
+def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert kind_of_joint({"lead": "1 mm"}) == "<one servo>"  # means travel_per_turn
+    lead = structs.replace(joints.joint_keys()[0], name="lead")
+    monkeypatch.setattr(joints, "joint_keys", lambda: [lead])
+    assert kind_of_joint({"lead": "1 mm"}) == "<no servo>"
 
 
 def test_layer_of_a_joint_key_is_above_the_servos_of_couplings(tmp_path: Path) -> None:

@@ -201,7 +201,8 @@ def kind_of_joint(joint: object) -> str:
     if isinstance(joint, dict):
         if "servos" in joint:
             return "<several servos>"
-        surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in BareJoint.model_fields}
+        of_any = BareJoint.model_fields.keys() | {key.name for key in joint_keys()}
+        surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in of_any}
         own = _keys_of_a_servo()
         if surplus and (surplus & own or surplus & words_for("BareJoint", own)):
             return "<one servo>"
