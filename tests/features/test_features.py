@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from msgspec import to_builtins
 
 import dxlrun.features
 from dxlrun.compile.contribution import CompileStage
-from dxlrun.description.robot import Robot, robot_form
-from dxlrun.features import FEATURES, stages
-from dxlrun.features.feature import Feature, Section
+from dxlrun.compile.robot import compile_files
+from dxlrun.description.form import Form, with_keys
+from dxlrun.description.joints.joints import BareJoint, Joint, SharedJoint
+from dxlrun.description.joints.mechanics import OneOfServos
+from dxlrun.description.robot import Group, GroupPolicies, Policies, Robot, robot_form
+from dxlrun.features import FEATURES, RESERVED, stages
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin
+
+ROBOT = Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml"
 
 
 def test_each_feature_has_the_section_of_its_name() -> None:
@@ -66,4 +74,99 @@ def test_broken_section_of_plugin_leaves_robots_usable(
     installed, broken = dxlrun.features._installed((plugin,))
     assert installed == FEATURES
     assert broken.keys() == {"lamps", "devices"}
-    assert "is there already" in broken["devices"]
+    assert "another feature has that name" in broken["devices"]
+
+
+KEYS = {
+    "form": 'Section("{name}", int, key("It.", "1", 0))',
+    "joint_key": 'JointKey("{name}", int, key("It.", "1", 0), value=int, before="not_there")',
+    "servo_key": 'ServoKey("{name}", int, key("It.", "1", 0), key("It.", "1", None), key("It.", "1", 0))',
+    "policy_key": 'PolicyKey("{name}", int, key("It.", "1", 0))',
+}
+
+
+Offer = Callable[..., tuple[Feature, tuple[Feature, ...], dict[str, str]]]
+
+
+@pytest.fixture
+def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
+    """Offer a feature whose files declare a key; return it, all that are installed, and the broken ones."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def make(
+        name: str, *files: str, declared: str = ""
+    ) -> tuple[Feature, tuple[Feature, ...], dict[str, str]]:
+        package = f"offered_{name}_{'_'.join(files)}"
+        (tmp_path / package).mkdir()
+        for file in files:
+            kind = KEYS[file].partition("(")[0]
+            (tmp_path / package / f"{file}.py").write_text(
+                f"from dxlrun.tooling.features import {kind}\nfrom dxlrun.tooling.files import key\n"
+                f"STAGE = {KEYS[file].format(name=declared or name)}\n"
+            )
+        (tmp_path / package / "__init__.py").write_text(
+            "from dxlrun.tooling.features import Feature\n\n\n"
+            f"def dxlrun_features():\n    return [Feature({name!r}, {package!r})]\n"
+        )
+        plugin = InstalledPlugin("offered", "offered 1.0", EntryPoint("offered", package, "dxlrun"))
+        return Feature(name, package, "offered 1.0"), *dxlrun.features._installed((plugin,))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("loop", "form"),
+        ("include", "form"),
+        ("bus", "joint_key"),
+        ("lower", "joint_key"),
+        ("id", "servo_key"),
+        ("on_exit", "policy_key"),
+        ("groups", "policy_key"),
+        ("graph", "policy_key"),
+    ],
+)
+def test_key_of_plugin_with_name_of_the_core_is_refused(offer: Offer, name: str, file: str) -> None:
+    _, installed, broken = offer(name, file)
+    assert installed == FEATURES
+    assert broken == {
+        name: f"the key {name} of offered 1.0 cannot be used: dxlrun has a key of that name; "
+        "report it to its author"
+    }
+
+
+def test_key_that_is_not_the_name_of_its_feature_is_refused(offer: Offer) -> None:
+    assert (
+        "joint_key.py, servo_key.py or policy_key.py declares it"
+        in (offer("lamps", "joint_key", declared="bus")[2]["lamps"])
+    )
+
+
+def test_key_of_joints_and_of_servos_is_refused(offer: Offer) -> None:
+    assert "a joint has both" in offer("glow", "joint_key", "servo_key")[2]["glow"]
+
+
+def test_key_before_an_unknown_one_is_the_last(offer: Offer) -> None:
+    feature, installed, broken = offer("backlash", "joint_key")
+    assert (installed, broken) == ((*FEATURES, feature), {})
+    stage = feature.stage(JointKey)
+    assert stage is not None
+    assert [*with_keys(BareJoint, [stage]).model_fields] == [*BareJoint.model_fields, "backlash"]
+
+
+def test_all_names_of_the_core_are_reserved() -> None:
+    forms = {
+        Section: (Robot,),
+        JointKey: (Joint, SharedJoint, OneOfServos, Group),
+        ServoKey: (Joint, SharedJoint, OneOfServos, Group),
+        PolicyKey: (Policies, GroupPolicies),
+    }
+    features = {feature.name for feature in FEATURES}
+    for kind, names in RESERVED.items():
+        public = {name for form in forms[kind] for name in {*dir(form), *form.model_fields} if name[0] != "_"}
+        assert public - {*dir(Form)} - features <= {*names.split()}, kind
+    assert {*Robot.read_before} <= {*RESERVED[Section].split()}
+    report = to_builtins(compile_files(ROBOT, {}, []).report)
+    assert all(report.keys() - features <= {*names.split()} for names in RESERVED.values())
+    assert report["joints"][0].keys() <= {*RESERVED[JointKey].split()}

@@ -144,7 +144,7 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
     order = [*form.model_fields]
     for each in added:
         if each.name not in order:
-            order.insert(order.index(each.before) if each.before else len(order), each.name)
+            order.insert(order.index(each.before) if each.before in order else len(order), each.name)
     # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
     made.__pydantic_fields__ = {name: made.model_fields[name] for name in order}
     return made

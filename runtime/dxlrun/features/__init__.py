@@ -6,9 +6,10 @@ share belongs to the room of that stage. `feature.py` describes the files; `FEAT
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -27,6 +28,26 @@ FEATURES = (
 """In the order in which every stage asks them; their states are in the cycle's record in this order.
 
 Devices are the first, because their plans count columns of the record from 0.
+"""
+
+_JOINTS = (
+    "bus continuous direction gear_ratio id joints limits model motor ratio reference servos simulation "
+    "tolerance torque travel_per_turn unit wrap "
+    "acceleration bounded effort effort_source effort_unit linear lower mode name position_source "
+    "reach_lower reach_upper upper velocity velocity_source"
+)
+_SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
+_REPORT = "robot rate joints groups controllers buses policies motions graph duration online"
+"""Keys of the report of `dxlrun check`, which has the rows of a feature under its name."""
+RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {
+    Section: f"{_REPORT} {_SECTIONS}",
+    JointKey: f"{_REPORT} {_JOINTS}",
+    ServoKey: f"{_REPORT} {_JOINTS}",
+    PolicyKey: f"{_REPORT} exit_timeout of_joint on_exit on_fault on_returned_servo",
+}
+"""Names of the core by kind of key: a key of a feature would replace what the core has by that name.
+
+The forms and the report are in rooms above this one, so they are not imported here. A test compares them.
 """
 
 
@@ -62,24 +83,34 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
         with suppress(Exception, SystemExit):  # foreign code: `dxlrun plugins` says why it cannot be used
             features += _features_of(plugin)
         for feature in features:
-            try:
-                forms = feature.stage(Section), feature.stage(PolicyKey)
-                keys = *forms, feature.stage(JointKey), feature.stage(ServoKey)
-            except (Exception, SystemExit) as error:
+            if fault := _find_fault(feature, found):
                 broken[feature.name] = (
-                    f"the section {feature.name} of {feature.distribution} cannot be used "
-                    f"({type(error).__name__}: {error}); report it to its author"
+                    f"the key {feature.name} of {feature.distribution} cannot be used: {fault}; "
+                    "report it to its author"
                 )
-                continue
-            if feature.name not in {key.name for key in keys if key} or feature.name in found:
-                broken[feature.name] = (
-                    f"{feature.distribution} offers the section {feature.name}, which "
-                    + ("is there already" if feature.name in found else "its form.py does not have")
-                    + "; report it to its author"
-                )
-                continue
-            found[feature.name] = feature
+            else:
+                found[feature.name] = feature
     return tuple(found.values()), broken
+
+
+def _find_fault(feature: Feature, found: Container[str]) -> str:
+    """Return why a feature of a plug-in cannot be used beside those that were found; empty if it can."""
+    name = feature.name
+    try:
+        keys = [key for kind in RESERVED if (key := feature.stage(kind)) is not None]
+    except (Exception, SystemExit) as error:
+        return f"{type(error).__name__}: {error}"
+    groups = [key.group for key in keys if isinstance(key, PolicyKey) and key.group is not None]
+    names = {key.name for key in (*keys, *groups)}
+    faults = {
+        "another feature has that name": name in found,
+        "no form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
+        f"a file declares {', '.join(sorted(names - {name}))} instead": len(names) > 1,
+        "dxlrun has a key of that name": any(name in RESERVED[type(key)].split() for key in keys),
+        "it is a key of joints and of servos, and a joint has both": {JointKey, ServoKey}
+        <= {*map(type, keys)},
+    }
+    return next((fault for fault, is_so in faults.items() if is_so), "")
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:

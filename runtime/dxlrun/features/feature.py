@@ -47,7 +47,7 @@ class Section(msgspec.Struct, Generic[T], frozen=True):
     field: T
     """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
-    """Key that follows it in lists of all keys; empty: it is the last."""
+    """Key that follows it in lists of all keys; it is the last where there is no such key."""
     moved_joints: Callable[[object], Iterable[str]] = lambda section: ()
     """Yields the joints whose servos are in this section, which may have mistakes. Groups and defaults give
     such joints no keys of servos."""
@@ -84,7 +84,7 @@ class JointKey(msgspec.Struct, Generic[T], frozen=True):
     value: type[T]
     """Type of the value in the plan: `float`, or a struct of msgspec for a form."""
     before: str = ""
-    """Key of a joint that follows it in lists of all keys; empty: it is the last."""
+    """Key of a joint that follows it in lists of all keys; it is the last where there is no such key."""
     examples: Mapping[JointUnit, str] = {}
     """How a value is written where the joint turns, and where it is linear; one of the other kind is refused.
     Empty: its unit has nothing to do with that of the joint."""
@@ -122,7 +122,7 @@ class ServoKey(msgspec.Struct, Generic[T], frozen=True):
     of_section: object
     """Field of the key in a servo that has no joint of its own."""
     before: str = ""
-    """Key of a servo that follows it in lists of all keys; empty: it is the last."""
+    """Key of a servo that follows it in lists of all keys; it is the last where there is no such key."""
 
     def of(self, servo: KeyedServo) -> T:
         """Return the value of a servo, which is that of its joint if it has none itself."""
@@ -141,7 +141,7 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
     field: T
     """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
-    """Key of the section that follows it in lists of all keys; empty: it is the last."""
+    """Key of the section that follows it in lists of all keys; it is the last where there is no such key."""
     group: PolicyKey[Any] | None = None
     """The same key of `policies.groups.NAME`; None: groups do not have it."""
 
