@@ -98,7 +98,9 @@ def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
         pytest.approx(np.radians(1)),
     ]
     groups = f"{ROBOT}groups: {{leg: {{joints: [ankle], backlash: 2 deg}}}}\n"
-    assert compiled(tmp_path, groups).plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))
+    plan = compiled(tmp_path, groups.replace("backlash: 4 deg", "torque: on")).plan
+    assert plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))
+    assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
 
 
 def test_joint_of_a_transmission_may_have_the_key(tmp_path: Path) -> None:

@@ -169,6 +169,9 @@ def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
     plan = plan_of(file)
     assert "on_hot_servo" not in {feature.name for feature in plan.features}
     assert "dxlrun_hot" not in plan.packages
+    group = "{joints: [pan], on_lost_servo: limp}"
+    file.write_text(f"{ROBOT}policies: {{groups: {{on_hot_servo: {group}}}}}\n")
+    assert "dxlrun_hot" not in plan_of(file).packages
     file.write_text(ROBOT + HOT % "limp")
     assert plan_of(file).packages["dxlrun_hot"] == "dxlrun-hot"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 from dxlrun import InputError
 from dxlrun.compile.robot import Compiled, compile_files
 from dxlrun.description.json_schema import robot_schema
+from dxlrun.features import feature
 from dxlrun.testing import installed, simulated_robot
 from dxlsim.servo.protocol2_servo import Protocol2Servo
 
@@ -106,6 +109,13 @@ def test_key_of_a_later_feature_counts(tmp_path: Path) -> None:
     text = ROBOT.replace("registers: {position_p_gain: 700}", "registers: {led: 0}")
     settings = compiled(tmp_path, text).plan.buses[0].servos[0].settings
     assert [(one.name, one.value) for one in settings] == [("led", 1)]
+
+
+def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
+    sys.modules.pop("dxlrun_glow.settings", None)
+    feature._stage.cache_clear()
+    assert "dxlrun_glow" not in compiled(tmp_path, re.sub(", glow: (true|false)", "", ROBOT)).plan.packages
+    assert "dxlrun_glow.settings" not in sys.modules
 
 
 def test_mistake_has_the_place_of_the_key(tmp_path: Path) -> None:

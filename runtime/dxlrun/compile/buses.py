@@ -9,7 +9,7 @@ from functools import reduce
 from msgspec.structs import replace
 
 from dxlrun.compile.contribution import Contribution
-from dxlrun.compile.joints.described_servos import described_servos, first_joints
+from dxlrun.compile.joints.described_servos import described_servos, first_joints, used_features
 from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
 from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.servos import CompiledServo, SettingsStage
@@ -18,7 +18,7 @@ from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
 from dxlrun.description.reading import Description
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
 from dxlrun.errors import suggestion
-from dxlrun.features import installed_features, stages
+from dxlrun.features import stages
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.control_table import ControlTable, find_table
 from dxlwire.control_table.device_table import DeviceTable
@@ -77,7 +77,7 @@ def compile_buses(
             file.error(mark, str(error), "change the joints or devices of this bus")
             continue
         _check_ticks(file, plan)
-        for _, stage in stages(SettingsStage, installed_features()):
+        for _, stage in stages(SettingsStage, used_features(file.description)):
             stage.check(file, plan)
         _check_budget(file, plan)
         plans.append(_with_monitoring(file, plan))

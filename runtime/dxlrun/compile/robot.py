@@ -18,7 +18,7 @@ from dxlrun.compile.controllers import (
     compile_modes,
     read_controller_files,
 )
-from dxlrun.compile.joints.described_servos import AUTO
+from dxlrun.compile.joints.described_servos import AUTO, used_features
 from dxlrun.compile.joints.joints import (
     CompiledJoint,
     check_limp_joints,
@@ -39,7 +39,7 @@ from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
-from dxlrun.features import installed_features, stages
+from dxlrun.features import stages
 from dxlrun.features.feature import Feature
 from dxlrun.installed_plugins import PHYSICS_GROUP, distribution_name, installed_plugins
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
@@ -156,7 +156,7 @@ def compile_robot(
     check_twins(file, {name: joint.table for name, joint in joints.items()})
     body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
-    features = _used_features(file)
+    features = used_features(description)
     compilation = Compilation(file, plugins, joints, body)
     by_feature = {
         feature.name: stage.contribute(compilation) for feature, stage in stages(CompileStage, features)
@@ -242,13 +242,6 @@ def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
     """Return the models of all servos and devices."""
     servos = {servo.model for bus in buses for servo in bus.servos}
     return frozenset(servos | {device.model for bus in buses for device in bus.devices})
-
-
-def _used_features(file: RobotFile) -> tuple[Feature, ...]:
-    """Return our features, and those of plug-ins whose sections or keys the file has."""
-    paths = (path for path in file.marks.keys if len(path) != 2 or path[0] == "policies")
-    written = {path[-1] for path in paths}  # without the names of joints and other entries
-    return tuple(each for each in installed_features() if not each.distribution or each.name in written)
 
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:

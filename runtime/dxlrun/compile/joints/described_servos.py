@@ -1,4 +1,7 @@
-"""Servos as the robot file has them: those of joints, with what a joint has for all, and of features."""
+"""Servos as the robot file has them: those of joints, with what a joint has for all, and of features.
+
+The file's servos decide which features it uses, as a key may be that of a servo.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint, ser
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.features import installed_features, stages
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey, Stage
 from dxlwire.joint_unit import JointUnit
 
 AUTO = "auto"  # In place of a model: it is read from the servo
@@ -69,6 +73,24 @@ def described_servos(description: Description) -> list[DescribedServo]:
     for _, stage in stages(ServoStage, installed_features()):
         found += stage.describe(description)
     return found
+
+
+def used_features(description: Description) -> tuple[Feature, ...]:
+    """Return our features, and those of plug-ins whose sections or keys the file has."""
+    robot, marks = description.robot, description.marks
+    servos = described_servos(description)
+    parents: dict[type[Stage], list[KeyPath]] = {
+        Section: [()],
+        PolicyKey: [("policies",), *(("policies", "groups", name) for name in robot.policies.groups)],
+        JointKey: [("joints", name) for name in robot.joints],
+        ServoKey: [place for servo in servos for place in (servo.place, servo.defaults)],
+    }
+
+    def is_used(feature: Feature) -> bool:
+        kinds = (kind for kind in parents if feature.stage(kind) is not None)
+        return any(marks.has((*parent, feature.name)) for kind in kinds for parent in parents[kind])
+
+    return tuple(each for each in installed_features() if not each.distribution or is_used(each))
 
 
 def find_unknown_servos(description: Description) -> frozenset[str]:

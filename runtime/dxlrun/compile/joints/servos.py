@@ -10,13 +10,13 @@ from typing import ClassVar, Protocol
 
 import msgspec
 
-from dxlrun.compile.joints.described_servos import AUTO, DescribedServo, described_servos
+from dxlrun.compile.joints.described_servos import AUTO, DescribedServo, described_servos, used_features
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.errors import Mark, suggestion
-from dxlrun.features import installed_features, stages
+from dxlrun.features import stages
 from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
@@ -108,7 +108,7 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
 
     `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
-    described = described_servos(file.description)
+    described, features = described_servos(file.description), used_features(file.description)
     _unique_ids(file, described)
     compiled: dict[str, CompiledServo] = {}
     for servo in described:
@@ -127,7 +127,7 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         found = file if certain else RobotFile(file.description)
         settings = {
             setting.name: setting
-            for _, stage in stages(SettingsStage, installed_features())
+            for _, stage in stages(SettingsStage, features)
             for setting in stage.compile(found, servo, table)
         }
         declared = {name: setting.value for name, setting in settings.items()}
