@@ -2,7 +2,13 @@
 
 from tests.kit.robots import compile_text, robot_text
 
+from dxlrun.features.devices.plan import decode_devices
+
 ROBOT = robot_text("devices")
+
+
+def commands_of(plan):
+    return decode_devices(plan.loop.feature_plans["devices"])
 
 
 def test_devices_are_the_first_sources_in_the_order_of_the_file():
@@ -26,8 +32,8 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file():
         ("force.y", 4, 1),
     ]
     assert [(block.address, block.length) for block in light.blocks] == [(65, 1), (130, 2)]
-    (lamp,) = light.commands
+    (lamp,) = commands_of(plan)["light"]
     assert (lamp.name, lamp.address, lamp.lowest, lamp.highest, lamp.safe) == ("lamp", 65, 0.0, 1.0, 0)
     given = compile_text(ROBOT.replace("{lamp: led}", "{lamp: led}, safe: {lamp: 1}")).plan
-    assert given.buses[0].devices[1].commands[0].safe == 1
+    assert commands_of(given)["light"][0].safe == 1
     assert plan.loop.sources[1].label == "light (ID 102 on bus main)"
