@@ -120,7 +120,7 @@ def test_devices_and_sensors_are_shown_with_their_age(shown: Any) -> None:
     code, printed = shown(Robot(sources=True), once=True)
     assert code == 0
     lines = [" ".join(line.split()) for line in printed.splitlines()]
-    assert "foot 1250 ms force.x 12.5 N, force.y -" in lines
+    assert "foot 1250 ms, not valid force.x 12.5 N, force.y -" in lines
     assert "imu 2 ms voltage 11.9 V" in lines
     assert len(frame(80, 24, sources=True)) <= 24
     assert any("voltage 11.9" in line for line in frame(80, 40, sources=True))

@@ -226,8 +226,10 @@ def sources(watched: Watched) -> Table:
 
 def _age(row: Row) -> Cell:
     age = row["age"]
-    text = f"{age * 1e3:.0f} ms" if isinstance(age, int | float) else "none came"
-    return Cell(text, "plain" if row["valid"] else "warning")
+    if not isinstance(age, int | float):
+        return Cell("none came", "warning")
+    text = f"{age * 1e3:.0f} ms"
+    return Cell(text) if row["valid"] else Cell(f"{text}, not valid", "warning")  # as `dxlrun get` has it
 
 
 def controllers(watched: Watched) -> Table:
