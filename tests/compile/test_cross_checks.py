@@ -10,6 +10,14 @@ def test_a_right_file_has_no_problem():
     assert problems_in(PAIR) == ()
 
 
+@pytest.mark.parametrize("loop", [3000, 7000, 30_000])
+def test_rate_of_a_controller_divides_a_fast_loop(loop: int) -> None:
+    """Its period is not a whole number of ns."""
+    text = PAIR.replace("{rate: 50}", f"{{rate: {loop}}}").replace("rate: 25}", f"rate: {loop // 2}}}")
+    assert f"rate: {loop // 2}" in text
+    assert not [problem.what for problem in problems_in(text) if "of states" in problem.what]
+
+
 MOTION = """\
 name: nod
 motions:
