@@ -1,10 +1,13 @@
 """The gateway under load and when parts of it fail. No time decides."""
 
 import signal
+import time
 
 import pytest
+from tests.remote.conftest import Arm, Desk
 
 from dxlrun.channels.events import EventCode, Severity
+from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.remote import link, preparation
 
 DONE = {"done": True, "cycle": 0}
@@ -51,6 +54,22 @@ def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_serv
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert desk.ask("POST", "/stop") == (200, DONE)
     assert [command.kind for command in desk.taken] == ["stop"]
+
+
+class SlowOffers(dict):
+    """Offers of a package that takes long to import."""
+
+    def get(self, name, default=None):
+        """Return an offer after the import."""
+        time.sleep(0.1)
+        return super().get(name, default)
+
+
+def test_import_of_a_controller_that_is_loaded_is_not_interrupted(monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    desk = Desk(plugins=PlugIns(SlowOffers(arm=Offer("arm", Arm, "tests 1")), {}))
+    status, content = desk.ask("POST", "/controllers", {"name": "more", "type": "arm", "joints": ["pan"]})
+    assert status == 200, content
 
 
 def test_a_failure_of_the_gateway_itself_fails_one_request_only(desk, monkeypatch, capsys):

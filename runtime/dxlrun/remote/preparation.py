@@ -303,9 +303,10 @@ class Preparation:
         """Return a controller with what its class asks for; raises RefusedRequest."""
         model: type[ParametersModel] = ParametersModel
         try:
+            # Unbounded: this imports a package, and an interrupted import leaves a part of it in the process.
+            offer = find_offer(plan.name, plan.type, self.plugins)
+            model = offer.controller.Parameters
             with bounded(plan.name):
-                offer = find_offer(plan.name, plan.type, self.plugins)
-                model = offer.controller.Parameters
                 wrapping = {joint.name for joint in self.joints.values() if joint.wrap}
                 found = compile_entry(plan, offer, tuple(self.joints), wrapping=wrapping, groups=self.groups)
                 require_fit(found, [self.joints[joint] for joint in found.plan.joints], self.urdf)
