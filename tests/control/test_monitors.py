@@ -60,10 +60,18 @@ class FarJoints:
 class Broken(FarJoints):
     """Raises in one of the cycles."""
 
+    error: BaseException = ValueError("no such joint")
+
     def check(self, time_ns: int) -> None:
         """Raise by the time."""
         if time_ns > 1e9 * ENDS_S:
-            raise ValueError("no such joint")
+            raise self.error
+
+
+class Exiting(Broken):
+    """Ends the process, as a script does."""
+
+    error = SystemExit(3)
 
 
 class OneMonitor(Feature, frozen=True, kw_only=False):
@@ -85,10 +93,13 @@ def robot_with(monitor: type[FarJoints], path: Path) -> VirtualRobot:
     return VirtualRobot(replace(plan, loop=replace(plan.loop, features=features)))
 
 
-def test_monitor_that_raises_ends_the_run_by_on_fault(tmp_path: Path) -> None:
-    robot = robot_with(Broken, tmp_path)
+@pytest.mark.parametrize(
+    ("monitor", "raised"), [(Broken, "ValueError: no such joint"), (Exiting, "SystemExit: 3")]
+)
+def test_monitor_that_raises_ends_the_run_by_on_fault(monitor, raised: str, tmp_path: Path) -> None:
+    robot = robot_with(monitor, tmp_path)
     result = robot.run()
-    detail = f"the monitor Broken of {__name__} raised ValueError: no such joint; on_fault: limp"
+    detail = f"the monitor {monitor.__name__} of {__name__} raised {raised}; on_fault: limp"
     assert (result.reason, result.detail) == ("fault", detail)
     assert not any(servo.torque_on for servo in robot.buses[0].servos)
 

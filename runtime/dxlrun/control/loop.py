@@ -231,7 +231,7 @@ class Loop:
                 monitor.check(time_ns)
             except PortError:
                 raise
-            except Exception as error:  # foreign code: the run ends by the steps of its policy
+            except (Exception, SystemExit) as error:  # foreign code: the run ends by the steps of its policy
                 kind, what = type(monitor), f"raised {type(error).__name__}: {error}"
                 self._actions.end_run("on_fault", f"the monitor {kind.__name__} of {kind.__module__} {what}")
         commands = steering.inbox.take()
