@@ -8,8 +8,15 @@ from hypothesis import strategies as st
 from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile.joints.register_values import declarable, register_value, steered_value
+from dxlrun.compile.joints.register_values import (
+    UnfitRegister,
+    any_value,
+    declarable,
+    register_value,
+    steered_value,
+)
 from dxlwire.control_table import all_tables, find_table
+from dxlwire.control_table.device_table import read_device_table
 
 ROBOT = """\
 name: arm
@@ -77,6 +84,16 @@ def test_any_value_is_taken_or_refused_with_a_sentence(value):
     for name in ("max_voltage_limit", "homing_offset", "velocity_limit", "return_delay_time", "shutdown"):
         found = outcome(table, name, value)
         assert "; " in found if isinstance(found, str) else found.value in range(-(1 << 31), 1 << 32)
+
+
+def test_quantity_for_an_item_of_a_device_counts_from_its_offset():
+    table = read_device_table(
+        'kind = "device"\nmodel = "heater"\nprotocol = 2.0\n[items]\n'
+        'aim = {address = 30, size = 1, access = "RW", tick = "0.5 V", offset = "5 V", maximum = 20}\n'
+    )
+    assert any_value(table, "aim", "8 V").value == 6
+    with pytest.raises(UnfitRegister, match=re.escape("is 0..20 (5..15 V), not 4 V (-2)")):
+        any_value(table, "aim", "4 V")
 
 
 PAGE = page_text("registers.md")

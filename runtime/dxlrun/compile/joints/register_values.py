@@ -151,7 +151,7 @@ def _raw(item: ControlItem, value: int | str) -> int:
         return value
     if not item.unit:
         raise UnfitRegister(f"{item.title} has no unit, but is {value!r}", "write a whole number")
-    ticks = quantity(value, item.unit) / item.scale
+    ticks = (quantity(value, item.unit) - item.offset) / item.scale
     if not math.isfinite(ticks):
         raise UnfitRegister(f"{value} is out of the range of {item.title}", f"write {_range(item)}")
     return round(ticks)
@@ -162,7 +162,8 @@ def _range(item: ControlItem) -> str:
     if not item.unit:
         return ends
     unit = "of the maximum" if item.unit == "1" else item.unit
-    return f"{ends} ({item.minimum * item.scale:.6g}..{item.maximum * item.scale:.6g} {unit})"
+    lowest, highest = (ticks * item.scale + item.offset for ticks in (item.minimum, item.maximum))
+    return f"{ends} ({lowest:.6g}..{highest:.6g} {unit})"
 
 
 def _shown(value: int | str, raw: int) -> str:
