@@ -57,7 +57,7 @@ class ServoArrays:
 
 
 class DynamixelHardware:
-    """Reads all servos, writes all goals, once a cycle; `control.loop.Hardware` has the contract.
+    """Reads all servos, writes all goals, once a cycle; `contract.hardware.Hardware` has the contract.
 
     States and goals are the robot's arrays, one row a joint. A row whose reply was lost is invalid and keeps
     its values while its age grows. A servo that missed a read, or whose torque enable was not read as 1, gets

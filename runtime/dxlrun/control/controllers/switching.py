@@ -321,7 +321,7 @@ class Switching:
     # Entering and leaving
 
     def _take(self, step: Step, number: int | None, why: str = "") -> Refusal | Waiting | None:
-        """Deactivate and activate controllers as planned; None: it is done (see `switch`).
+        """Deactivate and activate controllers as planned; None: it is done (see `switch_controllers`).
 
         `why`: the fault for which these take over; empty: they were asked for.
         """

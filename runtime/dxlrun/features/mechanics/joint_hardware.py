@@ -166,7 +166,7 @@ class ServosTogether:
 
 
 class JointHardware(HardwareLayer):
-    """Joints in front of a hardware of servos; `control.loop.Hardware` has the contract.
+    """Joints in front of a hardware of servos; `contract.hardware.Hardware` has the contract.
 
     The servos' hardware works on `arrays.servo_states` and `arrays.servo_goals`. A request for a joint is one
     for all its servos, and so for all joints of its transmission; it is answered when all have done it.
