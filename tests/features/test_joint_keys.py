@@ -35,6 +35,7 @@ KNEE = "{bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, back
 ANKLE = "{bus: main, id: 2, model: AX-12A, reference: 150 deg, direction: 1}"
 SLIDE = "{bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, travel_per_turn: 94 mm%s}"
 ROBOT = f"{HEAD}joints:\n  knee: {KNEE}\n  ankle: {ANKLE}\n"
+STRICT = "Annotated[tuple[Position, Position], Field(strict=False)]"
 RAD_PER_TICK = np.radians(300) / 1023
 
 
@@ -148,6 +149,42 @@ def test_check_shows_the_key_as_a_column(tmp_path: Path) -> None:
     table = next(iter(check._tables(found)))
     column = [one.name for one in table.columns].index("backlash")
     assert [row[column].text for row in table.rows] == ["4", "none", "0.1 mm"]
+
+
+@pytest.mark.parametrize(
+    ("form", "example", "written", "shown"),
+    [
+        ("tuple[Position, Position] | None", "[-1 rad, 1 rad]", "[-1 rad, 1 rad]", "[-1.0, 1.0]"),
+        ("Position | Literal['auto'] | None", "1 deg", "auto", "auto"),
+    ],
+)
+def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, example: str, written: str, shown: str
+) -> None:
+    project, package = tmp_path / "other", f"dxlrun_window_{shown.strip('[]')[:1].replace('-', '_')}"
+    (project / "src" / package).mkdir(parents=True)
+    (project / "src" / package / "__init__.py").touch()
+    (project / "src" / package / "joint_key.py").write_text(
+        "from typing import Annotated, Literal\n\nfrom pydantic import Field\n\n"
+        "from dxlrun import LINEAR, ROTARY\nfrom dxlrun.tooling.features import JointKey\n"
+        "from dxlrun.tooling.files import Position, key\n\n"
+        f"FORM = {form.replace('tuple[Position, Position]', STRICT)}\n"
+        f'EXAMPLE = "{example}"\n'
+        "STAGE = JointKey('window', FORM, key('It.', EXAMPLE, None), value=object,\n"
+        "    examples={ROTARY: EXAMPLE, LINEAR: EXAMPLE})\n"
+    )
+    (project / "src" / package / "plugin.py").write_text(
+        "from dxlrun.tooling.features import Feature\n\n\n"
+        f"def dxlrun_features():\n    return [Feature('window', {package!r})]\n"
+    )
+    (project / "pyproject.toml").write_text(
+        f'[project]\nname = "window"\nversion = "1.0"\n'
+        f'[project.entry-points.dxlrun]\nwindow = "{package}.plugin"\n'
+    )
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("backlash: 4 deg", f"window: {written}"))
+    with installed(project):
+        assert check.check(tmp_path / "robot.yaml") == 0
+    assert shown in capsys.readouterr().out
 
 
 def test_no_column_while_no_joint_has_the_key(tmp_path: Path) -> None:

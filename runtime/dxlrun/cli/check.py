@@ -213,6 +213,8 @@ def _joints(joints: Sequence[Row]) -> Table:
             return "none"
         if one.text is not None:
             return one.text(value, LINEAR if row["linear"] else ROTARY)
+        if not isinstance(value, int | float):
+            return str(value)
         text = f"{value * 1e3:.6g} mm" if row["linear"] else degrees(value)
         return own(f"{text}{one.column}", row[f"{one.name}_source"] if one.limit else "none")
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from dxlsim.motion.motor import Motor
     from dxlwire.control_table import ControlItem, ControlTable
     from dxlwire.control_table.device_table import DeviceTable
-from dxlwire.control_table.table import ControlItem
 
 _DEVICES_ALONE = ("offset", "state", "safe", "bit")
 """Fields of items that say nothing about servos."""

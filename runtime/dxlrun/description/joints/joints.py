@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Annotated, Optional, Self, TypeAlias, TypeVar, get_args
 
 from msgspec.structs import replace
@@ -317,8 +318,16 @@ def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
 
 
 def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
-    """Return the SI unit of a key's values for each kind of joint; empty where it does not depend on that."""
-    return {unit: kind(example).unit for kind in _kinds_of(key) for unit, example in key.examples.items()}
+    """Return the SI unit of a key's values for each kind of joint; empty where it does not depend on that.
+
+    It is empty for a list of quantities, too.
+    """
+    found: dict[JointUnit, str] = {}
+    for kind in _kinds_of(key):
+        for unit, example in key.examples.items():
+            with suppress(ValueError):
+                found[unit] = kind(example).unit
+    return found
 
 
 def _kinds_of(key: JointKey[object]) -> list[Either]:
