@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from dxlrun import Log, LogReader, open_log
-from dxlrun.tooling.output import Cell, Sentence, Table, Tone, Value, counted
-from dxlrun.tooling.output import Part as Shown
+from dxlrun.tooling.output import Cell, Part, Sentence, Table, Tone, Value, counted
 from dxlrun.tooling.plans import ScheduleName
 from dxlrun.tooling.records import EventCode
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.parts.cycles import CAUSES, CONTROLLERS, LATENCY, PERIODS, STEPS
 from dxlrun_analysis.parts.history import EVENTS, PAUSES, STEERING, TOPICS, tone_of
-from dxlrun_analysis.parts.part import Part, Report
+from dxlrun_analysis.parts.part import Report, ReportPart
 from dxlrun_analysis.parts.servos import BUSES, EXTREMES, JOINTS, SERVOS
 from dxlrun_analysis.parts.source_values import SOURCES
 from dxlrun_analysis.plan import LoggedBus, plan_of
@@ -23,10 +22,10 @@ from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.tally import Tally
 from dxlrun_analysis.verdict import judge
 
-PARTS: tuple[Part[Any], ...] = (
-    Part("log", lambda report: str(report.about.path)),
-    Part("robot", lambda report: report.robot),
-    Part("verdict", lambda report: report.verdict),
+PARTS: tuple[ReportPart[Any], ...] = (
+    ReportPart("log", lambda report: str(report.about.path)),
+    ReportPart("robot", lambda report: report.robot),
+    ReportPart("verdict", lambda report: report.verdict),
     PERIODS,
     LATENCY,
     STEPS,
@@ -40,10 +39,12 @@ PARTS: tuple[Part[Any], ...] = (
     STEERING,
     PAUSES,
     TOPICS,
-    Part("gaps", lambda report: report.totals.gaps),  # Records that the recorder did not get
-    Part("complete", lambda report: report.about.complete),
-    Part("damage", lambda report: report.about.damage),
-    Part("being_written", lambda report: report.about.being_written),  # The report is about the run so far
+    ReportPart("gaps", lambda report: report.totals.gaps),  # Records that the recorder did not get
+    ReportPart("complete", lambda report: report.about.complete),
+    ReportPart("damage", lambda report: report.about.damage),
+    ReportPart(
+        "being_written", lambda report: report.about.being_written
+    ),  # The report is about the run so far
     SOURCES,
 )
 """In the order of `--json`, and of the tables."""
@@ -77,7 +78,7 @@ def analyze(
 # The report as tables
 
 
-def parts(report: Report) -> tuple[Shown, ...]:
+def parts(report: Report) -> tuple[Part, ...]:
     """Return what a terminal shows: the verdict first, then the tables."""
     tone: Tone = "good" if report.verdict.good else "warning"
     return (

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dxlrun.tooling.output import Column, Columns, Table, Value, flagged, microseconds
 from dxlrun_analysis.causes.tables import causes_table
 from dxlrun_analysis.cycles.latency import Duration, Durations, Periods
-from dxlrun_analysis.parts.part import Part, Report, listing
+from dxlrun_analysis.parts.part import Report, ReportPart, listing
 
 
 def _loop(report: Report, periods: Periods) -> Table:
@@ -60,22 +60,22 @@ _DURATION: Columns[Duration] = (
     (Column("maximum"), _time("max_us")),
 )
 
-PERIODS = Part("periods", lambda report: report.totals.periods, _loop, section="latency")
-LATENCY = Part("latency", lambda report: report.totals.latency)
-STEPS = Part(
+PERIODS = ReportPart("periods", lambda report: report.totals.periods, _loop, section="latency")
+LATENCY = ReportPart("latency", lambda report: report.totals.latency)
+STEPS = ReportPart(
     "steps",
     lambda report: report.tally.of(Durations).finish()[0],
     listing("Steps of a cycle", ((Column("step", "name"), "name"), *_DURATION)),
     Durations,
     section="budget",
 )
-CONTROLLERS = Part(
+CONTROLLERS = ReportPart(
     "controllers",
     lambda report: report.tally.of(Durations).finish()[1],
     _controllers,
     Durations,
     section="budget",
 )
-CAUSES = Part(
+CAUSES = ReportPart(
     "causes", lambda report: report.totals.causes, lambda _, causes: causes_table(causes), section="budget"
 )

@@ -11,7 +11,7 @@ from dxlrun import Log
 from dxlrun.tooling.output import Cell, Column, Columns, Table, Tone
 from dxlrun.tooling.records import EventGroup, Severity
 from dxlrun_analysis.conduct.steering import Act
-from dxlrun_analysis.parts.part import Part, Report, listing
+from dxlrun_analysis.parts.part import Report, ReportPart, listing
 
 _MOST_ACTS = 100
 
@@ -109,16 +109,16 @@ _EVENT: Columns[EventCount] = (
     (Column("the first", "text"), lambda event: _once(event.first)),
 )
 
-EVENTS = Part(
+EVENTS = ReportPart(
     "events",
     lambda report: _count_events(report.totals.events),
     listing("Events", _EVENT),
     section="events",
     late=3,
 )
-STEERING = Part("steering", lambda report: report.totals.acts, _steering, section="steering", late=2)
-PAUSES = Part("pauses", lambda report: report.totals.pauses)
-TOPICS = Part(
+STEERING = ReportPart("steering", lambda report: report.totals.acts, _steering, section="steering", late=2)
+PAUSES = ReportPart("pauses", lambda report: report.totals.pauses)
+TOPICS = ReportPart(
     "topics",
     lambda report: report.tally.of(TopicCounts).finish(),
     listing("Topics", _TOPIC),

@@ -1,4 +1,4 @@
-"""Part: numbers of a log that the report has under one name, and their table."""
+"""Parts of the report: numbers of a log that the report has under one name, and their table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Part(Generic[T]):
+class ReportPart(Generic[T]):
     """A part of the report."""
 
     name: str  # Key of `--json`, and name of its table

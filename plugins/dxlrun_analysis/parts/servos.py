@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dxlrun.tooling.output import Cell, Column, Columns, Table, Value, flagged, microseconds
 from dxlrun_analysis.joints.health import ServoHealth
 from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.parts.part import Part, Report, listing
+from dxlrun_analysis.parts.part import Report, ReportPart, listing
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
 
 
@@ -65,7 +65,9 @@ _JOINT: Columns[JointTracking] = (
     (Column("at rest", form="{:.2f}", missing="-"), _error("rest_rad")),
 )
 
-SERVOS = Part("servos", lambda report: report.totals.servos, listing("Servos", _SERVO), section="buses")
-BUSES = Part("buses", lambda report: report.totals.buses, listing("Buses", _BUS), section="buses", first=True)
-JOINTS = Part("joints", lambda report: report.totals.tracking, _joints, section="joints")
-EXTREMES = Part("extremes", lambda report: report.tally.of(ServoHealth).extremes())
+SERVOS = ReportPart("servos", lambda report: report.totals.servos, listing("Servos", _SERVO), section="buses")
+BUSES = ReportPart(
+    "buses", lambda report: report.totals.buses, listing("Buses", _BUS), section="buses", first=True
+)
+JOINTS = ReportPart("joints", lambda report: report.totals.tracking, _joints, section="joints")
+EXTREMES = ReportPart("extremes", lambda report: report.tally.of(ServoHealth).extremes())

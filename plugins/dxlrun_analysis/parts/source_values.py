@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats, Log
 from dxlrun.tooling.output import Column, Columns, quantity_text
-from dxlrun_analysis.parts.part import Part, listing
+from dxlrun_analysis.parts.part import ReportPart, listing
 
 _DIGITS = 4
 
@@ -76,7 +76,7 @@ _COLUMNS: Columns[SourceValues] = (
     (Column("greatest"), lambda one: quantity_text(one.greatest, one.unit, digits=_DIGITS)),
 )
 
-SOURCES = Part(
+SOURCES = ReportPart(
     "sources",
     lambda report: report.tally.of(SourceHistory).finish(),
     listing("Devices, sensors and states of controllers", _COLUMNS),
