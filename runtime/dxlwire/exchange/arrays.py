@@ -13,7 +13,8 @@ Floats = NDArray[np.float64]
 class JointArrays(Protocol):
     """States of all joints, filled from replies; each array is contiguous and has one element per joint.
 
-    A joint without a plausible reply in this cycle keeps its last values, is not valid, and its age grows.
+    A joint without a plausible reply in this cycle keeps its last values, is marked invalid, and its age
+    grows.
     """
 
     @property
@@ -28,7 +29,7 @@ class JointArrays(Protocol):
 
     @property
     def effort(self) -> Floats:
-        """Nm, A, or the fraction of the maximum, by what the servo measures."""
+        """Nm, A, or the fraction of the maximum, depending on the quantity that the servo measures."""
         ...
 
     @property
@@ -38,7 +39,7 @@ class JointArrays(Protocol):
 
     @property
     def age_ns(self) -> NDArray[np.int64]:
-        """Time since the reply arrived whose values are shown; -1 before the first."""
+        """Age of the reply that the values come from; -1 before the first reply."""
         ...
 
     @property
@@ -57,10 +58,10 @@ class SourceArrays(Protocol):
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """One element per source: True where this cycle brought all its states."""
+        """One element per source: True where all of its states arrived in this cycle."""
         ...
 
     @property
     def age_ns(self) -> NDArray[np.int64]:
-        """One element per source: time since its states were true; -1 before the first reply."""
+        """One element per source: age of its states; -1 before the first reply."""
         ...

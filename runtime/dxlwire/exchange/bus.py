@@ -1,7 +1,7 @@
 """Bus: one serial line as a transaction machine that never blocks; Lines: all of them, with one wait.
 
-A bus writes an instruction, is fed the bytes that arrive, and is handed the time. `Lines` executes the jobs
-of all buses side by side: the cyclic reads, what is done in idle time, set-up and tools.
+A bus writes an instruction and receives incoming bytes and the time from its caller. `Lines` executes the
+jobs of all buses concurrently: cyclic reads, idle work, set-up and tools.
 """
 
 from __future__ import annotations
@@ -34,36 +34,43 @@ from dxlwire.wire.receiver import Receiver
 
 NEVER = 1 << 62
 QUIET_BYTES = 20
-"""A line that was silent for so many byte times is silent (docs/reference/protocol.md: drain until it is)."""
-LEAST_QUIET_NS = 200_000
-DRAIN_LIMIT_NS = 5_000_000  # A line that babbles longer than this is not waited for
-PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same for a job that has time
-LOST_LINE_STEP_NS = 200_000  # How often the other lines are looked at while one is lost
-BEAT_NS = 1_000_000  # The longest time between two signs of life, beside one wait
+"""Silence, in byte times, after which a line counts as quiet (docs/reference/protocol.md: drain until it
+is)."""
+LEAST_QUIET_NS = 200_000  # Minimum of that time, reached at 1 Mbit/s and above
+DRAIN_LIMIT_NS = 5_000_000  # A line that keeps sending noise for longer than this is not drained any further
+PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same limit for a job that has no deadline
+LOST_LINE_STEP_NS = 200_000  # Interval at which the other lines are checked while one is lost
+BEAT_NS = 1_000_000  # Longest interval between two calls of `beat`, not counting one wait
 MOST_LATE_NS = 1_000_000
-"""A reply that is later is an accident, as when this process was not running, and no property of the line."""
-_FORGOTTEN = 6  # With each reply that is less late, 2 ** -6 of a line's lateness is forgotten
+"""Cap for the measured lateness. A later reply is an accident, such as a stall of this process, and not a
+property of the line."""
+_FORGOTTEN = 6  # Each reply that is less late lowers a line's lateness by 2 ** -6
 
 FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
-"""What `Bus.words` holds, which the exchange kernel shares: when everything that was sent is off the wire;
-how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost; when the servos
-were last asked, 0: their watchdogs are not armed; how long these wait, 0: there are none."""
+"""Indices of `Bus.words`, the memory shared with the exchange kernel.
+
+- `FREE_NS`: time at which everything sent is off the wire.
+- `LATE_NS`: recent worst lateness of replies, not counting the adapter's latency.
+- `LOST`: 1 while the line is lost.
+- `ASKED_NS`: time of the last request to the servos; 0 while their watchdogs are not armed.
+- `SILENCE_NS`: timeout of the servos' watchdogs; 0 without watchdogs.
+"""
 
 _READY, _AWAITING, _RESTING, _DRAINING, _HOLDING = range(5)
-# to look into an Enum takes as long as to pack a packet's record
+# An attribute lookup on an Enum takes as long as packing a packet's record.
 _SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
 _INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
 
 _Shape: TypeAlias = tuple[int, int]  # ID and number of parameter bytes of a status packet
-_FAST: _Shape = (BROADCAST_ID, 0)  # Of the one status packet of a fast form, whatever its length
+_FAST: _Shape = (BROADCAST_ID, 0)  # Shape of the single status packet of a fast form, whatever its length
 
 
 class Bus:
-    """Executes transactions on one line; every byte that goes over it is reported to the packet sink.
+    """Transaction engine for one line. Reports every byte on the line to the packet sink.
 
-    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
-    several replies to one instruction each counts by itself, whatever became of the others. After a timeout
-    the line is drained until it is silent. A reply that may answer an older request does not count, see
+    A reply counts only when ID and length match exactly and it comes no sooner than the wire allows. Each of
+    several replies to one instruction counts on its own, even when another one is lost. After a timeout the
+    line is drained until it is silent. A reply that may answer an older request does not count, see
     `OwedReplies`.
     """
 
@@ -72,45 +79,46 @@ class Bus:
         self.plan = plan
         self.now_ns = clock.now_ns
         self.failure: PortError | None = None
-        """Why the line is lost; a bus with a failure does nothing more."""
+        """Reason why the line is lost. A bus with a failure does nothing more."""
         self.noise_bytes = 0  # Bytes that belonged to no intact packet, since the start
         self.unrequested = 0
-        """Packets since the start that no request of this host explains: instructions of another one, and the
-        replies to them."""
+        """Packets since the start that no request of this host explains: instructions of another host, and
+        the replies to them."""
         self.words = array("q", (0, 0, 0, 0, 0))  # Memory that the exchange kernel shares, see `FREE_NS`
         self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
-        """What a byte takes on the wire, ns."""
+        """Time that one byte takes on the wire, ns."""
         self._latency_ns = plan.latency_ns
         self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
         self._port = port
         self._sink = packets
         self._dialect: Dialect = dialect_of(plan.protocol)
         self.receiver = Receiver(self._take_packet, self._take_noise, self._dialect)
-        """What it has `pending` is the beginning of a packet, which a new request takes for noise."""
+        """Its `pending` bytes are the beginning of a packet; a new request discards them as noise."""
         cyclic = {
-            (one.servo_id, one.length + more)  # as many as late replies are distinguished by
+            (one.servo_id, one.length + more)  # As many lengths as late replies are distinguished by
             for one in plan.members
             for more in range(1 + one.spare)
         }
         self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
         self.owed = OwedReplies(clock.now_ns)
         """Replies that did not arrive in time and may arrive late."""
-        self._written: bytes | bytearray | memoryview = b""  # what was sent last
+        self._written: bytes | bytearray | memoryview = b""  # The packet that was sent last
         self._job: Job | None = None
         self._cyclic_job = self._waits = False
         self._held: Transaction | None = (
             None  # waits until the replies that are owed cannot be taken for its own
         )
         self._held_until_ns = 0
-        self._asked_length = 0  # parameters that the job asked for; a read may bring spare bytes
-        self._before: Transaction | None = None  # the one before the awaited one
+        self._asked_length = 0  # Parameter bytes that the job asked for; a read may return spare bytes
+        self._before: Transaction | None = None  # The transaction before the awaited one
         self._awaited: Transaction | None = None
         self._reply = Reply(_SENT, 0, b"", 0, 0, False)
         self._state = _READY
         self._sent_ns = self._earliest_ns = self._deadline_ns = self._drain_end_ns = 0
-        self._planned_deadline_ns = 0  # Of a reply that is awaited for longer; 0: none is
+        # Planned deadline of a reply whose deadline was extended; 0 without an extension
+        self._planned_deadline_ns = 0
         self._last_byte_ns = -NEVER
-        self._open = 0  # a bit for each status that is still awaited
+        self._open = 0  # One bit for each status that is still awaited
         self._refused = False
 
     # The line
@@ -122,16 +130,17 @@ class Bus:
 
     @property
     def late_ns(self) -> int:
-        """How late replies on this line came at worst lately, beside the adapter's latency."""
+        """Recent worst lateness of replies on this line, ns, not counting the adapter's latency."""
         return self.words[LATE_NS]
 
     def load(self, job: Job, *, cyclic: bool = False, waits: bool = False) -> None:
-        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
+        """Load a job; the next `step` begins it. Leftovers of an aborted job are dropped.
 
         Args:
             job: The transactions to execute.
             cyclic: The job reads the states of a cycle, and chooses the lengths of its reads itself.
-            waits: The job has time: a transaction is held back while a late reply could be taken for its own.
+            waits: The job has no deadline. A transaction is held back while a late reply could be taken
+                for its own.
         """
         self.drop()
         self._cyclic_job, self._waits = cyclic, waits
@@ -140,32 +149,35 @@ class Bus:
             self._reply.strays = 0
 
     def drop(self) -> None:
-        """Forget the loaded job; what still comes for it is stray."""
+        """Drop the loaded job. Replies that still arrive for it count as stray."""
         self._note_owed()
         self._job = self._awaited = self._held = None
         self._state = _READY
 
     def fail(self, error: PortError) -> None:
-        """Count the line as lost; its job is forgotten."""
+        """Mark the line as lost and drop its job."""
         self.failure = error
         self.words[LOST] = 1
         self._job = None
 
     def retry(self) -> None:
-        """Use the line again, which may be back or was only stuck."""
+        """Use a failed line again."""
         self.failure = None
         self.words[LOST] = 0
 
     def renew(self, port: Port) -> None:
-        """Continue on a line that is back in the place of one that was lost; its job is forgotten."""
+        """Continue on a reopened port in place of the lost one, and drop the job."""
         self._port = port
         self.retry()
         self.drop()
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
-        """Send a prepared packet without a reply, between two jobs; does not wait.
+        """Send a prepared packet without a reply, between two jobs, without blocking.
 
-        The next transaction starts when the packet is off the wire. Raises PortError when the line is lost.
+        The next transaction starts when the packet is off the wire.
+
+        Raises:
+            PortError: The line is lost.
         """
         if self.failure is None:
             try:
@@ -176,9 +188,12 @@ class Bus:
             raise self.failure
 
     def resume(self, received_ns: int, sent_ns: int, deadline_ns: int) -> None:
-        """Await the replies to the loaded job's next transaction, which the exchange kernel sent.
+        """Await the replies to the loaded job's next transaction, which the exchange kernel has sent.
 
-        `received_ns`: when the replies to the one before came.
+        Args:
+            received_ns: Arrival time of the replies to the transaction before.
+            sent_ns: Time at which the instruction left.
+            deadline_ns: Time at which the transaction times out.
         """
         if self._job is None or (transaction := self._job.advance(None)) is None:
             return
@@ -191,7 +206,7 @@ class Bus:
         self._deadline_ns = deadline_ns
 
     def take(self, data: bytes, at_ns: int) -> None:
-        """Take bytes that the exchange kernel received and could not use."""
+        """Parse bytes that the exchange kernel received and could not use."""
         self._last_byte_ns = at_ns
         self.receiver.feed(data, at_ns)
         self._skip_headers()
@@ -199,15 +214,16 @@ class Bus:
     # Time
 
     def hear(self) -> int:
-        """Take what the line has, and continue; return when to come back at the latest, as `step` does.
+        """Read the bytes that the line has, and continue. Return the latest time of the next call, as `step`
+        does.
 
-        Called when the line has bytes.
+        Called when the line is readable.
         """
         self._receive()
         return self.step(self.now_ns())
 
     def step(self, now_ns: int) -> int:
-        """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
+        """Do everything that is due. Return the latest time of the next call, NEVER without a job."""
         try:
             while self._job is not None:
                 if self._state == _READY:
@@ -230,7 +246,7 @@ class Bus:
                 self.fail(error)
 
     def _begin(self, job: Job) -> int:
-        """Hand the reply to the job and start its next transaction; return the time after that."""
+        """Pass the reply to the job and start its next transaction; return the time after that."""
         reply, done = self._reply, self._awaited
         if done is not None and reply.outcome is _OK:
             self._note_lateness(reply.last_ns - self._sent_ns - done.due_ns - self._latency_ns)
@@ -245,7 +261,7 @@ class Bus:
         reply.strays = 0
         self._asked_length = max((one.length for one in transaction.awaited), default=0)
         if transaction.packet and not self._cyclic_job:
-            self._receive()  # what arrived before the request is not its reply
+            self._receive()  # Bytes that arrived before the request are not part of its reply
             self._drain_end_ns = self.now_ns() + PATIENT_DRAIN_LIMIT_NS
             if self.failure is not None or (self._waits and self._hold_back(transaction)):
                 return self.now_ns()
@@ -253,7 +269,9 @@ class Bus:
         return self._send_awaited(transaction)
 
     def choose(self, transaction: Transaction) -> tuple[Transaction, int]:
-        """Return a transaction in the length that no owed reply has, and when it can be sent; 0: at once."""
+        """Return a transaction with a reply length that no owed reply has, and its earliest send time; 0:
+        now.
+        """
         best, best_ns = transaction, self.owed.free_ns(transaction)
         for more in range(1, transaction.spare + 1):
             if not best_ns:
@@ -265,12 +283,16 @@ class Bus:
         return best, best_ns
 
     def _hold_back(self, transaction: Transaction) -> bool:
-        """Hold a transaction back until the line is quiet, and no owed reply can be taken for its own."""
+        """Hold a transaction back until the line is quiet and no owed reply can be taken for its own.
+
+        Returns:
+            False when the transaction can be sent now.
+        """
         if not transaction.awaited:
             return False
         now_ns = self.now_ns()
         _, free_ns = self.choose(transaction)
-        # a reply that comes twice comes at once, so the latency of the adapter does not count
+        # A duplicate follows its original at once, so the latency of the adapter does not count.
         quiet_ns = min(self._quiet_at() - self._latency_ns, self._drain_end_ns)
         until_ns = min(max(free_ns, quiet_ns), now_ns + transaction.patience_ns)
         if until_ns <= now_ns:
@@ -281,7 +303,7 @@ class Bus:
         return True
 
     def _release_held(self, now_ns: int) -> None:
-        """Send the transaction that was held back, or hold it back again for what arrived meanwhile."""
+        """Send the transaction that was held back. Hold it back again if new bytes have arrived since."""
         transaction, self._held = self._held, None
         if transaction is not None and now_ns < self._held_until_ns:
             patient = self._held_until_ns
@@ -300,7 +322,7 @@ class Bus:
         packet = transaction.packet
         now_ns = self._write(packet, transaction.servo_id) if packet else self.now_ns()
         self._await(transaction, self._sent_ns if packet else now_ns)
-        # this process may have stood still before the bytes left
+        # This process may have been suspended before the bytes left.
         self._deadline_ns = max(self._deadline_ns, now_ns + transaction.timeout_ns)
         if packet and not self._cyclic_job and all(one.address == NO_REGISTER for one in transaction.awaited):
             self.owed.note_change(transaction, self._sent_ns)
@@ -314,14 +336,15 @@ class Bus:
         after = now_ns()
         self._written = packet
         self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
-        # a second packet waits in the adapter until the first is off the wire
+        # A second packet waits in the adapter until the first is off the wire.
         free = words[FREE_NS]
-        start = self._sent_ns = free if free > before else before  # a third of the time of max()
+        # A conditional takes a third of the time of max()
+        start = self._sent_ns = free if free > before else before
         words[FREE_NS] = start + len(packet) * self.byte_ns
         return after
 
     def _await(self, transaction: Transaction, started_ns: int) -> None:
-        """Await the replies to a transaction whose instruction is on its way."""
+        """Await the replies to a transaction whose instruction has been sent."""
         reply = self._reply
         reply.parameters = b""
         reply.error = 0
@@ -343,8 +366,8 @@ class Bus:
             self._deadline_ns = started_ns + transaction.due_ns
 
     def _end(self, now_ns: int) -> None:
-        """Do what is due at a transaction's deadline."""
-        # bytes may have come while this process was not running: look before giving up
+        """Handle the deadline of the current transaction."""
+        # Bytes may have arrived while this process was suspended: read them before the timeout counts.
         self._receive()
         if self._state == _AWAITING:
             if not self._extend_deadline(now_ns):
@@ -359,7 +382,9 @@ class Bus:
             self._release_held(now_ns)
 
     def _extend_deadline(self, now_ns: int) -> bool:
-        """Await a late reply for longer if the port has a reason to; return whether it has."""
+        """Extend the deadline if the port has a reason to expect a late reply; return True if it was
+        extended.
+        """
         self._planned_deadline_ns = self._planned_deadline_ns or self._deadline_ns
         self._deadline_ns = self._port.extend_deadline(
             self._planned_deadline_ns, self.words[FREE_NS], self._last_byte_ns, now_ns
@@ -367,12 +392,12 @@ class Bus:
         return self._deadline_ns > now_ns
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return for how long what is behind the line had no processor between two times, ns."""
+        """Return how long the other side of the line had no processor between two times, ns."""
         return self._port.stalled_ns(since_ns, until_ns)
 
     def _give_up(self, now_ns: int) -> None:
-        """End a transaction of which not every reply came in time."""
-        self.receiver.flush()  # the reply may stand behind a false header
+        """End a transaction that timed out with replies missing."""
+        self.receiver.flush()  # A false header may hide the reply
         if self._state != _AWAITING:
             return
         self._note_owed()
@@ -385,15 +410,17 @@ class Bus:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
 
     def _note_lateness(self, late_ns: int) -> None:
-        """Keep how late replies come: idle time begins nothing that would end as late. As in kernel.c."""
+        """Update the lateness of the line. Idle time starts no transaction that could end that late. Same
+        rule in kernel.c.
+        """
         kept_ns = self.words[LATE_NS]
         kept_ns -= (kept_ns >> _FORGOTTEN) + 1
         self.words[LATE_NS] = max(min(late_ns, MOST_LATE_NS), kept_ns, 0)
 
-    # What arrives: match received packets to the pending request, count the rest as stray
+    # Incoming packets: match each one to the pending request, count the rest as stray
 
     def _skip_headers(self) -> None:
-        # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        # Enough bytes for an awaited reply without a complete packet: its header is a false one.
         receiver, awaited = self.receiver, self._awaited
         while awaited is not None and self._state == _AWAITING and receiver.pending >= awaited.widest:
             receiver.skip_header()
@@ -403,7 +430,8 @@ class Bus:
                 self._await_devices(awaited, self._last_byte_ns)
 
     def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
-        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are replies
+        # A fast form's status that is truncated or corrupted: the entries before the damage are valid
+        # replies.
         used = self._take_fast(data, last_ns) if self._is_fast(data) else 0
         if used:
             self._sink.packet(self.index, _STATUS, BROADCAST_ID, first_ns, last_ns, data[:used])
@@ -441,16 +469,20 @@ class Bus:
         return True
 
     def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
-        """Await what is open for a moment only: the servos have answered by `last_ns`. As in kernel.c."""
+        """Shorten the deadline for the open replies: all servos have answered by `last_ns`. Same rule in
+        kernel.c.
+        """
         self._planned_deadline_ns = 0
         brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
         self._deadline_ns = min(self._deadline_ns, brief_ns)
 
     def _place(self, status: Status, last_ns: int) -> tuple[int, bool] | None:
-        """Return which of the awaited statuses this is, and whether it is a refusal; None: it is none."""
+        """Return the index of the awaited status that this one answers, and True for a refusal; None if it is
+        stray.
+        """
         servo_id, error, parameters = status
         length = len(parameters)
-        # an echo, or left over from before, comes sooner than the wire allows
+        # An echo or a leftover of the request before comes sooner than the wire allows.
         if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
             return None
         for index, one in enumerate(self._awaited.awaited):
@@ -461,13 +493,13 @@ class Bus:
                 any_age = self._cyclic_job or self._awaited.any_age
                 if self.owed.confuses(self._awaited, one, refusal=refused, any_age=any_age):
                     return None
-                if not self._cyclic_job:  # the kernel, which reads most cycles, does not note it either
+                if not self._cyclic_job:  # The kernel, which reads most cycles, does not note it either
                     self.owed.note_answer(self._awaited, one, self._sent_ns)
                 return index, refused
         return None
 
     def _is_fast(self, data: memoryview) -> bool:
-        """Check whether a fast form is awaited, and this looks like its one status, whole or not."""
+        """Return True if a fast form is awaited and the data begins like its single status."""
         awaited = self._awaited
         return (
             awaited is not None
@@ -477,13 +509,13 @@ class Bus:
         )
 
     def _take_fast(self, data: memoryview, last_ns: int) -> int:
-        """Take what is good of the one status of a fast form; return the number of its bytes."""
+        """Use the valid entries of a fast form's single status; return the number of bytes used."""
         awaited, job = self._awaited, self._job
         if awaited is None or job is None:
             return 0
         parts, used = _good_parts(self._dialect, awaited, data)
         if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
-            return 0  # sooner than the wire allows: left over from before
+            return 0  # Sooner than the wire allows: a leftover of the request before
         reply = self._reply
         for index, part in enumerate(parts):
             reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
@@ -495,7 +527,7 @@ class Bus:
         return used
 
     def _note_owed(self) -> None:
-        """Note the replies to a transaction that is given up; they may still come."""
+        """Register the missing replies of an abandoned transaction as owed; they may still arrive."""
         awaited = self._awaited
         if awaited is None:
             return
@@ -510,10 +542,10 @@ class Bus:
             self.owed.add(awaited, 0, self._sent_ns)
 
     def _stray(self, packet: memoryview) -> PacketKind:
-        """Return what an intact packet is that is not awaited, and count it.
+        """Classify and count an intact packet that is not awaited.
 
-        Replies are distinguished by ID and length, so those to another host that reads what this one reads
-        are taken for second ones.
+        Replies are distinguished by ID and length. Replies to another host that reads the same items are
+        therefore taken for duplicates.
         """
         reply, awaited = self._reply, self._awaited
         if packet == self._written or (awaited is not None and packet == awaited.packet):
@@ -525,7 +557,7 @@ class Bus:
             shape = _FAST if fast else (status.servo_id, len(status.parameters))
             length = len(packet) if fast else shape[1]
             if self.owed.settle(status.servo_id, length, status.error):
-                if self._state == _HOLDING:  # it may have been what the held transaction waited for
+                if self._state == _HOLDING:  # The held transaction may have waited for this reply
                     self._deadline_ns = self.now_ns()
                     self._drain_end_ns = self._deadline_ns + PATIENT_DRAIN_LIMIT_NS
                 return PacketKind.LATE
@@ -543,13 +575,13 @@ def _shapes(transaction: Transaction | None) -> list[_Shape]:
 
 
 def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
-    """Return what is good of the one status of a fast form that is cut off or spoilt, and its bytes."""
+    """Return the valid entries of a fast form's truncated or corrupted status, and their size in bytes."""
     if dialect.size_at(data, 0, len(data)) != transaction.widest:
         return [], 0
     awaited = transaction.awaited
     try:
         parts = dialect.fast_answers(data, [one.length for one in awaited])
-    except ValueError:  # spoilt before its first part
+    except ValueError:  # Corrupted before its first entry
         return [], 0
     count = 0
     while count < len(parts) and parts[count].servo_id == awaited[count].servo_id:
@@ -559,7 +591,7 @@ def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) ->
 
 
 class Lines:
-    """The serial lines of a robot together: their jobs are executed side by side, by one wait for all."""
+    """The serial lines of a robot: their jobs are executed concurrently, with one wait for all lines."""
 
     def __init__(
         self,
@@ -569,7 +601,15 @@ class Lines:
         packets: PacketSink | Sequence[PacketSink],
         beat: Callable[[], None] = lambda: None,
     ) -> None:
-        """`packets`: of all lines, or one for each; `beat` is called at least every BEAT_NS beside a wait."""
+        """Open no port; `ports` are open already.
+
+        Args:
+            plans: One plan for each line.
+            ports: The open ports, in the order of `plans`.
+            clock: Clock of the run.
+            packets: One sink for all lines, or one for each.
+            beat: Called at least every BEAT_NS, not counting one wait.
+        """
         self.plans = tuple(plans)
         self.ports = ports
         self.clock = clock
@@ -582,14 +622,14 @@ class Lines:
 
     @property
     def failure(self) -> PortError | None:
-        """Why the first line that is lost is; None: all are there."""
+        """Failure of the first line that is lost; None while all lines work."""
         return next((bus.failure for bus in self.buses if bus.failure is not None), None)
 
     def clear(self, buses: Iterable[Bus]) -> None:
-        """Take what some lines have before something is asked on them.
+        """Discard the input of some lines before a request is sent on them.
 
-        What came before a request must not be taken for its reply, and replies come in the order of requests:
-        one that is too many would shift all that follow.
+        A packet that arrived before a request must not be taken for its reply. Replies come in the order of
+        requests, so one extra reply would shift all later ones.
         """
         here = {bus.index: bus for bus in buses if bus.failure is None}
         for index in self.ports.wait(0):
@@ -597,10 +637,10 @@ class Lines:
                 here[index].hear()
 
     def pump(self) -> None:
-        """Execute the jobs of all lines: one wait over all ports, until every job is finished.
+        """Execute the jobs of all lines with one wait over all ports, until every job is finished.
 
-        All that can be sent is sent before anything is awaited. Raises nothing: a line that is lost has its
-        `failure`, and the others continue.
+        Everything that can be sent is sent before a reply is awaited. Nothing is raised: a lost line gets a
+        `failure`, and the other lines continue.
         """
         buses, clock_ns, wait = self.buses, self.clock.now_ns, self.ports.wait
         now_ns, beat_ns = clock_ns(), 0
@@ -617,7 +657,7 @@ class Lines:
                     heard = True
                     deadlines[index] = bus.hear()
             if not heard:
-                # a line that is lost is ready for ever: look at the others now and then instead of waiting
+                # A lost line is always readable: check the other lines at an interval instead of waiting.
                 self.clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
                 for bus in buses:
                     bus.hear()
@@ -626,9 +666,11 @@ class Lines:
                 deadlines = [bus.step(now_ns) for bus in buses]
 
     def run(self, programs: Sequence[Program[Result]]) -> list[Result | None]:
-        """Run one program a line to its end, blocking, side by side; for set-up and tools, never in the loop.
+        """Run one program per line to completion, concurrently. Blocks; for set-up and tools, never in the
+        loop.
 
-        Returns what each program returned; None where the line is lost: see the bus' `failure`.
+        Returns:
+            The result of each program; None where the line is lost, see `Bus.failure`.
         """
         jobs = [ProgramJob(program) for program in programs]
         for bus, job in zip(self.buses, jobs, strict=True):

@@ -1,8 +1,9 @@
-"""Cyclic reads: the prepared reads of one bus, planned anew after each loss.
+"""Cyclic reads: the prepared reads of one bus, planned again after each loss.
 
-Servos that can answer in turn are read by one instruction. A servo that misses its turn is read by itself
-from the next cycle on, until it answers: in Protocol 1.0 a silent servo ends the chain, in 2.0 it may, so it
-must not stay in it. A device that misses its turn leaves at once: it may cost the servos nothing.
+Servos that can answer in turn are read by one instruction. A servo that misses its turn is read separately
+from the next cycle on, until it answers. In Protocol 1.0 a silent servo ends the chain, in 2.0 it may end it,
+so it must not stay in the chain. A device that misses its turn leaves the chain at once: it must not cost the
+servos their replies.
 
 A reply that arrives cycles late would look current. A group is therefore read in the length for which no
 reply is owed (`OwedReplies`), or whose owed replies are the oldest.
@@ -26,21 +27,23 @@ from dxlwire.plan.reads import state_read
 from dxlwire.transaction import Outcome, Reply, Transaction
 
 MOST_CHAINS = 64
-"""Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""
+"""Size of the cache of chains that omit certain servos. On a line that loses a different servo every cycle
+the cache is cleared and rebuilt."""
 
 CALM_CYCLES = 2
-"""Cycles of the parser in which every servo answered in order, before the exchange kernel reads again."""
+"""Cycles of the parser without a loss before the exchange kernel reads again."""
 
 MOST_PROGRAMS = 8
-"""Programs of the kernel are kept: the length of replies changes after a loss, and after that again."""
+"""Size of the cache of kernel programs: the length of replies changes after a loss, and once more after
+recovery."""
 
 MOST_BROKEN = 5
-"""Fast reads of a group that stay incomplete, with no complete one among them, before the group is read
-plainly: a servo then answers when it is asked by itself, and not in the shared status."""
+"""Incomplete fast reads of a group, without a complete one between them, before the group is read by the
+plain form. Some servos answer a request of their own, but not in the shared status."""
 
 
 class Request(msgspec.Struct, frozen=True):
-    """One read of servos of one group, in each length: `patient` awaits late replies, `short` does not."""
+    """One read of servos of one group, in each length. `patient` waits for late replies, `short` does not."""
 
     group: int
     indices: tuple[int, ...]
@@ -51,14 +54,14 @@ class Request(msgspec.Struct, frozen=True):
 class Cycle(msgspec.Struct, frozen=True):
     """The reads of a cycle."""
 
-    silent: tuple[bool, ...]  # Servos that missed their newest read; each is read by itself
+    silent: tuple[bool, ...]  # Servos that missed their newest read; each is read separately
     queue: tuple[Request, ...]
     program: Program | None
-    """The same for the kernel; None while a servo is silent, or was a moment ago."""
+    """The same reads for the kernel; None while a servo is silent or has just recovered."""
 
 
 class CyclicReads:
-    """The job that reads the state of every servo of one bus once."""
+    """Job that reads the state of every servo of one bus once."""
 
     def __init__(self, plan: BusPlan, samples: BusSamples, owed: OwedReplies) -> None:
         self._members = plan.members
@@ -66,27 +69,27 @@ class CyclicReads:
         self.missed = [0] * count  # Replies in a row that did not arrive
         self.errors = [0] * count  # Error byte of the newest reply
         self.garbled = [False] * count
-        """True when the newest loss had bytes, and was the first of its read."""
+        """True when the newest loss had bytes and was the first one of its read."""
         self.away = [False] * count
-        """True for a servo or a device that is lost and not asked any more; see `leave`."""
+        """True for a lost servo or device that is no longer read; see `leave`."""
         self.apart = [False] * count
-        """True for a device that is read by itself: it answers, but not together with others."""
-        self.fast = list(plan.fast)  # The groups that are read by a fast form; `plain` ends that
+        """True for a device that is read separately because it does not answer in a chain."""
+        self.fast = list(plan.fast)  # True for each group that is read by a fast form; `plain` ends that
         self.given_up: list[int] = []
-        """Groups whose fast reads stayed incomplete, so that they are read plainly now; to be reported."""
-        self.begun = False  # True from the parser's first read of a cycle to `end`
+        """Groups to report: their fast reads stayed incomplete, so they are read by the plain form now."""
+        self.begun = False  # True from the parser's first read of a cycle until `end`
         self._plan = plan
         self.samples = samples
         self._line = plan_line(plan)
         self._owed = owed
-        self._planned_at = 0  # version of `owed` that the cycle was planned with
-        self._shape = [0] * groups  # by how many bytes more than its state a group is asked
-        self._lossy: set[int] = set()  # groups that lost a reply in this cycle
-        self._broken = [0] * groups  # incomplete fast reads since the last complete one
-        self._calm = 0  # cycles of the parser in a row without a loss
+        self._planned_at = 0  # Version of `owed` for which the cycle was planned
+        self._shape = [0] * groups  # Extra bytes by which each group's read is longer than its state
+        self._lossy: set[int] = set()  # Groups that lost a reply in this cycle
+        self._broken = [0] * groups  # Incomplete fast reads of each group since the last complete one
+        self._calm = 0  # Consecutive cycles of the parser without a loss
         self.cycle = Cycle((), (), None)
-        self._stale = True  # the next cycle is another one
-        self._position = 0  # in its queue
+        self._stale = True  # True when the next cycle must be planned again
+        self._position = 0  # Index of the current read in the queue
         self._patient = True
         self._made: dict[tuple[int, ...], Request] = {}
         self._programs: dict[tuple[object, ...], Program] = {}
@@ -95,11 +98,11 @@ class CyclicReads:
 
     @property
     def stale(self) -> bool:
-        """True when the next cycle has to be planned again."""
+        """True when the next cycle must be planned again."""
         return self._stale or self._planned_at != self._owed.version
 
     def plan(self) -> Cycle:
-        """Plan the next cycle, before anything of it is asked: as the one before if nothing happened."""
+        """Plan the next cycle before its first request. The plan is reused if nothing has changed."""
         if self.stale:
             self._stale, self._planned_at = False, self._owed.version
             silent = tuple(map(bool, self.missed))
@@ -118,7 +121,9 @@ class CyclicReads:
         return self.cycle
 
     def end(self) -> None:
-        """End a cycle in which the parser read, or the line was lost: plan the next by what came of it."""
+        """End a cycle that the parser read, or in which the line was lost. The next plan follows from its
+        losses.
+        """
         self.begun = False
         self._stale = True
         silent = self.cycle.silent
@@ -134,8 +139,9 @@ class CyclicReads:
         self._calm = 0 if silence or any(self._broken) else self._calm + 1
 
     def blamed(self, member: int) -> bool:
-        """Check whether a member was asked in this cycle and did not answer, where all before it in its read
-        did: one that is silent may silence those behind it.
+        """Return True if a member missed its turn although every member before it in the same read answered.
+
+        A silent member may silence the members after it, so only the first one is to blame.
         """
         for request in self.cycle.queue:
             if member in request.indices:
@@ -145,23 +151,23 @@ class CyclicReads:
         return False
 
     def leave(self, servo: int) -> None:
-        """Ask a servo no more: it is lost, and its silence would cost the others their time."""
+        """Stop reading a lost servo: its timeout would cost the other servos their time."""
         self.away[servo] = True
         self._stale = True
 
     def join(self, servo: int) -> None:
-        """Ask a servo again from the next cycle on, with the others: it was found in order."""
+        """Read a recovered servo again from the next cycle on, together with the others."""
         self.away[servo] = False
         self.missed[servo] = 0
         self._stale = True
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
-        """Await replies when they are due by the servos' measured return delays, ns by ID."""
+        """Set the measured return delays of the servos, ns by ID. Deadlines of replies follow from them."""
         self._line = replace(self._line, return_delays=dict(return_delays))
         self._forget()
 
     def plain(self, group: int) -> None:
-        """Read a group by the form that every firmware knows from the next cycle on."""
+        """Read a group by the plain form, which every firmware supports, from the next cycle on."""
         self.fast[group] = False
         self._forget()
 
@@ -180,7 +186,7 @@ class CyclicReads:
             spare = min(one.spare for one in servos or members)
             fast = self.fast[group] and len(indices) > 1
             patient = tuple(state_read(self._line, members, more, fast=fast) for more in range(1 + spare))
-            short = patient  # a device is never awaited for long
+            short = patient  # A device is never waited for
             if servos:
                 less_ns = TIMEOUT_MARGIN_NS - SHORT_TIMEOUT_MARGIN_NS
                 short = tuple(structs.replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
@@ -188,9 +194,11 @@ class CyclicReads:
         return request
 
     def _choose_length(self, group: int, requests: Sequence[Request]) -> None:
-        """Read a group in the length whose owed replies are the oldest, best in one that has none.
+        """Choose the length of a group's reads: one without owed replies, else the one whose owed replies are
+        the oldest.
 
-        One length for all: three silent servos of a group would otherwise ask alike for ever.
+        All reads of the group have the same length. Otherwise three silent servos of a group would choose the
+        same lengths forever.
         """
         count = max((len(one.patient) for one in requests), default=1)
         first = self._shape[group]
@@ -202,8 +210,8 @@ class CyclicReads:
     def _program(self, queue: Sequence[Request]) -> Program | None:
         """Return the reads of a calm cycle for the kernel.
 
-        None where a servo reports more than an alert, or where a late reply to a request between the cycles
-        may look like a state: the parser reads then.
+        Returns None, so that the parser reads, in two cases: a servo reports more than an alert, or a late
+        reply to a request of idle time may look like a state.
         """
         reads = [
             PlannedRead(
@@ -231,14 +239,14 @@ class CyclicReads:
     # Reading by the parser
 
     def begin(self, done: int = 0) -> None:
-        """Begin the parser's part of a cycle, behind the reads that the kernel has done."""
+        """Begin the parser's part of a cycle, after `done` reads that the kernel has completed."""
         if not done:
             self.samples.clear()
         self.begun = self._patient = True
         self._position = done
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Take what came of a read, return the next one."""
+        """Process the result of the current read and return the next read."""
         queue = self.cycle.queue
         if reply is not None:
             if reply.outcome is not Outcome.OK:
@@ -247,12 +255,13 @@ class CyclicReads:
         if self._position == len(queue):
             return None
         request = queue[self._position]
-        # the first silence of a cycle has cost its timeout: the others keep their time
+        # The first timeout of a cycle has used up the time for waiting: the later reads get the short
+        # timeout.
         patient = self._patient and not self.missed[request.indices[0]]
         return self._in_length(request.patient if patient else request.short, request.group)
 
     def status(self, index: int, reply: Reply) -> None:
-        """Keep the state of one servo of the current read."""
+        """Store the state of one servo of the current read."""
         servo = self.cycle.queue[self._position].indices[index]
         self.samples.take(servo, reply.parameters, reply.last_ns)
         self.errors[servo] = reply.error
@@ -268,7 +277,9 @@ class CyclicReads:
         for servo in request.indices:
             if not self.samples.arrived(servo):
                 self.garbled[servo] = garbled
-                garbled = False  # the bytes are those of the first one; nothing is known of those behind it
+                # Stray bytes are those of the first missing servo. They say nothing about the servos after
+                # it.
+                garbled = False
 
 
 def _reads(group: Sequence[int], silent: Sequence[bool]) -> list[tuple[int, ...]]:

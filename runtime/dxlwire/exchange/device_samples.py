@@ -11,31 +11,31 @@ from dxlwire.bus_plan import BusPlan
 from dxlwire.exchange.arrays import Floats, SourceArrays
 from dxlwire.exchange.reports import Reason, ReportSink
 
-REPORT_AGAIN_NS = 1_000_000_000  # One device has at most one event in this time
+REPORT_AGAIN_NS = 1_000_000_000  # Minimum interval between two events of one device
 
 
 class DeviceSamples:
-    """What came of all devices; blocks are in the order of the plans.
+    """Newest replies of all devices; blocks are in the order of the plans.
 
-    A device's row is valid when all its blocks came in this cycle and all their values are finite; else it
-    keeps its values, is invalid, and its age grows.
+    A device's row is valid when all its blocks arrived in this cycle and all their values are finite.
+    Otherwise it keeps its values, is marked invalid, and its age grows.
     """
 
     def __init__(self, plans: Sequence[BusPlan], sources: SourceArrays, reports: ReportSink) -> None:
-        self.sources = sources  # Those of the cycle's record
+        self.sources = sources  # Source arrays of the cycle's record
         self._reports = reports
         devices = [(plan, device) for plan in plans for device in plan.devices]
         blocks = [block for _, device in devices for block in device.blocks]
         self.values: Floats = np.full(len(sources.values), np.nan)
-        """By the newest intact replies, at the columns of `source_states`."""
+        """Values of the newest intact replies, at the columns of `source_states`."""
         self.fresh = np.zeros(len(blocks), dtype=np.bool_)
         """True where an intact reply arrived in this cycle."""
         self.at_ns = np.full(len(blocks), -1, dtype=np.int64)
-        """Time at which the newest reply arrived; -1 while none ever did."""
+        """Arrival time of the newest reply; -1 before the first reply."""
         self.shown_ns = np.full(len(devices), -1, dtype=np.int64)
-        """Time of the oldest reply among those that the states show, of each device; -1: they show none."""
+        """Arrival time of the oldest reply that each device's states come from; -1 before the first."""
         self.doubted = np.zeros(len(devices), dtype=np.bool_)
-        """True where the replies of this cycle are not believed."""
+        """True where the replies of this cycle are rejected."""
         self._fields = [block.fields for block in blocks]
         self._devices: list[tuple[str, str, slice, list[int]]] = []
         first = 0
@@ -47,7 +47,7 @@ class DeviceSamples:
         self._reported_ns = [-REPORT_AGAIN_NS] * len(devices)
 
     def judge(self, now_ns: int) -> None:
-        """Doubt each device that sent something that is no finite number in this cycle."""
+        """Reject and report each device that sent a NaN or an infinite value in this cycle."""
         for number, (_, _, here, columns) in enumerate(self._devices):
             if self.fresh[here].all() and not np.isfinite(self.values[columns]).all():
                 self._report(number, now_ns)

@@ -1,4 +1,4 @@
-"""Goals: arrays in SI units -> the sync writes of one bus, in whatever mode each servo is."""
+"""Goals: arrays in SI units -> the sync writes of one bus, in the current mode of each servo."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ from dxlwire.plan.planning import goal_parts
 from dxlwire.wire.dialect import dialect_of
 
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
-"""The goal that a mode follows, where it is not the position; without it a servo is sent none."""
+"""Leading goal of each mode that does not follow the position. A servo without its leading goal gets no
+goals."""
 
 _VELOCITY = COMMAND_INTERFACES.index("velocity")
 
 
 class GoalCell(msgspec.Struct, frozen=True):
-    """One goal item of one servo: how a goal in SI units becomes the integer in its packet.
+    """One goal item of one servo: conversion of a goal in SI units to the integer in the packet.
 
-    With its sign: tick = (sign * goal + offset) / unit, to the nearest, from `low` to `high`. A magnitude:
-    tick = |goal| / unit, from `low` to `high`, `free` where the goal is NaN; that of a speed is rounded down,
-    because it is a limit.
+    Signed: tick = (sign * goal + offset) / unit, rounded to the nearest and clamped to `low` and `high`.
+
+    Magnitude: tick = |goal| / unit, clamped to `low` and `high`, and `free` where the goal is NaN. The
+    magnitude of a speed is rounded down, because it is a limit.
     """
 
-    place: Field  # Where it stands in the servo's block
-    interface: int  # Row of the goals, as COMMAND_INTERFACES counts
+    place: Field  # Position of the item in the servo's block
+    interface: int  # Row of the goals, an index into COMMAND_INTERFACES
     magnitude: bool
     sign: float
     offset: float
@@ -46,38 +48,45 @@ class GoalCell(msgspec.Struct, frozen=True):
 
 
 class GoalArrays:
-    """The sync writes of one bus, one for all servos of one mode and layout; `build` in kernel.c fills them.
+    """Sync writes of one bus, one for all servos of one mode and layout; `build` in kernel.c fills them.
 
-    A goal is sent when it changed, once more in the next cycle, and every 50 cycles; so what stays costs no
-    time on the wire. Position: to the nearest tick, inside the joint's limits and so inside the
-    servo's range, never wraps. Speed toward a position: magnitude, rounded down; 0 rad/s is 1 tick, because 0
-    ticks mean the maximum in joint mode and no limit in a profile; NaN is 0 ticks; too fast is the highest
-    tick.
-    Velocity, effort and PWM as goals of their own: to the nearest tick with their sign, no more than the
-    servo's own limit, beyond which it would refuse the goal as a whole; NaN: the servo gets none. Effort
-    beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
+    A goal is sent when it changes, once more in the next cycle, and every 50 cycles. A constant goal
+    therefore costs almost no time on the wire.
+
+    Position: rounded to the nearest tick and clamped to the joint's limits, which lie within the servo's
+    range; never wraps.
+
+    Speed toward a position: magnitude, rounded down. 0 rad/s is 1 tick, because 0 ticks mean the maximum in
+    joint mode and no limit in a profile. NaN is 0 ticks. A speed above the range is the highest tick.
+
+    Velocity, effort and PWM as leading goals: rounded to the nearest tick with their sign, and clamped to the
+    servo's own limit, because the servo refuses a goal beyond that limit. NaN: the servo gets no goal.
+
+    Effort in addition to a position: the maximum effort; NaN means the servo's own limit.
     """
 
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self.own_limits: list[Mapping[OwnLimit, int]] = [{} for _ in plan.servos]
-        """Limits that were read of each servo, ticks; a servo refuses a goal beyond them."""
-        self.limits_changed = False  # Since the hardware handed them to the loop
-        self.fraction = 1.0  # The part of a servo's limit of effort or PWM that goals may ask for
+        """Limits read from each servo, ticks; a servo refuses a goal beyond them."""
+        # True when limits have changed since the hardware passed them to the loop.
+        self.limits_changed = False
+        self.fraction = 1.0  # Fraction of a servo's effort or PWM limit that goals may use
         self.sync_writes: tuple[SyncWrite, ...] = ()
-        """One for each mode and block of goals, in the order in which they are sent; new after a change."""
+        """One sync write per mode and block of goals, in the order of sending; replaced after a change."""
         self.renew()
 
     @property
     def modes(self) -> Sequence[Mode]:
-        """The modes in which the servos are for the goals; UNKNOWN: one gets none."""
+        """Current modes of the servos; a servo in UNKNOWN gets no goals."""
         return self._modes
 
     def set_mode(self, index: int, mode: Mode) -> None:
-        """Take a servo, by its index in the plan, for one in another mode; UNKNOWN: it gets no goals.
+        """Set the mode of a servo by its index in the plan; a servo in UNKNOWN gets no goals.
 
-        Raises LookupError when the servo does not have the mode.
+        Raises:
+            LookupError: The servo does not have the mode.
         """
         if mode != self._modes[index]:
             if mode is not Mode.UNKNOWN:
@@ -86,9 +95,9 @@ class GoalArrays:
             self.renew()
 
     def set_limits(self, index: int, limits: Mapping[OwnLimit, int]) -> None:
-        """Keep the goals of a servo within the limits that were read of it, ticks.
+        """Clamp the goals of a servo to the limits that were read from it, ticks.
 
-        A limit that was not read keeps its value.
+        A limit that is missing in `limits` keeps its value.
         """
         found = {**self.own_limits[index], **limits}
         if found != self.own_limits[index]:
@@ -100,12 +109,16 @@ class GoalArrays:
         return {limit.of: value for limit, value in self.own_limits[index].items()}
 
     def weaken(self, fraction: float) -> None:
-        """Let no goal ask for more effort or PWM than a fraction of the servo's limit."""
+        """Limit effort and PWM goals to a fraction of the servo's limit.
+
+        Args:
+            fraction: 0 to 1.
+        """
         self.fraction = fraction
         self.renew()
 
     def renew(self) -> None:
-        """Build the sync writes anew; every goal is sent again, as after the line was lost."""
+        """Rebuild the sync writes; every goal is sent again. Used after a lost line, too."""
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
         servos = self._plan.servos
         for index, (servo, mode) in enumerate(zip(servos, self._modes, strict=True)):
@@ -131,23 +144,24 @@ class GoalArrays:
 
 
 class SyncWrite(msgspec.Struct, frozen=True):
-    """One block of goals of the servos of one bus in one mode."""
+    """One block of goals, for the servos of one bus that are in one mode."""
 
     layout: GoalLayout
-    lead: int  # Row of the goals without which a servo is sent none
-    members: tuple[int, ...]  # Indices of its servos on the bus
+    lead: int  # Row of the leading goal; a servo without it gets no goals
+    members: tuple[int, ...]  # Indices of the servos on the bus
     rows: tuple[int, ...]
     ids: tuple[int, ...]
-    cells: tuple[list[GoalCell], ...]  # The items of each servo, in the order of the wire
+    cells: tuple[list[GoalCell], ...]  # Goal items of each servo, in the order of the wire
 
 
 def _cells(
     servo: ServoPlan, mode: Mode, layout: GoalLayout, limits: Mapping[str, int], fraction: float
 ) -> list[GoalCell]:
-    """Return the goals that stand in a block, in the order of the wire.
+    """Return the goals of a block, in the order of the wire.
 
-    `limits`: the servo's own, ticks, by what they limit; `fraction`: the part of an effort's or a PWM's limit
-    that may be used.
+    Args:
+        limits: The servo's own limits, ticks, by limited quantity.
+        fraction: Usable fraction of an effort or PWM limit.
     """
     plan = servo.mode_plan(mode)
 
@@ -171,7 +185,7 @@ def _cells(
     elif layout.effort is not None:
         unit, most = _reach(plan.effort, "effort", limits, fraction)
         effort = COMMAND_INTERFACES.index("effort")
-        # Torque Limit = 0 shows a shutdown
+        # A Torque Limit of 0 means a shutdown, so the goal must not reach 0.
         least = int(servo.torque_limit is not None and layout.address == servo.torque_limit.address)
         most = max(least, most)
         found.append(GoalCell(layout.effort, effort, True, 1.0, 0.0, unit, least, most, most))
@@ -179,7 +193,7 @@ def _cells(
 
 
 def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
-    """Counted from the servo's raw 0, to the nearest tick, inside the joint's limits."""
+    """Return the position goal, counted from the servo's raw 0."""
     return GoalCell(
         place,
         COMMAND_INTERFACES.index("position"),
@@ -195,7 +209,9 @@ def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
 def _reach(
     scale: Scale | None, of: str, limits: Mapping[str, int], fraction: float, ratio: float = 1.0
 ) -> tuple[float, int]:
-    """Return unit, as the joint counts, and highest tick of a goal; 1 and 0 where a mode has no such goal."""
+    """Return the unit in the joint's terms and the highest tick of a goal; 1 and 0 if the mode lacks the
+    goal.
+    """
     if scale is None:
         return 1.0, 0
     used = 1.0 if of == "speed" else fraction

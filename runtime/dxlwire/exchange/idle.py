@@ -1,7 +1,7 @@
 """Idle scheduler: runs programs of transactions on one bus between two cycles, the most urgent first.
 
-Nothing of it makes a cycle late, as long as it is not urgent and starved: a transaction begins only when its
-reply can be there in time, and a program that did not end continues in the next idle time.
+A transaction begins only when its reply can arrive in time, so it does not delay the cycle. The exception is
+an urgent program that starves. A program that did not finish continues in the next idle time.
 """
 
 from __future__ import annotations
@@ -18,46 +18,48 @@ from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000
-"""A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
+"""Minimum time for which a reply is awaited after it is due; servos answer with less delay than this."""
 STARVED = 50
-"""Cycles after which an urgent program continues though time is too short: a skipped period is better than a
-joint that gets no goals for the rest of the run."""
-STARVED_AGAIN = 5  # Cycles between its transactions from then on
-WHOLE_BUS = -1  # Instead of a servo: the program is about no single one
+"""Cycles after which an urgent program continues although the time is too short. A skipped period is better
+than a joint that gets no goals for the rest of the run."""
+STARVED_AGAIN = 5  # Cycles between the transactions of a starved program from then on
+WHOLE_BUS = -1  # Servo index of a program that concerns the whole bus
 
 
 @unique
 class Urgency(IntEnum):
-    """The order of programs: a lower number goes first, between two transactions of others if need be.
+    """Priority of programs: a lower number goes first, even between two transactions of another program.
 
-    A program other than SLOW that never finds enough time is executed at the cost of the next cycle.
+    A program that never finds enough time is executed at the cost of the next cycle, unless it is SLOW.
     """
 
-    MODE = 0  # A joint has no goal until its mode is there
-    REPAIR = 1  # What a servo is owed: its torque, its alert, its return
-    STEERED = 2  # A client waits for it
-    SLOW = 3  # Registers of which one reading may be missed; never done without the time for it
+    MODE = 0  # A joint has no goals until its mode is set
+    REPAIR = 1  # Recovery of a servo: its torque, its alert, its return to the cycle
+    STEERED = 2  # A client waits for the result
+    SLOW = 3  # Registers whose readings may be skipped; never executed without enough time
 
 
 class _Task:
-    """A program on its way: the transaction that is next, and since when it waits."""
+    """A program in progress, with its next transaction."""
 
     def __init__(self, program: Program[None], turn: tuple[Urgency, int], name: str, servo: int) -> None:
         self._program = program
         self.turn = turn
         self.name = name
         self.servo = servo
-        self.pressed = turn[0]  # The highest urgency of the programs that wait for it
+        self.pressed = turn[0]  # Highest urgency among the programs that wait for this one
         self.next: Transaction | None = None
-        self.begun = False  # True once anything of it was on the line
+        self.begun = False  # True once one of its transactions was on the line
         self.paused = False
         self.wake_ns = 0
-        self.held_ns = NEVER  # since when its transaction waits for owed replies
-        self.starved = 0  # Cycles in a row without time for its next transaction
+        self.held_ns = NEVER  # Time since which its transaction waits for owed replies
+        self.starved = 0  # Consecutive cycles without time for its next transaction
         self.reported = False
 
     def resume(self, reply: Reply | None) -> bool:
-        """Hand over what came of the transaction before, None at the start; return whether one follows."""
+        """Pass the reply of the last transaction, None at the start; return True if another transaction
+        follows.
+        """
         self.begun = reply is not None
         self.held_ns = NEVER
         try:
@@ -68,11 +70,11 @@ class _Task:
 
 
 class IdleScheduler:
-    """Programs of one bus that wait for time between cycles; a bus executes it as one job per idle time.
+    """Programs of one bus that wait for time between cycles; a bus executes them as one job per idle time.
 
-    Programs of one servo never mix: one that has begun ends before another one begins. A transaction that
-    sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end: a
-    line that is gone answers with time-outs (`abandon`).
+    Programs of one servo never overlap: a program that has begun ends before the next one begins. A
+    transaction that sends nothing (`line.listen`) is a pause, and other programs use the line during it.
+    Every program runs to completion: on a lost line its transactions time out (`abandon`).
     """
 
     def __init__(self, bus: Bus, reports: ReportSink) -> None:
@@ -92,24 +94,29 @@ class IdleScheduler:
         name: str,
         servo: int = WHOLE_BUS,
     ) -> None:
-        """Let a program be executed in the next idle times; at its end it does itself what follows from it.
+        """Queue a program for the next idle times. The program handles its own result.
 
-        `name`: what a person reads when it has to wait: `torque enable of elbow (ID 4 on bus main)`.
-        `servo`: index into the plan's servos. May be called from a program.
+        May be called from a program.
+
+        Args:
+            program: The transactions, as a generator.
+            urgency: Priority of the program.
+            name: Name in reports about a wait: `torque enable of elbow (ID 4 on bus main)`.
+            servo: Index into the plan's servos, or WHOLE_BUS.
         """
         self._count += 1
         insort(self.tasks, _Task(program, (urgency, self._count), name, servo), key=_turn)
 
     @property
     def waiting(self) -> int:
-        """How many programs have not come to their end."""
+        """Number of unfinished programs."""
         return len(self.tasks)
 
     @property
     def least_ns(self) -> int:
-        """The least idle time, beside the margin for late replies, in which anything can be done.
+        """Shortest useful idle time, ns, without the margin for late replies.
 
-        NEVER: nothing waits; 0: what waits is looked at in each.
+        NEVER: no program waits. 0: check the programs in every idle time.
         """
         least_ns = NEVER
         for task in self.tasks:
@@ -119,7 +126,7 @@ class IdleScheduler:
         return least_ns
 
     def begin(self, until_ns: int) -> bool:
-        """Prepare for the idle time that ends at `until_ns`; return whether there is anything to do."""
+        """Prepare for the idle time that ends at `until_ns`; return False if no program waits."""
         if not self.tasks:
             return False
         self._until_ns = until_ns
@@ -127,7 +134,7 @@ class IdleScheduler:
         return True
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Give a reply to the program that waits for it, return the next transaction that fits."""
+        """Pass a reply to the program that awaits it, and return the next transaction that fits."""
         if reply is not None and self._current is not None:
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
         first = reply is None
@@ -143,12 +150,14 @@ class IdleScheduler:
         return None
 
     def status(self, index: int, reply: Reply) -> None:
-        """Wait for the end of the transaction: a program awaits one status at a time."""
+        """Ignore a single status. The whole reply follows in `advance`: a program awaits one status at a
+        time.
+        """
 
     def abandon(self) -> None:
-        """Bring every program to its end without a line: every transaction times out.
+        """Run every program to completion without a line: every transaction times out.
 
-        What they add meanwhile waits for the next idle time.
+        Programs added during this call wait for the next idle time.
         """
         tasks, self.tasks, self._current = self.tasks, [], None
         for task in tasks:
@@ -157,7 +166,7 @@ class IdleScheduler:
                 more = task.resume(_nothing())
 
     def _ready(self) -> _Task | None:
-        """Return the program that is next; of one servo that is the one that has begun."""
+        """Return the next program to run. A program that has begun precedes all others of the same servo."""
         now = self.now_ns()
         for task in self.tasks:
             chosen = task
@@ -169,7 +178,7 @@ class IdleScheduler:
         return None
 
     def _held_back(self, task: _Task, now_ns: int) -> bool:
-        """Check whether a transaction has to wait because a late reply could be taken for its own."""
+        """Return True if a transaction must wait because a late reply could be taken for its own."""
         wanted = task.next
         if wanted is None or not wanted.packet or not self.bus.choose(wanted)[1]:
             return False
@@ -188,7 +197,7 @@ class IdleScheduler:
             self._resume(task, _nothing(Outcome.SENT))
 
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
-        """Return the transaction with a timeout that the idle time allows; None: it has to wait."""
+        """Return the transaction with a timeout that fits the idle time, or None if it must wait."""
         left_ns = self._until_ns - self.now_ns()
         latest_ns = self._need_ns(self.bus.choose(wanted)[0], max(self.bus.late_ns, LEAST_MARGIN_NS))
         if latest_ns > left_ns:
@@ -199,14 +208,16 @@ class IdleScheduler:
         return structs.replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
 
     def _need_ns(self, wanted: Transaction, margin_ns: int) -> int:
-        """Return the time that a transaction takes at most, if its replies are no later than by a margin.
+        """Return the longest duration of a transaction whose replies are late by no more than the margin, ns.
 
-        A reply behind the end would disturb the next cyclic read, which costs far more than this brings.
+        A reply after the end of idle time would disturb the next cyclic read, which costs more than waiting.
         """
         return wanted.due_ns + (self.plan.latency_ns + margin_ns if wanted.awaited else 0)
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
-        """Count the cycles that a program waits; return whether it is done at the cost of the next cycle."""
+        """Count the cycles that a program has waited; return True if it now runs at the cost of the next
+        cycle.
+        """
         task.starved += 1
         if task.pressed is Urgency.SLOW or task.starved <= (STARVED_AGAIN if task.reported else STARVED):
             return False

@@ -1,11 +1,12 @@
-/* Kernel: the inner part of the exchange, for all serial lines of a robot together.
+/* Exchange kernel: reads and writes of one cycle, for all serial lines of a robot.
  *
- * It executes a plan of flat structs that `kernel.py` lays out: which bytes leave, which bytes are due, where
- * their data belong. It writes, waits, reads, verifies, stamps, appends to the packet log, fills the states, and
- * turns goals into sync writes. Whatever is not exactly as planned ends it with UNEXPECTED; what has arrived
- * until then is left in the line's buffer, and the packet-by-packet parser in Python goes on from there.
+ * It executes a plan of flat structs that `kernel.py` lays out: the bytes to send, the expected replies, and the
+ * destination of their data. It writes, waits, reads, verifies, timestamps, appends to the packet log, fills the
+ * states, and turns goals into sync writes. Any deviation from the plan ends the call with UNEXPECTED. The bytes
+ * received until then stay in the line's buffer, and the packet-by-packet parser in Python continues with them.
  *
- * All lengths come from the plan, none from the wire. Build with -ffp-contract=off: the same bits everywhere.
+ * All lengths come from the plan, none from the wire, so a corrupted packet cannot overrun a buffer. Build with
+ * -ffp-contract=off: fused multiply-add would change the last bits between machines.
  */
 
 #define _GNU_SOURCE
@@ -18,7 +19,7 @@
 #include <unistd.h>
 #ifdef __linux__
 #include <poll.h>
-#else /* robots run on virtual time alone, where no line has a descriptor */
+#else /* elsewhere robots run on virtual time only, where no line has a file descriptor */
 #define POLLIN 1
 #define POLLOUT 4
 struct pollfd { int fd; short events, revents; };
@@ -27,52 +28,52 @@ typedef unsigned nfds_t;
 #endif
 
 #ifndef SOURCE_CRC
-#define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py refuses an object of another one, as it reads the structs here */
+#define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py rejects an object of another version, as structs may differ */
 #endif
-#define MOST_LINES 256 /* a record's bus is a byte: packets.py */
+#define MOST_LINES 256 /* a packet record stores the bus in one byte: packets.py */
 #define MOST_PIECES 32
 #define LONGEST_SYNC_WRITE 6200
 #define RECORD_HEADER 24 /* bus, kind, ID, pad, length, two times: packets.py */
 #define REPEATED 50      /* cycles after which an unchanged goal is sent again: a sync write has no acknowledgement */
 #define NEVER ((int64_t)1 << 62)
-#define WRITE_TIMEOUT_NS 20000000 /* port.py */
-#define LEAST_NAP_NS 15000
+#define WRITE_TIMEOUT_NS 20000000 /* same value as _WRITE_TIMEOUT_NS in ports.py */
+#define LEAST_NAP_NS 15000        /* a shorter sleep is not worth its wake-up; the time is polled instead */
 
 enum { OK, WAITING, FULL, UNEXPECTED, LOOK, SILENCE };
 enum { IDLE, AWAITING, THROUGH };
-enum { FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS }; /* words of a line that the parser shares: bus.py */
-#define MOST_LATE_NS 1000000     /* bus.py */
+enum { FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS }; /* words of a line, shared with the parser: bus.py */
+#define MOST_LATE_NS 1000000     /* same value as in bus.py */
 enum { INSTRUCTION = 1, STATUS = 2 };
 enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE, FLOAT32 };
 
 typedef struct {
     int32_t offset, size, encoding;
-    int32_t bit; /* the only bit of it that is meant; -1: all of it */
+    int32_t bit; /* index of the single bit that counts; -1: the whole number */
 } Field;
 
-typedef struct { /* one servo: where its state is in its data, and which row of the states it has */
+typedef struct { /* one servo: position of its state in the reply data, and its row in the states */
     Field fields[3];
     int64_t row;
     double quick; /* rad; a step up to this is always plausible */
 } Servo;
 
-typedef struct { /* one state of a device: number * scale + offset, at its column of the source states */
+typedef struct { /* one state of a device: number * scale + offset, stored in its column of the source states */
     Field field;
     double scale, offset;
     int64_t column;
 } DeviceField;
 
-typedef struct { /* what one read gets of a device */
+typedef struct { /* block of a device's items that one read fetches */
     int32_t first_field, field_count;
 } Block;
 
-typedef struct { /* one device, and which row of the sources it has */
+typedef struct { /* one device, with its row in the sources */
     int32_t first_block, block_count;
     int64_t row;
 } Device;
 
-typedef struct { /* what one servo says in the replies to a read, or a device: its blocks come behind the servos */
-    int32_t servo, data_at, end, unused; /* `end`: behind its checksum */
+typedef struct { /* reply data of one servo, or of one block of a device; blocks are numbered after the servos */
+    int32_t servo, data_at, end, unused; /* `end`: offset after the checksum */
 } Part;
 
 typedef struct { /* one status packet of the replies */
@@ -81,16 +82,16 @@ typedef struct { /* one status packet of the replies */
 
 typedef struct { /* one read instruction and its replies, to the byte */
     const uint8_t *instruction;
-    const uint8_t *expected; /* the replies, */
-    const uint8_t *known;    /* 0xff where that is known beforehand */
+    const uint8_t *expected; /* expected bytes of the replies */
+    const uint8_t *known;    /* 0xff for each byte of `expected` that must match, 0 for data and checksums */
     const Packet *packets;
     const Part *parts;
     int32_t instruction_size, size, packet_count, part_count, id, fast;
-    int32_t firm_size, unused; /* once so many bytes have come, only devices are awaited; 0: none is */
+    int32_t firm_size, unused; /* bytes after which only devices are still awaited; 0: the read has no devices */
     int64_t due_ns, timeout_ns, tail_timeout_ns, tail_margin_ns, least_ns, record_bytes;
 } Read;
 
-typedef struct { /* one goal item of one servo: goals.Cell */
+typedef struct { /* one goal item of one servo: goals.GoalCell */
     int32_t at, size, interface, magnitude, mirrored, low, high, free;
     double sign, offset, unit;
 } Cell;
@@ -99,10 +100,10 @@ typedef struct { /* goals.SyncWrite */
     const int32_t *members; /* indices on the bus */
     const int32_t *rows;
     const uint8_t *ids;
-    const Cell *cells; /* of the first servo, of the second */
+    const Cell *cells; /* `items` cells per servo, one servo after the other */
     int32_t *ticks;
-    uint8_t *again;  /* the goal changed in the cycle before */
-    uint8_t *served; /* the servo could get a goal in the cycle before */
+    uint8_t *again;  /* 1 if the goal changed in the previous cycle */
+    uint8_t *served; /* 1 if the servo could get a goal in the previous cycle */
     int64_t *sent_at;
     int64_t cycle;
     int32_t count, items, address, length, lead, unused;
@@ -116,8 +117,8 @@ typedef struct {
 typedef struct { /* one serial line */
     const Read *reads;
     SyncWrite *writes;
-    const uint8_t *included; /* which servos may get goals */
-    const double *ceiling;   /* rad/s of each servo, NaN: none */
+    const uint8_t *included; /* 1 for each servo that may get goals */
+    const double *ceiling;   /* speed limit of each servo, rad/s; NaN: no limit */
     uint8_t *buffer;
     int64_t *words;
     int64_t byte_ns, latency_ns, sent_ns, due_ns, deadline_ns, at_ns;
@@ -125,11 +126,11 @@ typedef struct { /* one serial line */
     int32_t first_servo, servo_count, first_block, block_count;
     int32_t room, read_count, write_count;
     int32_t state, done, have, pieces;
-    int32_t gone; /* errno of a write that failed, or -1; 0: none did */
+    int32_t gone; /* errno of a failed write, or -1; 0: no write has failed */
     Piece piece[MOST_PIECES];
 } Line;
 
-typedef struct { /* replies are polled for when they are due: reply_polling.py */
+typedef struct { /* polling for replies shortly before they are due: ReplyPolling in ports.py */
     double share, credit_ns;
     int64_t longest_ns, updated_ns, late_ns, step_ns, margin_ns, saved_ns;
     int32_t enabled, slept;
@@ -155,7 +156,7 @@ typedef struct Kernel {
     uint8_t *source_valid;
     int64_t *source_age_ns;
     const double *goals[4];
-    uint8_t *desk; /* packets of the log that are not committed yet; NULL: no log */
+    uint8_t *desk; /* log batch that is not committed yet; NULL: no log */
     uint64_t *used;
     int64_t desk_room, reserved, beat_ns;
     int64_t (*now)(void);
@@ -163,11 +164,11 @@ typedef struct Kernel {
     int32_t (*receive)(int32_t line, uint8_t *data, int32_t room);
     int32_t (*wait)(int64_t deadline_ns, uint8_t *ready);
     int32_t line_count, servo_count, write_line, write_number, device_count;
-    int32_t raised; /* one of these functions raised an exception: no call ends well */
+    int32_t raised; /* 1 after one of these functions raised an exception: every call then fails */
     Polling polling;
 } Kernel;
 
-/* The machine: used where the Python side gave no functions of its own (virtual time does) */
+/* System calls: used unless the Python side provides its own functions, as on virtual time */
 
 static int64_t clock_ns(void)
 {
@@ -180,7 +181,7 @@ static int64_t now_ns(const Kernel *k) { return k->now ? k->now() : clock_ns(); 
 
 static int is_read(const Line *l) { return l->planned && !l->words[LOST]; }
 
-/* Waits for bytes on any line; `ready` has a flag a line. Returns the number of lines with bytes. */
+/* Wait for bytes on any line. `ready` has one flag per line. Return the number of readable lines. */
 static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 {
     struct pollfd set[MOST_LINES];
@@ -207,7 +208,7 @@ static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
     return found;
 }
 
-/* Hands one whole packet to a line; false when the line is gone or takes no more bytes. */
+/* Write one whole packet to a line. Return false when the line is gone or accepts no more bytes. */
 static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
 {
     if (k->send) {
@@ -226,7 +227,7 @@ static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
             size -= (int32_t)count;
             continue;
         }
-        /* the output queue is full: packets are short, so one that stays full is stuck */
+        /* The output queue is full. Packets are short, so a queue that stays full belongs to a stuck line. */
         if (!deadline)
             deadline = clock_ns() + WRITE_TIMEOUT_NS;
         int64_t left = deadline - clock_ns();
@@ -241,7 +242,7 @@ static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
     return 1;
 }
 
-/* Returns the number of bytes, 0 for none, -1 when the line is gone; a line that was ready and has none is. */
+/* Return the number of bytes read, 0 if none, -1 if the line is gone. Readable without data (EOF) counts as gone. */
 static int32_t receive(Kernel *k, Line *l)
 {
     uint8_t *place = l->buffer + l->have;
@@ -274,7 +275,8 @@ static void put_record(Kernel *k, const Line *l, int32_t kind, int32_t id, int64
     memcpy(to + 8, &first, 8);
     memcpy(to + 16, &last, 8);
     memcpy(to + RECORD_HEADER, data, (size_t)size);
-    atomic_signal_fence(memory_order_release); /* last: a process may die here */
+    /* Publish the record last: if the process dies here, the reader must not see a partial record. */
+    atomic_signal_fence(memory_order_release);
     *(volatile uint64_t *)k->used += (uint64_t)(RECORD_HEADER + size);
 }
 
@@ -301,11 +303,11 @@ static uint16_t crc16(uint16_t crc, const uint8_t *data, int32_t size)
 
 static int crc_is_right(uint16_t crc, const uint8_t *tail) { return crc == (tail[0] | tail[1] << 8); }
 
-/* Checks the replies that end within so many bytes. */
+/* Verify the checksums of the replies that end within the first `bytes` bytes. */
 static int sums_are_right(const Line *l, const Read *r, int32_t bytes)
 {
     const uint8_t *b = l->buffer;
-    if (r->fast) { /* each CRC goes on where the one before it ended, and covers that one, too */
+    if (r->fast) { /* each CRC continues from the previous one and covers that CRC as well */
         uint16_t crc = 0;
         int32_t from = 0;
         for (int32_t i = 0; i < r->part_count; i++) {
@@ -328,7 +330,7 @@ static int sums_are_right(const Line *l, const Read *r, int32_t bytes)
         } else {
             if (!crc_is_right(crc16(0, b + start, end - 2 - start), b + end - 2))
                 return 0;
-            /* a stuffed reply of this length has fewer bytes of data than were asked for */
+            /* A reply of this length with byte stuffing has less data than was requested. */
             for (int32_t at = start + 7; at + 4 <= end; at++)
                 if (b[at] == 0xff && b[at + 1] == 0xff && b[at + 2] == 0xfd && b[at + 3] == 0xfd)
                     return 0;
@@ -339,7 +341,7 @@ static int sums_are_right(const Line *l, const Read *r, int32_t bytes)
 
 /* Reply polling */
 
-/* Begins to await a reply: returns how long to sleep, and in `until` when to end polling; 0: no credit. */
+/* Begin to await a reply. Return the time to sleep, and in `until` the end of polling; 0: no credit left. */
 int64_t dxl_polling_begin(Polling *p, int64_t due_ns, int64_t now, int64_t deadline_ns, int64_t *until)
 {
     *until = 0;
@@ -366,34 +368,34 @@ int64_t dxl_polling_begin(Polling *p, int64_t due_ns, int64_t now, int64_t deadl
     return nap;
 }
 
-/* Takes note of how long was polled, and how often. */
+/* Charge the time spent polling, and record whether the first look was already successful. */
 void dxl_polling_spent(Polling *p, int64_t duration_ns, int32_t looks)
 {
     p->credit_ns -= (double)duration_ns;
     p->slept = p->slept && looks == 1;
 }
 
-/* Takes note that the replies that were due at `due_ns` were there at `at_ns`. */
+/* Update the expected lateness with replies that were due at `due_ns` and seen at `at_ns`. */
 void dxl_polling_came(Polling *p, int64_t due_ns, int64_t at_ns)
 {
     int64_t late = at_ns - due_ns;
     if (p->slept && late >= p->late_ns - p->margin_ns) {
-        /* they may have been there for long: sleep less and less until their arrival is seen */
+        /* They were there at the first look, perhaps for long: shorten the sleep until an arrival is observed. */
         late = p->late_ns - p->step_ns;
         p->step_ns *= 2;
     } else {
         p->step_ns = p->margin_ns;
         int64_t change = late - p->late_ns;
         if (change < 0)
-            change = (change - 1) / 2; /* rounded down, */
+            change = (change - 1) / 2; /* rounds down */
         else
-            change = (change < p->margin_ns ? change : p->margin_ns) / 8; /* one that is very late says little */
+            change = (change < p->margin_ns ? change : p->margin_ns) / 8; /* limits the influence of an outlier */
         late = p->late_ns + change;
     }
     p->late_ns = late < -2000000 ? -2000000 : late > 20000000 ? 20000000 : late;
 }
 
-/* Sleeps until shortly before replies are due and looks again and again; returns how many lines have bytes. */
+/* Sleep until shortly before replies are due, then poll. Return the number of readable lines. */
 static int32_t poll_for_replies(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 {
     int64_t now = clock_ns(), soonest = NEVER, latest = 0, until;
@@ -433,7 +435,7 @@ static double tick(const Field *f, const uint8_t *data)
     if (f->bit >= 0)
         return raw >> f->bit & 1;
     if (f->encoding == SIGN_MAGNITUDE) /* bit 10 is the sign: e-Manual AX-12A, Present Speed (38) */
-        return raw & 0x400 ? -(int32_t)(raw & 0x3ff) : (int32_t)(raw & 0x3ff); /* an integer: has no -0.0 */
+        return raw & 0x400 ? -(int32_t)(raw & 0x3ff) : (int32_t)(raw & 0x3ff); /* integers, to avoid -0.0 */
     if (f->encoding == TWOS_COMPLEMENT)
         return f->size == 1 ? (int8_t)raw : f->size == 2 ? (int16_t)raw : (int32_t)raw;
     if (f->encoding == FLOAT32) {
@@ -461,7 +463,7 @@ static void take_block(Kernel *k, int32_t i, const uint8_t *data, int64_t at_ns)
     k->block_at_ns[i] = at_ns;
 }
 
-/* Takes what a member of a line, by its index, answered to the read of its state. */
+/* Store the state that a member of a line, servo or device block, has sent. */
 static void take_state(Kernel *k, const Line *l, int32_t member, const uint8_t *data, int64_t at_ns)
 {
     if (member >= l->servo_count) {
@@ -476,15 +478,15 @@ static void take_state(Kernel *k, const Line *l, int32_t member, const uint8_t *
     k->at_ns[i] = at_ns;
 }
 
-/* Begins a cycle of a line: nothing has come. */
+/* Begin a cycle of a line: mark all its states as not received. */
 static void clear_fresh(Kernel *k, const Line *l)
 {
     memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
     memset(k->block_fresh + l->first_block, 0, (size_t)l->block_count);
 }
 
-/* Counts what was sent from `before` on: it waits in the adapter behind what was sent before. Returns when the
- * first of it is on the wire. */
+/* Account for a packet written at `before`: it waits in the adapter until earlier packets are off the wire. Return
+ * the time at which its first byte is on the wire. */
 static int64_t occupy(Line *l, int64_t before, int32_t size)
 {
     int64_t start = l->words[FREE_NS] > before ? l->words[FREE_NS] : before;
@@ -492,7 +494,7 @@ static int64_t occupy(Line *l, int64_t before, int32_t size)
     return start;
 }
 
-/* Sends the next read of a line; OK, FULL, or UNEXPECTED when the line is gone. */
+/* Send the next read of a line. Return OK, FULL, or UNEXPECTED when the line is gone. */
 static int ask(Kernel *k, Line *l)
 {
     const Read *r = &l->reads[l->done];
@@ -509,13 +511,13 @@ static int ask(Kernel *k, Line *l)
     k->reserved += r->record_bytes - RECORD_HEADER - r->instruction_size;
     l->sent_ns = occupy(l, before, r->instruction_size);
     l->due_ns = l->sent_ns + r->due_ns;
-    /* this process may have stood still before the bytes left */
+    /* This process may have been suspended before the bytes left. */
     l->deadline_ns = (l->sent_ns > after ? l->sent_ns : after) + r->timeout_ns;
     l->state = AWAITING;
     return OK;
 }
 
-/* Keeps how late the replies on a line come, as `Bus` does: idle time begins nothing that would end as late. */
+/* Update the lateness of a line, as `Bus` does. Idle time starts no transaction that could end that late. */
 static void note_lateness(Line *l, int64_t late_ns)
 {
     int64_t kept = l->words[LATE_NS] - (l->words[LATE_NS] >> 6) - 1;
@@ -548,13 +550,13 @@ static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
     return OK;
 }
 
-/* Whether replies came sooner than the wire allows: they are of a request before, or an echo. */
+/* Return true for replies that came sooner than the wire allows: an echo, or replies to an earlier request. */
 static int is_early(const Line *l, const Read *r)
 {
     return piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns;
 }
 
-/* Awaits the rest of the replies for a moment only: the servos have answered. */
+/* Shorten the deadline of the remaining replies: all servos have answered, only devices are awaited. */
 static void await_devices(Line *l, const Read *r, int64_t at)
 {
     int64_t brief = l->sent_ns + r->tail_timeout_ns;
@@ -564,7 +566,7 @@ static void await_devices(Line *l, const Read *r, int64_t at)
         l->deadline_ns = brief;
 }
 
-/* Takes bytes that arrived on a line at a time; OK, FULL, or UNEXPECTED where they are not as planned. */
+/* Process `count` bytes that arrived on a line. Return OK, FULL, or UNEXPECTED if they differ from the plan. */
 static int take(Kernel *k, Line *l, int32_t count, int64_t at)
 {
     const Read *r = &l->reads[l->done];
@@ -587,7 +589,7 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
     return keep_replies(k, l, r, at);
 }
 
-/* Takes what a line has; what comes where nothing is awaited is left in the buffer for the parser. */
+/* Read the bytes of a line. Bytes that arrive while no reply is awaited stay in the buffer for the parser. */
 static int hear(Kernel *k, Line *l)
 {
     int32_t count = receive(k, l);
@@ -602,7 +604,7 @@ static int hear(Kernel *k, Line *l)
     return UNEXPECTED;
 }
 
-/* Whether all of a device came in this cycle. */
+/* Return true if all blocks of a device arrived in this cycle. */
 static int is_whole(const Kernel *k, const Device *d)
 {
     for (int32_t b = d->first_block; b < d->first_block + d->block_count; b++)
@@ -611,7 +613,7 @@ static int is_whole(const Kernel *k, const Device *d)
     return 1;
 }
 
-/* Whether all values of a device are finite. */
+/* Return true if all values of a device are finite. */
 static int is_finite(const Kernel *k, const Device *d)
 {
     for (int32_t b = d->first_block; b < d->first_block + d->block_count; b++)
@@ -621,7 +623,7 @@ static int is_finite(const Kernel *k, const Device *d)
     return 1;
 }
 
-/* Fills the states of the devices: a row is valid when all its blocks came, with numbers that are finite. */
+/* Fill the states of the devices. A row is valid when all its blocks arrived and are not doubted. */
 static void show_devices(Kernel *k, int64_t now)
 {
     for (int32_t i = 0; i < k->device_count; i++) {
@@ -640,7 +642,7 @@ static void show_devices(Kernel *k, int64_t now)
     }
 }
 
-/* Fills the states of the robot from what came in this cycle and is not doubted. */
+/* Fill the states of the robot from the replies of this cycle that are not doubted. */
 void dxl_show(Kernel *k, int64_t now)
 {
     int32_t n = k->servo_count;
@@ -660,8 +662,8 @@ void dxl_show(Kernel *k, int64_t now)
     }
 }
 
-/* Ends a cycle, and fills the states; LOOK, with nothing changed, where a position is further than is plausible,
- * or a device sent no number. */
+/* End a cycle and fill the states. Return LOOK, with the states unchanged, if a position is further away than is
+ * plausible, or if a device sent a NaN or an infinite value. */
 int32_t dxl_settle(Kernel *k, int64_t now)
 {
     int32_t n = k->servo_count;
@@ -681,13 +683,13 @@ int32_t dxl_settle(Kernel *k, int64_t now)
     return OK;
 }
 
-/* Takes what the parser found of a member of a line. */
+/* Store the state of a line's member that the parser received. */
 void dxl_take(Kernel *k, int32_t line, int32_t member, const uint8_t *data, int64_t at_ns)
 {
     take_state(k, &k->lines[line], member, data, at_ns);
 }
 
-/* Notes that the servos are asked now; false where a line had no instruction for longer than its servos wait. */
+/* Note the time of this request to the servos. Return false if a line was silent for longer than its watchdogs. */
 static int is_in_time(Kernel *k, int64_t now)
 {
     for (int32_t i = 0; i < k->line_count; i++) {
@@ -707,16 +709,16 @@ static int32_t read_all(Kernel *k)
     int64_t now = now_ns(k);
     if (!is_in_time(k, now))
         return SILENCE;
-    int64_t stop = NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns; /* `beat_ns` may be NEVER */
+    int64_t stop = NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns; /* `beat_ns` may be NEVER: no overflow */
     int32_t idle = 0;
-    for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
+    for (int32_t i = 0; i < k->line_count; i++) { /* before the reads, as the parser may settle this cycle */
         const Line *l = &k->lines[i];
         if (!is_read(l))
             clear_fresh(k, l);
     }
     for (int32_t i = 0; i < k->line_count; i++)
         idle += is_read(&k->lines[i]) && k->lines[i].state == IDLE;
-    if (idle && wait_for(k, 0, ready)) /* what came before a request must not be taken for its reply */
+    if (idle && wait_for(k, 0, ready)) /* bytes from before a request must not be taken for its reply */
         for (int32_t i = 0; i < k->line_count; i++)
             if (ready[i] && is_read(&k->lines[i]) && k->lines[i].state == IDLE)
                 return UNEXPECTED;
@@ -745,8 +747,8 @@ static int32_t read_all(Kernel *k)
             found = wait_for(k, end, ready);
         now = now_ns(k);
         if (!found && now >= deadline && !(found = wait_for(k, 0, ready)))
-            return UNEXPECTED; /* looked once more: this process may have stood still meanwhile */
-        /* every line that has bytes is heard, whatever came on another: the parser does so, too */
+            return UNEXPECTED; /* checked twice: this process may have been suspended during the wait */
+        /* Read every readable line, whatever the result of the other lines. The parser does the same. */
         int answer = OK;
         for (int32_t i = 0; i < k->line_count; i++) {
             int one = ready[i] && is_read(&k->lines[i]) ? hear(k, &k->lines[i]) : OK;
@@ -759,8 +761,8 @@ static int32_t read_all(Kernel *k)
     return dxl_settle(k, now_ns(k));
 }
 
-/* Reads every servo once. WAITING: `beat_ns` has passed since the call; FULL: commit the log; call again. SILENCE:
- * nothing was sent, watchdogs may have stopped servos. */
+/* Read every servo once. Call again after WAITING (`beat_ns` has passed) and FULL (commit the log first). SILENCE:
+ * nothing was sent, because watchdogs may have stopped servos. */
 int32_t dxl_read(Kernel *k)
 {
     int32_t answer = read_all(k);
@@ -779,12 +781,12 @@ static int32_t goal_tick(const Cell *c, double goal, double ceiling)
     if (c->interface == 1 && !(isnan(ceiling) || fabs(goal) <= ceiling))
         goal = ceiling;
     double exact = fabs(goal) / c->unit;
-    if (exact >= c->low && exact <= c->high) /* a speed is a limit, ROUNDING of goals.py */
+    if (exact >= c->low && exact <= c->high) /* a speed is a limit, so it is rounded down: goals.GoalCell */
         return (int32_t)(c->interface == 1 ? floor(exact + 1e-6) : rint(exact));
     return exact < c->low ? c->low : exact > c->high ? c->high : c->free;
 }
 
-/* Puts a byte behind INST with byte stuffing: FF FF FD is followed by another FD. */
+/* Append a byte of the parameters with byte stuffing: FF FF FD is followed by another FD. */
 static int32_t put(uint8_t *packet, int32_t size, uint8_t byte)
 {
     packet[size++] = byte;
@@ -793,7 +795,7 @@ static int32_t put(uint8_t *packet, int32_t size, uint8_t byte)
     return size;
 }
 
-/* Builds the sync write of the goals that are due; returns its size, 0 when none is. */
+/* Build the sync write of the goals that are due. Return its size, 0 if no goal is due. */
 static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
 {
     int32_t size = 0;
@@ -859,7 +861,7 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
     return size;
 }
 
-/* Sends the goals that are due on one line; OK, or FULL. A line that takes no more bytes is `gone`. */
+/* Send the due goals of one line. Return OK or FULL. A line that accepts no more bytes is marked `gone`. */
 static int write_goals(Kernel *k, Line *l)
 {
     uint8_t packet[LONGEST_SYNC_WRITE];
@@ -878,8 +880,8 @@ static int write_goals(Kernel *k, Line *l)
     return OK;
 }
 
-/* Sends the goals that are due on every line. FULL: commit the log and call again; UNEXPECTED: a line is gone, the
- * others have their goals. */
+/* Send the due goals of every line. FULL: commit the log and call again. UNEXPECTED: a line is gone, and the other
+ * lines have their goals. */
 int32_t dxl_write(Kernel *k)
 {
     int32_t gone = 0;
@@ -892,7 +894,7 @@ int32_t dxl_write(Kernel *k)
     return gone || k->raised ? UNEXPECTED : OK;
 }
 
-/* Ends a cycle that the parser finishes, and forgets what was asked. */
+/* End a cycle that the parser finishes, and drop all pending reads. */
 void dxl_abandon(Kernel *k)
 {
     k->reserved = 0;
@@ -902,5 +904,5 @@ void dxl_abandon(Kernel *k)
     }
 }
 
-/* Checksum of this source: kernel.py takes the structs from it. */
+/* Return the checksum of this source; kernel.py compares it, because it reads the structs from the source. */
 uint32_t dxl_source(void) { return SOURCE_CRC; }

@@ -1,8 +1,8 @@
 """Exchange kernel: lays out the plan of a cycle for `kernel.c`, which executes it.
 
-The kernel is one shared object without Python in it, called through ctypes; the build compiles it. Where it
-meets anything unexpected the packet-by-packet parser (`bus`) finishes the cycle. The structs that both sides
-share are those of `kernel.c`: they are read from there.
+The kernel is a shared object without Python code, called through ctypes and compiled by the build. After
+anything unexpected the packet-by-packet parser (`bus`) finishes the cycle. The structs that both sides share
+are parsed from `kernel.c`.
 """
 
 from __future__ import annotations
@@ -32,23 +32,25 @@ from dxlwire.port.ports import ReplyPolling
 from dxlwire.transaction import BROADCAST_ID, Transaction
 from dxlwire.wire.dialect import dialect_of
 
-_ROOM = 8192  # Bytes of a line's buffer; the replies to one read may take a quarter of it
+_ROOM = 8192  # Size of a line's buffer, bytes; the replies to one read may use a quarter
 _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32": 3}
 
 
 @unique
 class Answer(IntEnum):
-    """How a call of the kernel ended."""
+    """Result of a kernel call."""
 
     OK = 0
     WAITING = 1  # Replies are still awaited
     FULL = 2  # The log's batch must be committed first
-    UNEXPECTED = 3  # Something did not come as planned; the parser continues
-    LOOK = 4  # All replies came, and a position is further from the last one than is plausible
-    SILENCE = 5  # Nothing was sent: servos had no instruction for longer than their watchdogs wait
+    UNEXPECTED = 3  # The replies differ from the plan; the parser continues
+    # All replies arrived, but a position is further from the last one than is plausible, or a device sent a
+    # NaN or an infinite value
+    LOOK = 4
+    SILENCE = 5  # Nothing was sent: servos got no instruction for longer than their watchdog timeout
 
 
-AWAITING = 1  # State of a line: a read was sent; 0: none was in this cycle
+AWAITING = 1  # State of a line whose read was sent; 0: no read was sent in this cycle
 _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
@@ -65,8 +67,11 @@ _Part, _Packet, _Read, _Cell, _SyncWrite = (
 
 
 def library(path: Path | None = None) -> ctypes.CDLL:
-    """Return the functions of the compiled kernel. Raises NotCompiled where it was not built, or of another
-    source."""
+    """Return the functions of the compiled kernel.
+
+    Raises:
+        NotCompiled: The kernel was not built, or was built from another source.
+    """
     found = load_compiled(SOURCE, ctypes.CDLL, path or LIBRARY)
     for name, result, arguments in (
         ("read", c_int32, (c_void_p,)),
@@ -82,7 +87,7 @@ def library(path: Path | None = None) -> ctypes.CDLL:
 
 
 def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
-    """Return the `Polling` of kernel.c before the first reply; without `polling` none is polled for."""
+    """Return the `Polling` struct of kernel.c in its initial state; without `polling` it is disabled."""
     if polling is None:
         return STRUCTS["Polling"]()
     return STRUCTS["Polling"](
@@ -91,7 +96,7 @@ def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
         updated_ns=-1,
         step_ns=polling.margin_ns,
         margin_ns=polling.margin_ns,
-        saved_ns=50_000_000,  # what was saved in a pause is not spent at once
+        saved_ns=50_000_000,  # Cap of the polling credit: a long pause must not pay for a burst of polling
         enabled=1,
     )
 
@@ -108,11 +113,11 @@ class Program:
     """The reads of one bus, laid out for the kernel."""
 
     def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
-        self._kept: list[object] = []  # the kernel has only the addresses
+        self._kept: list[object] = []  # Keeps buffers alive: the kernel has only their addresses
         self.count = len(reads)
         self.reads = _array(_Read, [self._read(plan, read) for read in reads])
         self.bytes = max((read.record_bytes for read in self.reads[: self.count]), default=0)
-        """The most that one read and its replies take in the log."""
+        """Log space of the largest read with its replies, bytes."""
 
     def _keep(self, data: bytes) -> int:
         kept = ctypes.create_string_buffer(data, len(data))
@@ -153,7 +158,7 @@ _Replies = tuple[bytes, bytes, list[ctypes.Structure], list[ctypes.Structure]]
 
 
 def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
-    """Return replies that come one behind the other: header, ID, length and error byte are known."""
+    """Return the replies that follow one another: header, ID, length and error byte are known in advance."""
     dialect = dialect_of(plan.protocol)
     data_at = dialect.OVERHEAD - dialect.CHECKSUM
     expected, known = b"", b""
@@ -170,7 +175,7 @@ def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
 
 
 def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
-    """Return the one status of a fast form (e-Manual, Protocol 2.0, "Fast Sync Read (0x8A)")."""
+    """Return the single status of a fast form (e-Manual, Protocol 2.0, "Fast Sync Read (0x8A)")."""
     dialect = dialect_of(plan.protocol)
     awaited = read.transaction.awaited
     size = dialect.fast_size(sum(one.length for one in awaited), len(awaited))
@@ -186,15 +191,15 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
 
 
 class KernelGoals(msgspec.Struct, frozen=True):
-    """What the exchange kernel makes the goals of one bus of; the arrays are shared."""
+    """Goals of one bus, as arrays that are shared with the exchange kernel."""
 
     arrays: GoalArrays
-    included: NDArray[np.bool_]  # Which of its servos may get goals
-    ceiling: Floats  # The highest speed of each toward a position, rad/s; NaN: no limit
+    included: NDArray[np.bool_]  # True for each servo that may get goals
+    ceiling: Floats  # Speed limit of each servo toward a position, rad/s; NaN: no limit
 
 
 class Kernel:
-    """The lines of a robot as the exchange kernel has them."""
+    """All lines of a robot, laid out for the exchange kernel."""
 
     def __init__(
         self,
@@ -204,7 +209,15 @@ class Kernel:
         goals: Floats,
         packets: PacketLog,
     ) -> None:
-        """`goals`: shape (4, joints), one row for each of COMMAND_INTERFACES; NaN: no goal."""
+        """Lay out the plan of all lines.
+
+        Args:
+            lines: The lines with their open ports.
+            shared: One for each line.
+            samples: States to fill.
+            goals: Shape (4, joints), one row for each of COMMAND_INTERFACES; NaN: no goal.
+            packets: Log of the exchanged packets.
+        """
         self._library = library()
         self._buses = lines.buses
         self._shared = tuple(shared)
@@ -216,7 +229,7 @@ class Kernel:
         self._raised: BaseException | None = None
         self._kept: list[object] = [samples, goals]
         self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in shared]
-        self.programs: list[Program | None] = [None] * len(shared)  # By which each bus is read
+        self.programs: list[Program | None] = [None] * len(shared)  # The program that reads each bus
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(shared)
         self._written: list[object] = [None] * len(shared)
         self._kernel = STRUCTS["Kernel"](beat_ns=BEAT_NS)
@@ -233,12 +246,12 @@ class Kernel:
             self._kernel.desk_room = self._room
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
         self.read: Callable[[], int] = partial(self._library.dxl_read, self._pointer)
-        """Reads every servo once, in C; returns 0, or what `finish_read` takes."""
+        """Read every servo once, in C. Returns 0, or a code for `finish_read`."""
         samples.take = partial(self._library.dxl_take, self._pointer)
         samples.settle_all = partial(self._library.dxl_settle, self._pointer)
         samples.show = partial(self._library.dxl_show, self._pointer)
         self.write: Callable[[], int] = partial(self._library.dxl_write, self._pointer)
-        """Sends the goals that are due, in C; returns 0, or what `finish_write` takes."""
+        """Send the goals that are due, in C. Returns 0, or a code for `finish_write`."""
 
     def _laid_lines(self) -> ctypes.Array[ctypes.Structure]:
         lines = (STRUCTS["Line"] * max(len(self._buses), 1))()
@@ -300,12 +313,12 @@ class Kernel:
         kernel.source_age_ns = _data(sources.age_ns)
 
     def _lay(self, array: ctypes.Array[ctypes.Structure]) -> int:
-        """Keep an array, of which the kernel has the address alone."""
+        """Keep an array alive, because the kernel has only its address; return the address."""
         self._kept.append(array)
         return ctypes.addressof(array)
 
     def _lay_ports(self) -> None:
-        """Let the kernel use descriptors, or functions of the ports and the clock where there are none."""
+        """Give the kernel file descriptors, or callbacks to the ports and the clock where there are none."""
         if (descriptors := self._ports.descriptors) is not None:
             for line, descriptor in zip(self._lines, descriptors, strict=False):
                 line.descriptor = descriptor
@@ -321,8 +334,9 @@ class Kernel:
         for name, call in calls.items():
             setattr(self._kernel, name, ctypes.cast(call, c_void_p))
 
-    # What the kernel calls on virtual time. It knows no exceptions: one, such as an interrupt of the user, is
-    # kept, every later call fails, and `_raise` raises it when the kernel has returned.
+    # Callbacks of the kernel on virtual time. C cannot propagate an exception, such as a KeyboardInterrupt.
+    # The exception is stored, every later callback fails, and `_raise` raises it when the kernel has
+    # returned.
 
     def _now(self) -> int:
         try:
@@ -346,19 +360,20 @@ class Kernel:
         try:
             count = self._ports.ports[line].read_into(memoryview(array).cast("B"))
         except PortError:
-            return -1  # the parser meets it again and has the reason
+            return -1  # The parser calls the port again and gets the reason
         except BaseException as error:
             self._keep_raised(error)
             return -1
         return -1 if self._raised else count
 
     def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
-        indices: Sequence[int] = range(len(self._buses))  # after an exception: all lines, whose calls fail
+        # After an exception report all lines as readable, so that their calls fail
+        indices: Sequence[int] = range(len(self._buses))
         try:
             if self._raised is None:
                 heard = self._ports.wait(deadline_ns)
                 indices = [index for index in heard if self._is_read(index)]
-                if heard and not indices:  # a line that is gone is ready for ever: let time pass
+                if heard and not indices:  # A lost line is always readable: let time pass
                     self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
         except BaseException as error:
             self._keep_raised(error)
@@ -370,7 +385,7 @@ class Kernel:
         return bool(self._lines[index].planned) and self._buses[index].failure is None
 
     def _raise(self) -> None:
-        """Raise what came up while the kernel was at work."""
+        """Raise the exception that a callback stored, if any."""
         if (error := self._raised) is not None:
             self._raised, self._kernel.raised = None, 0
             self.abandon()
@@ -380,12 +395,17 @@ class Kernel:
         self._raised, self._kernel.raised = error, 1
 
     def poll_for_replies(self) -> None:
-        """Begin to poll for replies if the ports are set so; before real time."""
+        """Enable polling for replies if the ports are configured for it. Call before real-time scheduling
+        starts.
+        """
         self._kernel.polling = polling_state(self._ports.polling)
 
     def plan(self, index: int, program: Program) -> bool:
-        """Read a bus by a program from the next cycle on; False where there is no room for it: the log's
-        batch must hold what the lines have at once, a line's buffer the replies to one read.
+        """Read a bus by a program from the next cycle on.
+
+        Returns:
+            False when the program is too large: the log's batch must hold the packets of all lines at
+                once, and the replies to one read must fit into a quarter of the line's buffer.
         """
         sizes = [read.size for read in program.reads[: program.count]]
         if program.bytes * len(self._buses) > self._room or max(sizes, default=0) > _ROOM // 4:
@@ -397,7 +417,7 @@ class Kernel:
         return True
 
     def finish_read(self, code: int) -> Answer:
-        """Continue a read that has not come to its end; return how it ended."""
+        """Continue an unfinished read; return its final result."""
         while True:
             self._raise()
             if code == Answer.WAITING:
@@ -409,13 +429,13 @@ class Kernel:
             code = self.read()
 
     def plan_writes(self) -> None:
-        """Take the goals' sync writes, which are others after a change of mode or limits."""
+        """Lay out new sync writes of the goals. They are replaced after a change of mode or limits."""
         for index, shared in enumerate(self._shared):
             if shared.arrays.sync_writes is not self._writes[index]:
                 self._take_writes(index, shared.arrays.sync_writes)
 
     def finish_write(self, code: int) -> dict[int, PortError]:
-        """Continue a write that has not ended; return why lines took no more bytes, by index, once."""
+        """Continue an unfinished write; return the failures of the lines since the last call, by index."""
         while code == Answer.FULL:
             self._packets.commit()
             code = self.write()
@@ -426,7 +446,6 @@ class Kernel:
         return {index: failure for index, failure in found.items() if failure is not None}
 
     def _take_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
-        """Lay the sync writes of a bus out."""
         self._writes[index] = writes
         laid = [_laid_write(one) for one in writes]
         array = _array(_SyncWrite, [one for one, _ in laid])
@@ -435,29 +454,29 @@ class Kernel:
         line.writes, line.write_count = ctypes.addressof(array), len(laid)
 
     def _failure(self, index: int) -> PortError | None:
-        """Return why a line took no more bytes, once; None: it takes them."""
+        """Return the write failure of a line, once; None without a failure."""
         line = self._lines[index]
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
 
     def line(self, index: int) -> tuple[ctypes.Structure, PortError | None]:
-        """Return where a line stands in a cycle that did not come to its end, and why it took no bytes."""
+        """Return the state of a line in an unfinished cycle, and its write failure."""
         return self._lines[index], self._failure(index)
 
     def pieces(self, index: int) -> Iterator[tuple[bytes, int]]:
-        """Yield what was received on a line and could not be used, and when, ns."""
+        """Yield the unused bytes that were received on a line, with their arrival time, ns."""
         line, start = self._lines[index], 0
         for piece in line.piece[: line.pieces]:
             yield ctypes.string_at(line.buffer + start, piece.end - start), piece.at_ns
             start = piece.end
 
     def abandon(self) -> None:
-        """End a cycle that did not come to its end."""
+        """End an unfinished cycle."""
         self._library.dxl_abandon(self._pointer)
 
 
 def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
-    """Return a sync write for the kernel, and what must be kept as long as it is used."""
+    """Return a sync write for the kernel, and the objects that must stay alive while it is used."""
     count, items = len(write.members), max(map(len, write.cells), default=0)
     arrays: dict[str, NDArray[np.generic]] = {
         "members": np.array(write.members, dtype=np.int32),
@@ -501,7 +520,7 @@ def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
 
 
 def _array(kind: type[ctypes.Structure], items: Sequence[ctypes.Structure]) -> ctypes.Array[ctypes.Structure]:
-    """Return an array of structs; of nothing one, as an array has an address only then."""
+    """Return an array of structs, with at least one element: an empty array has no address."""
     return (kind * max(len(items), 1))(*items)
 
 
@@ -511,7 +530,11 @@ def _field(field: Field) -> ctypes.Structure:
 
 
 def _data(array: NDArray[np.generic]) -> int:
-    """Return the address of a contiguous array; raises ValueError for another."""
+    """Return the address of a contiguous array.
+
+    Raises:
+        ValueError: The array is not contiguous.
+    """
     if not array.flags.c_contiguous:
         raise ValueError("the kernel takes contiguous arrays only")
     return array.ctypes.data

@@ -1,9 +1,9 @@
 """Owed replies: the requests of one line that timed out and whose replies may still arrive.
 
 A status packet carries neither an address nor a sequence number, so a late reply looks like the reply to the
-next request for as many bytes. This is the one rule about that, for cycle, idle time, start-up and tools: a
+next request for the same number of bytes. One rule handles this for cycle, idle time, start-up and tools: a
 status counts only while no reply of its ID and length is owed to another request. A request therefore asks
-for a few bytes more, or is held back, until no such reply is owed.
+for a few extra bytes, or is held back, until no matching reply is owed.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from typing import NamedTuple
 from dxlwire.transaction import BROADCAST_ID, Awaited, Transaction
 
 LEAST_WINDOW_NS = 750_000_000
-"""A reply is owed for at least this time after its request [i]: stalled machines, virtual machines and USB
+"""Minimum time for which a reply is owed after its request [i]: stalled machines, virtual machines and USB
 adapters delay replies by up to 600 ms."""
-MOST_WINDOW_NS = 1_500_000_000  # Bounds the wait on a line whose replies were seen even later
-SLOW_MEMORY_NS = 60_000_000_000  # A stall such as that of a suspended machine ends; longer waits end with it
-MOST_OWED = 8  # So many late replies to the same repeated request are recognized
+MOST_WINDOW_NS = 1_500_000_000  # Limits the wait on a line with even slower replies
+# Time after which a slow reply is forgotten, because a stall, such as that of a suspended machine, ends
+SLOW_MEMORY_NS = 60_000_000_000
+MOST_OWED = 8  # Maximum number of late replies recognized for one repeated request
 
 Question = int | bytes
-"""Identifies what a request asks for: the address of a read, else the instruction packet."""
+"""Key of a request: the address of a read, otherwise the instruction packet."""
 
 
 class _Entry:
@@ -37,21 +38,21 @@ class _Entry:
 
 
 class _Change(NamedTuple):
-    """The newest instruction to one servo that may have changed registers."""
+    """Latest instruction to one servo that may have changed registers."""
 
     packet: bytes
-    first_ns: int  # Start of the first of its repetitions
+    first_ns: int  # Time of the first of its repetitions
     last_ns: int
 
 
 class OwedReplies:
     """Replies that may still arrive on one line, by servo ID and number of parameter bytes.
 
-    Replies of a fast form have the broadcast ID, and the size of their one packet as length.
+    Replies of a fast form are filed under the broadcast ID and the size of their single packet.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        """`now_ns` returns the time of the run's clock."""
+        """Args:     now_ns: Returns the time of the run's clock."""
         self._now_ns = now_ns
         self.version = 0  # Increases with each reply that becomes owed
         self._entries: dict[int, list[_Entry]] = {}
@@ -61,7 +62,7 @@ class OwedReplies:
 
     @property
     def window_ns(self) -> int:
-        """Time after its request for which a reply is owed: more than the slowest reply took lately."""
+        """Time for which a reply is owed after its request, ns: more than the slowest recent reply took."""
         if self._slowest_ns and self._now_ns() - self._slowest_at_ns > SLOW_MEMORY_NS:
             self._slowest_ns = 0
         return min(max(LEAST_WINDOW_NS, self._slowest_ns * 5 // 4), MOST_WINDOW_NS)
@@ -80,11 +81,11 @@ class OwedReplies:
         self.version += 1
 
     def settle(self, servo_id: int, length: int, error: int) -> bool:
-        """Charge a status that arrived to the oldest reply that it may be; return whether one was owed."""
+        """Charge a received status to the oldest owed reply that it may be; return True if one was owed."""
         entries = self._entries.get(servo_id, [])
         found = next((one for one in entries if one.length == length), None)
         if found is None:
-            # a refusal has no data, whatever was asked: which request it answers stays open
+            # A refusal has no data, whatever was requested, so the answered request stays unknown.
             return bool(entries) and length == 0 and error != 0
         now_ns, window_ns = self._now_ns(), self.window_ns
         if self._slowest_ns <= (late_ns := now_ns - found.last_ns) < window_ns:
@@ -95,7 +96,9 @@ class OwedReplies:
         return True
 
     def note_answer(self, transaction: Transaction, awaited: Awaited, sent_ns: int) -> None:
-        """Note that a request was answered: a reply that an older one was owed is owed to this one now."""
+        """Note that a request was answered. A reply owed to an older, identical request is owed to this one
+        now.
+        """
         servo_id, length, question = _shape(transaction, awaited)
         for one in self._entries.get(servo_id, ()):
             if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns:
@@ -105,12 +108,13 @@ class OwedReplies:
         """Note an instruction that may change registers: older reads are invalid from now on."""
         before, first_ns = self._changes.get(transaction.servo_id), sent_ns
         if before is not None and before.packet == transaction.packet:
-            # a retry changes nothing; later the servo may have changed the register itself, as by a reboot
+            # A retry changes nothing. After the window the servo may have changed the register itself, as by
+            # a reboot.
             first_ns = before.first_ns if sent_ns - before.last_ns < self.window_ns else sent_ns
         self._changes[transaction.servo_id] = _Change(transaction.packet, first_ns, sent_ns)
 
     def free_ns(self, transaction: Transaction, *, any_age: bool = False) -> int:
-        """Return when each reply to a transaction will be unambiguous; 0: it is now."""
+        """Return the time from which each reply to a transaction is unambiguous; 0: it is now."""
         window_ns, free_ns = self.window_ns, 0
         for servo_id, length, question in _shapes(transaction):
             for one in self._entries.get(servo_id, ()):
@@ -119,9 +123,9 @@ class OwedReplies:
         return free_ns if free_ns and free_ns > self._now_ns() else 0
 
     def confuses(self, transaction: Transaction, awaited: Awaited, *, refusal: bool, any_age: bool) -> bool:
-        """Check whether a status that fits an awaited one may be the late reply to another request.
+        """Return True if a status that fits an awaited one may be the late reply to another request.
 
-        A refusal has no data, whatever was asked.
+        A refusal has no data, so it may belong to a request of any length.
         """
         servo_id, length, question = _shape(transaction, awaited)
         if not (entries := self._entries.get(servo_id)):
@@ -135,7 +139,7 @@ class OwedReplies:
         )
 
     def asked_ns(self, transaction: Transaction, sent_ns: int) -> int:
-        """Return when the oldest request was sent that the reply to a transaction may answer.
+        """Return the send time of the oldest request that a reply to this transaction may answer.
 
         A late reply to an earlier repetition counts as the reply to this one.
         """
@@ -148,7 +152,7 @@ class OwedReplies:
         return min([sent_ns, *times])
 
     def newest_ns(self, transactions: Iterable[Transaction]) -> int:
-        """Return when the newest request was sent whose late reply would fit a transaction; 0: none."""
+        """Return the send time of the newest request whose late reply would fit; 0 without one."""
         times = [
             one.last_ns
             for transaction in transactions
@@ -159,9 +163,14 @@ class OwedReplies:
         return max(times, default=0)
 
     def _same(self, servo_id: int, one: _Entry, question: Question, *, any_age: bool) -> bool:
-        """Check whether a late reply would answer the question as well as a new one.
+        """Return True if a late reply would answer the question as well as a new one.
 
-        `any_age`: also after a write, which makes older readings of registers wrong, but not measured states.
+        Args:
+            servo_id: The servo.
+            one: Repetitions of the older request.
+            question: Key of the new request.
+            any_age: Accept replies from before a write as well. A write invalidates older readings of
+                registers, but not measured states.
         """
         if one.question != question:
             return False

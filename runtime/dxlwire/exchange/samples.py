@@ -1,4 +1,4 @@
-"""Samples: replies of a cycle -> states of the whole robot in SI units; implausible jumps are no samples."""
+"""Samples: replies of a cycle -> states of the whole robot in SI units, without implausible jumps."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from dxlwire.modes import Mode
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 
-MARGIN_RAD = 0.035  # rad, two degrees: noise of a potentiometer, and what a hand adds [i]
+MARGIN_RAD = 0.035  # Two degrees: noise of a potentiometer, plus the movement by a hand [i]
 MARGIN_NS = 10_000_000
-"""A reply may be that much later than the one before was, so that less time seems to have passed."""
-REPORT_AGAIN_NS = 1_000_000_000  # One servo has at most one event in this time
+"""Jitter of replies: the time between two replies may appear shorter by this much."""
+REPORT_AGAIN_NS = 1_000_000_000  # Minimum interval between two events of one servo
 
 
 class Samples:
-    """Fills the states of all servos at once; arrays have one column a servo, in the order of the plans.
+    """States of all servos, filled from replies; arrays have one column per servo, in the order of the plans.
 
     Position: q = direction * (raw * rad_per_tick - reference) * ratio, rad or m. The sign of velocity and
-    effort follows the joint's direction, so positive effort is torque toward growing q. In wheel mode the
-    speed of a model that controls none is a fraction of full output (AX-12A, Present Speed (38)), see
+    effort follows the joint's direction, so positive effort is torque toward growing q. In wheel mode a model
+    without speed control reports a fraction of full output as its speed (AX-12A, Present Speed (38)), see
     `mode_plan`.
     """
 
@@ -39,50 +39,50 @@ class Samples:
         reports: ReportSink,
     ) -> None:
         servos = [servo for plan in plans for servo in plan.servos]
-        self.states = states  # Of the robot; filled here
+        self.states = states  # States of the robot; filled by this class
         self.rows = np.array([servo.row for servo in servos], dtype=np.intp)
         """Row of each servo's joint in the states."""
         self.values: Floats = np.full((3, len(servos)), np.nan)
-        """Position, velocity and effort of each servo by its newest intact reply, SI units."""
+        """Position, velocity and effort of each servo in its newest intact reply, SI units."""
         self.scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
-        """Units of a tick of each value; that of the velocity follows the servo's mode."""
+        """Units per tick of each value; the unit of the velocity follows the servo's mode."""
         self.reference: Floats = np.array(
             [servo.direction * servo.reference * servo.ratio for servo in servos]
         )
-        """rad or m, subtracted from each position."""
+        """Offset subtracted from each position, rad or m."""
         self.fresh = np.zeros(len(servos), dtype=np.bool_)
         """True where an intact reply arrived in this cycle."""
         self.at_ns = np.full(len(servos), -1, dtype=np.int64)
-        """Time at which the newest plausible reply arrived; -1 while none ever did."""
+        """Arrival time of the newest plausible reply; -1 before the first reply."""
         self.shown_ns = self.at_ns.copy()
-        """The same as of the end of the cycle before: the time of the sample that the states show."""
+        """`at_ns` at the end of the cycle before: arrival time of the sample that the states come from."""
         self.recounted_ns = np.full(len(servos), -2, dtype=np.int64)
-        """Time of the last sample before a servo began to count its turns again; -2: it did not."""
+        """Time of the last sample before a servo restarted its turn count; -2 if it never did."""
         self.doubted = np.zeros(len(servos), dtype=np.bool_)
-        """True where the reply of this cycle is not believed."""
+        """True where the reply of this cycle is rejected."""
         self.jumps = Jumps(plans, reports)
         self.take: Callable[[int, int, bytes, int], object]
-        """Takes what a member of a bus answered, both by their index, and when it came; of the kernel."""
+        """Store a reply: index of the bus, index of the member, data, arrival time. Set by the kernel."""
         self.settle_all: Callable[[int], int]
-        """Fills the states at a time from the replies of this cycle; or returns another number than 0, having
-        filled none, where something is to be judged."""
+        """Fill the states from the replies of this cycle. Returns 0, or another number if no state was filled
+        because a value is suspect. Set by the kernel."""
         self.show: Callable[[int], object]
-        """Fills the states at a time from those replies that are not doubted."""
+        """Fill the states from the replies that are not doubted. Set by the kernel."""
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
-        self.modes = b""  # The robot's modes, as of the last `follow_modes`
+        self.modes = b""  # Modes of the robot at the last `follow_modes`
         self.devices = DeviceSamples(plans, sources, reports)
-        """Where the replies of devices go."""
+        """Samples of all devices."""
         first_servo = first_block = 0
         buses = []
         for number, plan in enumerate(plans):
             buses.append(BusSamples(number, plan, self, first_servo, first_block))
             first_servo += len(plan.servos)
             first_block += len(plan.members) - len(plan.servos)
-        self.buses = tuple(buses)  # Where the replies of each bus go
+        self.buses = tuple(buses)  # Samples of each bus
 
     def follow_modes(self) -> None:
-        """Use the unit of velocity that belongs to each servo's mode; before replies are taken."""
+        """Set the unit of velocity that belongs to each servo's mode. Call before replies are processed."""
         self.modes = self.states.mode.tobytes()
         turning = np.isin(self.states.mode[self.rows], _WHEEL_MODES)
         self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
@@ -90,14 +90,14 @@ class Samples:
     def settle(self, now_ns: int) -> None:
         """Fill the states from the replies of this cycle.
 
-        The row of a servo without a reply, or with an implausible one, keeps its values, is invalid, and its
-        age grows.
+        The row of a servo without a reply, or with an implausible one, keeps its values, is marked invalid,
+        and its age grows.
         """
         if self.settle_all(now_ns):
             self.judge(now_ns)
 
     def judge(self, now_ns: int) -> None:
-        """Fill the states from those replies of this cycle that can be true."""
+        """Fill the states from the plausible replies of this cycle and report the others."""
         steps = self.values[0] - self.states.position[self.rows]
         for index in self.jumps.suspects(steps, self.fresh):
             elapsed_ns = int(self.at_ns[index] - self.shown_ns[index])
@@ -110,7 +110,9 @@ class Samples:
 
 
 class BusSamples:
-    """The part of one bus: its servos are columns of the arrays of `Samples`; its devices' blocks follow."""
+    """Samples of one bus, as views of the arrays of `Samples`: first its servos, then the blocks of its
+    devices.
+    """
 
     def __init__(self, number: int, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
@@ -121,37 +123,37 @@ class BusSamples:
         self.fresh = samples.fresh[here]
         """True where an intact reply arrived in this cycle; shape (servos of the bus,)."""
         self.blocks_fresh = samples.devices.fresh[blocks]
-        """The same of the devices' blocks; shape (blocks of the bus,)."""
+        """True for each block of a device that arrived in this cycle; shape (blocks of the bus,)."""
         self.blocks_at_ns = samples.devices.at_ns[blocks]
-        """Time at which the newest reply of each block arrived; -1 while none ever did."""
+        """Arrival time of the newest reply of each block; -1 before the first reply."""
         self.at_ns = samples.at_ns[here]
-        """Time at which the newest plausible reply arrived; -1 while none ever did."""
+        """Arrival time of the newest plausible reply; -1 before the first reply."""
 
     def clear(self) -> None:
-        """Begin a cycle: nothing has arrived."""
+        """Begin a cycle: mark all states as not received."""
         self.fresh[:] = False
         self.blocks_fresh[:] = False
 
     def restart_count(self, servo: int) -> None:
-        """Believe the next position of a servo, however far it is: a reboot took it back into one turn."""
+        """Accept the next position of a servo at any distance: a reboot reset its turn count."""
         self._samples.recounted_ns[self._here][servo] = self.at_ns[servo]
 
     def arrived(self, member: int) -> bool:
-        """Check whether an intact reply of a member of the plan arrived in this cycle."""
+        """Return True if an intact reply of a member of the plan arrived in this cycle."""
         servos = len(self.fresh)
         return bool(self.fresh[member] if member < servos else self.blocks_fresh[member - servos])
 
     def take(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
-        """Keep what a member of the plan, by its index, answered to the read of its state."""
+        """Store the state that a member of the plan, by its index, has sent."""
         self._samples.take(self._number, servo, bytes(data), at_ns)
 
 
 class Jumps:
-    """Checks whether a position can be true: one that is further from the last than the servo can have turned
-    is no sample. Steps are in the order of the plans' servos.
+    """Plausibility check of positions: a servo cannot move further than its speed allows.
 
-    What is possible is the servo's highest speed limit times the time since its last good sample, so that a
-    servo that really stands elsewhere is believed again after a moment.
+    A step is possible up to the servo's highest speed limit times the time since its last good sample. A
+    servo that really is elsewhere is therefore accepted again after a moment. Steps are in the order of the
+    plans' servos.
     """
 
     def __init__(self, plans: Iterable[BusPlan], reports: ReportSink) -> None:
@@ -162,17 +164,17 @@ class Jumps:
         ratios = np.array([servo.ratio for _, servo in both], dtype=np.float64)
         self._fastest = np.array(speeds, dtype=np.float64) * ratios
         self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD * ratios
-        """rad or m; a step up to this is possible, whenever the sample before was."""
+        """Largest step that is possible at any time after a good sample, rad or m."""
         self._mask = np.zeros(len(both), dtype=np.bool_)
         self._reported_ns = [-REPORT_AGAIN_NS] * len(both)
 
     def suspects(self, steps: Floats, fresh: NDArray[np.bool_]) -> list[int]:
-        """Return which of the `fresh` servos made a step that may be too far, by index; steps in rad."""
+        """Return the indices of the `fresh` servos with a step that may be too large; steps in rad or m."""
         np.greater(np.abs(steps), self.always_possible, self._mask)
         return np.flatnonzero(self._mask & fresh).tolist()
 
     def can_be(self, index: int, step: float, elapsed_ns: int, now_ns: int) -> bool:
-        """Check whether a servo can have made a step in this time; report it if it cannot."""
+        """Return True if a servo can have made a step within `elapsed_ns`; report it otherwise."""
         reach = self.always_possible[index] + self._fastest[index] * elapsed_ns * 1e-9
         if abs(step) <= reach:
             return True
@@ -198,7 +200,7 @@ def _in_wheel_mode(servo: ServoPlan) -> float:
 
 
 def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:
-    """Return the highest speed of a servo, rad/s: a profile may be set to more than the velocity limit.
+    """Return the highest speed of a servo, rad/s. A profile may be faster than the velocity limit.
 
     Velocity Limit (44) of an X servo ends at 1023, Profile Velocity (112) at 32767 (e-Manual XM430-W350).
     """
