@@ -1,5 +1,5 @@
-"""Control: the loop and what it calls in each cycle (steering, controllers, gate, policies).
+"""Control: the loop and the modules that it calls in each cycle (steering, controllers, gate, policies).
 
-Nothing here knows servos or bytes: it sees the arrays of the cycle's record and the interface of the
-hardware.
+This package does not depend on servos or protocols. It works on the arrays of the cycle's record and on the
+hardware interface.
 """

@@ -1,6 +1,6 @@
-"""Anchoring: joints that may have been moved without the loop begin again where they are.
+"""Anchoring: restart joints at their measured positions after they may have moved without the loop.
 
-Decided by the record of the cycle, so that a replay decides the same.
+Decisions depend on the cycle's record only, so a replay makes the same ones.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 MOVED_DISTANCES: Mapping[JointUnit, float] = {ROTARY: 0.0873, LINEAR: 0.005}
-"""5 deg or 5 mm: a joint that was moved farther in a pause begins again where it is. One that follows an
-effort coasts or sags by less. [i]"""
+"""5 deg or 5 mm: a joint that moved farther in a pause restarts at its measured position. A joint in effort
+mode coasts or sags by less. [i]"""
 _HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
-"""Modes in which a servo with torque keeps its goal while the controllers stand still."""
+"""Modes in which a servo with torque keeps its goal while the controllers are paused."""
 
 
 class Anchoring:
-    """Sets goals to where joints are, and starts the controllers of these joints again."""
+    """Sets goals to measured positions and restarts the controllers of these joints."""
 
     def __init__(self, context: ControlContext, switching: Switching, gate: Gate) -> None:
         joints, record = context.plan.joints, context.record
@@ -38,14 +38,14 @@ class Anchoring:
         self._record = record
         self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
         self._paused_at: Floats = record.states.position.copy()
-        """Where each joint stood first in the pause."""
+        """Position of each joint when it first came to rest in the pause, rad or m."""
         self._coasts = np.zeros(len(self._names), dtype=np.bool_)
-        """Joints that have not stood yet in the pause."""
+        """Joints that have not come to rest yet in the pause."""
 
     def anchor_given(self) -> None:
-        """Anchor the joints that were given torque, and let their servos get goals; after a read.
+        """Anchor the joints whose torque was just enabled, and send goals to their servos again.
 
-        One whose reply is missing waits for it: it is not known where the joint is.
+        Called after a read. A joint without a valid reply is anchored later: its position is not known.
         """
         states = self._record.states
         given = (states.torque == Torque.GIVEN) & states.valid
@@ -54,22 +54,23 @@ class Anchoring:
             self._hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def begin_pause(self) -> None:
-        """Remember where the joints are when the controllers stop."""
+        """Store the joint positions at the start of a pause."""
         self._coasts.fill(True)
         self.watch_pause()
         np.copyto(self._paused_at, self._record.states.position)
 
     def watch_pause(self) -> None:
-        """Follow the joints that have not stood yet; in each cycle of a pause.
+        """Update the stored positions of joints that still coast. Called in each cycle of a pause.
 
-        A wheel coasts after its goal became 0: nobody has moved it. One without a measured speed stands.
+        A wheel coasts after its goal became 0, which must not count as moved by hand. A joint without a
+        measured speed counts as at rest.
         """
         states = self._record.states
         self._coasts &= np.abs(states.velocity) > self._still
         np.copyto(self._paused_at, states.position, where=self._coasts)
 
     def end_pause(self) -> None:
-        """Anchor the joints that do not hold a position and were moved in the pause."""
+        """Anchor the joints that were moved in the pause and are not in a mode that holds a position."""
         states = self._record.states
         moved = ~np.isin(states.mode, _HOLDING) & (np.abs(states.position - self._paused_at) > self._moved)
         if moved.any():

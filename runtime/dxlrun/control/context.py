@@ -1,4 +1,4 @@
-"""Control context: the parts of one run that its loop, its controllers and the requests of clients share."""
+"""Control context: objects of one run that its loop, its controllers and client requests share."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from dxlwire.clock import Clock
 
 
 class StopFlag(msgspec.Struct):
-    """The request to stop; set by a signal's handler, seen at the next cycle."""
+    """Stop request, set by a signal handler and checked once a cycle."""
 
     requested: bool = False
 
     def request(self) -> None:
-        """Ask the loop to end orderly."""
+        """Request an orderly end of the loop."""
         self.requested = True
 
 
 class Supervision(Protocol):
-    """The process of a loop, as the loop sees it: requests the stop, and shows others that the loop lives."""
+    """Interface of the loop to its process: the stop request and the heartbeat for the guardian."""
 
     stop: StopFlag
 
     def beat(self) -> None:
-        """Show the guardian that the loop lives; called once a cycle, and between long steps."""
+        """Send a heartbeat to the guardian. Called once a cycle and between long steps."""
 
     def limit_cycle(self, limit_ns: int) -> None:
-        """Set how long the guardian lets a cycle take from now on."""
+        """Set the guardian's timeout for a cycle, ns."""
 
     def set_period(self, period_ns: int) -> None:
-        """Adapt to another period, so that the clock's polling stays a small share of it."""
+        """Adapt the clock's polling time to a period, ns, so that it stays a small share of the period."""
 
 
 class Unsupervised:
-    """Supervision of a loop that no other process watches."""
+    """Supervision of a loop without a guardian."""
 
     def __init__(self, stop: StopFlag | None = None) -> None:
         self.stop = stop or StopFlag()
@@ -51,7 +51,7 @@ class Unsupervised:
         """Do nothing."""
 
     def limit_cycle(self, limit_ns: int) -> None:
-        """Do nothing: a cycle may take any time."""
+        """Do nothing: cycles have no timeout."""
 
     def set_period(self, period_ns: int) -> None:
         """Do nothing: the clock does not poll."""
@@ -59,25 +59,25 @@ class Unsupervised:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlContext:
-    """One robot under control, from its assembly to the end of its loop.
+    """Objects of one run, from its assembly to the end of its loop.
 
-    Built once a run. Its users bind what a cycle reads when they are built.
+    Built once a run. Its users bind the arrays that a cycle reads when they are constructed.
     """
 
     plan: LoopPlan
     record: CycleRecord
-    """Memory of the cycle, with the arrays that all share."""
+    """Record of the current cycle, with the shared arrays."""
     clock: Clock
     hardware: Hardware
-    """Started before and stopped after the loop by what built it."""
+    """Started before the loop and stopped after it by the code that built it."""
     events: EventSink
     command_log: CommandSink = field(default_factory=NoCommands)
-    """Commands that cycles took."""
+    """Log of the commands that cycles executed."""
     inbox: Inbox = field(default_factory=NoInbox)
-    """Commands of clients, and the way of their answers."""
+    """Queue of client commands and their answers."""
     supervision: Supervision = field(default_factory=Unsupervised)
     schedule: Schedule = field(init=False)
-    """When cycles are due, their period, and the controllers' time."""
+    """Deadlines, period and the controllers' time."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "schedule", schedule_of(self.plan))

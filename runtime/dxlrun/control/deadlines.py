@@ -1,4 +1,4 @@
-"""Deadlines: the waits of the loop, for programs that measure this machine."""
+"""Deadlines: the loop's waits without a robot, for programs that measure this machine."""
 
 from __future__ import annotations
 
@@ -8,21 +8,24 @@ from dxlwire.clock import Clock, MonotonicClock
 
 
 class Deadlines:
-    """One deadline each period, waited for with the clock and the schedule of the loop.
+    """Periodic deadlines with the clock and the schedule of the loop.
 
-    Deadlines that passed before the wait for them began are left out, as in a run with `overrun: skip`.
-    The first is one period after the first call of `wait`.
+    Deadlines that passed before `wait` was called are skipped, as in a run with `overrun: skip`. The first
+    deadline is one period after the first call of `wait`.
+
+    Args:
+        period_ns: Period.
+        clock: Replaces the machine's clock in tests.
     """
 
     def __init__(self, period_ns: int, clock: Clock | None = None) -> None:
-        """`clock`: waits instead of the machine's clock, for tests."""
         self._machine = MonotonicClock()
         self._clock = clock or self._machine
         self._schedule = Schedule(period_ns)
         self._started = False
 
     def measure_margin(self, most_ns: int | None) -> Grant:
-        """Measure for how long the clock is polled before a deadline, and poll for that time from now on.
+        """Measure and set the time for which the clock is polled before a deadline.
 
         Args:
             most_ns: Longest time, as `SchedulerPlan.polling_ns`; None: a share of the period.
@@ -31,11 +34,11 @@ class Deadlines:
 
     @property
     def margin_ns(self) -> int:
-        """How long before a deadline the clock is polled."""
+        """Polling time before a deadline, ns."""
         return self._machine.spin_ns
 
     def wait(self) -> tuple[int, int]:
-        """Wait for the next deadline; return it and the time after the wake-up, ns."""
+        """Wait for the next deadline; return the deadline and the wake-up time, ns."""
         schedule, clock = self._schedule, self._clock
         if self._started:
             schedule.advance(schedule.following(clock.now_ns(), "skip"))

@@ -1,4 +1,4 @@
-"""Halt: every joint comes to a stop within its limits and holds, while the run goes on."""
+"""Halt: stop and hold all joints within their limits while the run continues."""
 
 from __future__ import annotations
 
@@ -14,45 +14,49 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 STILL_SPEEDS: Mapping[JointUnit, float] = {ROTARY: 0.1, LINEAR: 0.003}
-"""A slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less, with
-noise of some steps. [i]"""
+"""rad/s or m/s; a slower joint counts as at rest. Servos report velocity in steps of 0.024 rad/s (XM430) or
+less, with noise of some steps. [i]"""
 STILL_NS = 100_000_000
-"""For how long all joints must be that slow, with goals at rest."""
+"""Time for which all joints must be at rest, with constant goals."""
 HALT_NS = 5_000_000_000
-"""A halt is answered after this time at the latest, as joints may change their modes for so long."""
+"""Timeout of a halt; joints may take so long to change their modes."""
 _HOLDING = (Mode.POSITION, Mode.VELOCITY)
 _FREE = (*LIMP, *OFFLINE)
-"""Joints that do not count: what moves them is not the run, or not known."""
+"""Torque states of joints that a halt ignores: the run does not move them, or their state is unknown."""
 
 
 class Halt:
-    """Deactivates all controllers that command joints, and watches the joints until they stand still.
+    """Deactivates all controllers that command joints, and watches the joints until they are at rest.
 
-    Without a command the gate lets goals come to rest within `limits.acceleration`, and brings velocities to
-    0; joints in other modes are brought into their rest modes as after any deactivation. The goal of a joint
-    without an acceleration limit may be far ahead of it, where its servo goes there at a lower speed: while
-    such a joint moves toward its goal, the goal becomes where the joint is.
+    Without a command, the gate brings goals to rest within `limits.acceleration` and velocities to 0. Joints
+    in other modes enter their rest modes, as after any deactivation. The goal of a joint without an
+    acceleration limit may be far ahead of a slow servo. While that joint moves toward its goal, its goal is
+    set to the measured position.
+
+    Args:
+        context: The run.
+        switching: Deactivates the controllers.
+        answer: Sends the answer to a command, by the command's number.
     """
 
     def __init__(
         self, context: ControlContext, switching: Switching, answer: Callable[[int, Answer], None]
     ) -> None:
-        """`answer` sends a client an answer, by the number of its command."""
         joints = context.plan.joints
         self._joints = tuple(joint.name for joint in joints)
         self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
         self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
-        """As fast as that a joint stands still, rad/s or m/s."""
+        """Speed below which each joint counts as at rest, rad/s or m/s."""
         self._switching = switching
         self._record = context.record
         self._answer = answer
         self.waiting: list[int] = []
-        """Commands that wait for the joints to stand still."""
+        """Numbers of the commands that wait until the joints are at rest."""
         self._began_ns = self._still_ns = 0
         self._before = b""
 
     def halt_joints(self, number: int) -> Refusal | Waiting:
-        """Deactivate the controllers, upper ends of chains first; the joints are watched from now on."""
+        """Deactivate the controllers, upper ends of chains first, and start to watch the joints."""
         refusal = self._switching.switch_controllers((), self._switching.commanding(self._joints))
         if isinstance(refusal, Refusal):
             return refusal
@@ -63,8 +67,10 @@ class Halt:
         return Waiting(())
 
     def watch(self) -> None:
-        """Look at the joints after a read while commands wait; answer when they have stood still for
-        a while, or time is over."""
+        """Check the joints, and answer when they have been at rest for STILL_NS or after the timeout.
+
+        Called after a read while commands wait.
+        """
         record, now_ns = self._record, self._record.woken_ns
         states, goals = record.states, record.goals
         count = ~np.isin(states.torque, _FREE)
@@ -97,7 +103,7 @@ class Halt:
             )
 
     def end(self) -> None:
-        """Answer what the run's end interrupts."""
+        """Refuse the waiting commands because the run ends."""
         self._end(Refusal(Code.RUN_ENDING))
 
     def _end(self, answer: Answer) -> None:

@@ -1,4 +1,4 @@
-"""Controllers in a run: plug-ins that offer them, claims, their graph, and the manager that updates them.
+"""Controllers in a run: plug-in discovery, claims, the controller graph, switching, and the manager.
 
 The controllers themselves are plug-ins; the standard ones are in plugins/dxlrun_controllers.
 """

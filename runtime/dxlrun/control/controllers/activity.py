@@ -1,9 +1,9 @@
-"""Activity: the controller whose code runs now, shown to other processes; what that code must not start.
+"""Activity: publish which controller's code runs, and refuse threads and processes that it starts.
 
-A thread beside the loop would be handed the interpreter in the middle of a cycle, and a forked child has the
-loop's memory and stops the loop while it is made. Both are refused to controllers while the robot runs: where
-Python starts them the start itself fails; threads that foreign machine code starts are counted after the
-call, its processes are not seen. A process that a controller needs is started in on_configure.
+A second thread could take the interpreter lock in the middle of a cycle. A fork copies the loop's memory map
+and stalls the loop for that time. Controllers must not start either while the robot runs. A start by Python
+code fails at once. Threads of native code are counted after the call; processes of native code are not
+detected. A controller starts the processes that it needs in on_configure.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ _TRACEBACK = 6000
 P = ParamSpec("P")
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
 """The last method before the robot runs."""
-# found at once, twice a call
+# Bound here because each call of a controller uses both twice.
 _ident, _process = threading.get_ident, os.getpid
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Return whether what foreign code seems to raise is Ctrl-C of the process that it runs in.
+    """Return whether an exception from foreign code is a Ctrl-C of its process.
 
-    In the loop's own process SIGINT is ignored: there, as for all other exceptions, it is that code's. A
-    handler of this package raises in a frame of its own, which that code cannot be the last of.
+    The loop's own process ignores SIGINT, so a KeyboardInterrupt is the foreign code's own there. A signal
+    handler of this package raises in its own frame, so the last frame of the traceback is in dxlrun.
     """
     handler = signal.getsignal(signal.SIGINT)
     if type(error) is not KeyboardInterrupt or handler is signal.SIG_IGN:
         return False
     if handler is signal.default_int_handler:
-        return True  # its frame is not seen
+        return True  # the default handler is C code without a Python frame
     raised_in = [
         str(frame.f_globals.get("__name__", "")) for frame, _ in traceback.walk_tb(error.__traceback__)
     ]
@@ -49,14 +49,16 @@ def is_interrupt(error: BaseException) -> bool:
 
 
 class Activity:
-    """What is called now of which controller.
+    """Calls methods of controllers and publishes the current call to other processes.
 
-    `count_threads` returns the number of threads, in a process that must have no other than the loop's;
-    without it other threads come and go.
+    Args:
+        page: Shared memory for the name of the controller and of the method; None publishes nothing.
+        count_threads: Returns the number of threads of this process. Used in a process that must not have
+            more threads after a call than before; None allows other threads.
     """
 
     guarded: ClassVar[Activity | None] = None
-    """The one whose controller must start nothing now; a process runs one loop at a time."""
+    """Instance whose controller must not start threads or processes now. A process runs only one loop."""
 
     def __init__(self, page: Heartbeat | None = None, count_threads: Callable[[], int] | None = None) -> None:
         self._page = page
@@ -65,19 +67,19 @@ class Activity:
         self._process = _process()
         self._names: dict[int, str] = {}
         self.thread = 0
-        """Which thread calls the controller."""
+        """Identifier of the thread that calls the controller."""
         self.refused = ""
-        """What was refused to the controller in this call."""
+        """Thread or process that the controller tried to start in this call; empty: none."""
         _guard()
 
     def name_controller(self, place: int, name: str) -> None:
-        """Name the controller in this place, before anything of it is called."""
+        """Set the name of the controller at a place. Must precede the first call of the controller."""
         self._names[place] = name
         if self._page is not None:
             self._page.name_controller(place, name)
 
     def show(self, place: int, method: ControllerMethod) -> None:
-        """Show what is called next of the controller in this place."""
+        """Publish the method that is called next for the controller at a place."""
         if self._page is not None:
             self._page.call(place, method)
 
@@ -90,10 +92,18 @@ class Activity:
         *arguments: P.args,
         **named: P.kwargs,
     ) -> None:
-        """Call a method of the controller in this place; `kind` is that of the command it is given.
+        """Call a method of the controller at a place.
 
-        Raises ControllerFault for what it raises, and for what it starts while the robot runs. A child that
-        it forked and that came back from the call ends here: there is one loop only.
+        A forked child that returns from the call exits here: there must be only one loop.
+
+        Args:
+            place: Place of the controller.
+            method: Method that is called, for other processes and messages.
+            kind: Kind of the command that is passed; empty: no command.
+            call: The bound method, with its arguments.
+
+        Raises:
+            ControllerFault: The method raised, or started a thread or a process while the robot runs.
         """
         page = self._page
         if page is not None:
@@ -131,7 +141,7 @@ class Activity:
                 f"{started} in {what}: while the robot runs that would stop the loop; "
                 "start a process in on_configure instead"
             )
-        elif isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
+        elif isinstance(raised, ControllerFault):  # raised by the context, with a complete sentence
             text = str(raised)
         else:
             error = " ".join(f"{type(raised).__name__}: {raised}".split())
@@ -143,14 +153,14 @@ class Activity:
 
 
 def _line_of(raised: BaseException | None) -> str:
-    """Return the line of the author's code that raised, in brackets, or that called what raised."""
+    """Return the innermost line of the author's code in the traceback, in brackets; empty: none."""
     frames = traceback.extract_tb(None if raised is None else raised.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_AUTHORS)]
     return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
 
 
 _NOT_THE_AUTHORS = (str(Path(__file__).parents[2]), str(Path(np.__file__).parent))
-"""Folders of code that an author of a controller cannot correct: dxlrun's, and numpy's."""
+"""Folders of dxlrun and numpy: lines that the author of a controller cannot correct."""
 _STARTS = {
     "os.fork": "a child process",
     "os.forkpty": "a child process",
@@ -162,11 +172,11 @@ _STARTS = {
     "_thread.start_new_thread": "a thread",
     "_thread.start_joinable_thread": "a thread",
 }
-"""Audit events (docs.python.org, Audit events table) that come before something is started."""
+"""Audit events of process and thread starts (docs.python.org, Audit events table)."""
 
 
 def _refuse(what: str) -> None:
-    """Raise RuntimeError in a controller that starts something while the robot runs."""
+    """Raise RuntimeError if the caller is a controller while the robot runs."""
     activity = Activity.guarded
     if activity is not None and activity.thread == _ident():
         activity.refused = what
@@ -180,10 +190,10 @@ def _audit(event: str, _: tuple[object, ...]) -> None:
 
 @cache
 def _guard() -> None:
-    """Check every start of a thread or a process from now on.
+    """Install the checks for the start of threads and processes, once a process.
 
-    Before Python 3.12 no audit event reports a thread, and none reports the processes of multiprocessing
-    that are not forked.
+    Audit events alone are not sufficient: before Python 3.12 none reports threads, and none reports
+    multiprocessing's processes that are not forked.
     """
     sys.addaudithook(_audit)
     start: Callable[[threading.Thread], None] = threading.Thread.start

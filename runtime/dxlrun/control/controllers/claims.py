@@ -1,7 +1,7 @@
-"""Claims: which controllers may be active together; one commander a servo, and one a reference.
+"""Claims: check which controllers may be active together. Each servo and each reference has one commander.
 
 A controller that is `into` others commands their references: it is above them. It is never active without
-them, so it enters after and leaves before them, in the same step.
+them, so it enters after them and leaves before them, in the same step.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dxlwire.modes import Mode, mode_of
 
 
 class Conflict(msgspec.Struct, frozen=True):
-    """Two controllers that claim the same joint, or the same reference of it."""
+    """Two controllers that claim the same joint or the same reference."""
 
     joint: str
     holder: str
     other: str
     reference: str = ""
-    """`arm_pid/shoulder/position`, or `light/led` of a device; empty: they claim its servo."""
+    """`arm_pid/shoulder/position`, or `light/led` for a device; empty: both claim the servo."""
 
     def __str__(self) -> str:
         what = self.reference or f"joint {self.joint}"
@@ -31,11 +31,11 @@ class Conflict(msgspec.Struct, frozen=True):
 
 
 def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
-    """Return every joint, and every reference, that a later controller claims although an earlier one has it.
+    """Return each joint and reference that a later controller claims although an earlier one holds it.
 
-    A claim of one interface of a servo keeps all others of the joint away too: position and speed of a servo
-    belong together, and a stale speed of another controller would move the robot in an unexpected way. The
-    interfaces of a reference are claimed one by one: the lower controller makes one command of them.
+    A claim of one interface of a servo claims the whole joint: a servo combines position and speed, so a
+    stale speed of another controller would move the robot unexpectedly. Interfaces of a reference are claimed
+    one by one: the lower controller combines them into one command.
     """
     holders: dict[tuple[str, str], str] = {}
     found: list[Conflict] = []
@@ -50,10 +50,9 @@ def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
 
 
 def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]:
-    """Yield joints with the claimed reference; with none where the servo is claimed.
+    """Yield pairs of joint and claimed reference. The reference is empty if the servo is claimed.
 
-    Of controllers that are into several ones each joint is claimed where it is exported, as far as these are
-    among `named`.
+    A controller that is into several ones claims each joint at the one in `named` that exports it.
     """
     for command in claimant.source_commands:
         yield "", command
@@ -65,14 +64,14 @@ def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]
         for name in claimant.into:
             lower = named.get(name)
             if lower is claimant:
-                continue  # a mistake that is refused
+                continue  # invalid, and refused elsewhere: `update_order` finds the circle
             if lower is None or (joint in lower.joints and set(claimant.command) <= set(lower.reference)):
                 for interface in claimant.command:
                     yield joint, f"{name}/{joint}/{interface}"
 
 
 def conflicts_text(found: Iterable[Conflict]) -> str:
-    """Return conflicts in words: each pair of controllers once, with its first joint; empty for none."""
+    """Return the conflicts as text: each pair of controllers once, with its first joint. Empty for none."""
     pairs: dict[tuple[str, str], list[Conflict]] = {}
     for conflict in found:
         pairs.setdefault((conflict.holder, conflict.other), []).append(conflict)
@@ -82,9 +81,10 @@ def conflicts_text(found: Iterable[Conflict]) -> str:
 
 
 def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
-    """Return the mode that each claimed joint needs, by its name; other joints are not in it.
+    """Return the required mode of each claimed joint, by joint name.
 
-    Raises ValueError for command interfaces that no mode has together.
+    Raises:
+        ValueError: No mode has this combination of command interfaces.
     """
     return {
         joint: mode_of(claimant.command)
@@ -95,34 +95,39 @@ def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
 
 
 def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPlan]) -> dict[str, Mode]:
-    """Return the mode in which each joint begins a run, by its name: what the controllers need that are
-    active from the start, else its rest mode."""
+    """Return the initial mode of each joint, by joint name.
+
+    That is the mode that an initially active controller requires, otherwise the joint's rest mode.
+    """
     claimed = claimed_modes(controller for controller in controllers if controller.active)
     return {joint.name: claimed.get(joint.name, joint.rest) for joint in joints}
 
 
 class Step(msgspec.Struct, frozen=True):
-    """Controllers that leave and enter together, each list in the order in which they do."""
+    """Controllers that leave and enter together, in execution order."""
 
     leave: tuple[str, ...]
     enter: tuple[str, ...]
 
 
 class Standing(msgspec.Struct, frozen=True):
-    """The controllers as they stand, by their names: what may change from here, and what goes along."""
+    """Snapshot of the controllers and their states, by name. Plans switches from this state."""
 
     known: Plans
     active: Plans
     entering: Plans = {}
-    """Those that will be active when their joints are in their modes."""
+    """Controllers that become active as soon as their joints are in the required modes."""
 
     @property
     def engaged(self) -> Plans:
-        """Those that have their claims: active and entering ones."""
+        """Controllers that hold claims: active and entering ones."""
         return {**self.active, **self.entering}
 
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> Step | Refusal:
-        """Return what a switch does: those below that are not active enter too; or why it is refused."""
+        """Return the step of a switch, or its refusal.
+
+        Inactive controllers below the activated ones enter too.
+        """
         known, engaged = self.known, self.engaged
         for code, names in (
             (Code.UNKNOWN_CONTROLLER, [name for name in (*activate, *deactivate) if name not in known]),
@@ -151,10 +156,11 @@ class Standing(msgspec.Struct, frozen=True):
         return Step(uppers_first(deactivate, known), enter)
 
     def request(self, names: Sequence[str]) -> Step | Refusal:
-        """Return how controllers take over because another one requests it, or why that is refused.
+        """Return the step of a takeover that a controller requested, or its refusal.
 
-        All that claim what these and those below them claim leave, and those above them. What is active, or
-        waits for modes, stays as it is.
+        Controllers leave if they hold a claim that the requested ones or those below them need, together with
+        the controllers above them. Requested controllers that are already active or entering stay as they
+        are.
         """
         known = self.known
         needed = [known[name] for name in lowers_first(names, known)]
@@ -170,14 +176,20 @@ class Standing(msgspec.Struct, frozen=True):
         enter = tuple(plan.name for plan in needed if plan.name not in engaged)
         if late := tuple(lower for name in enter for lower in known[name].into if lower in self.entering):
             return Refusal(Code.NOT_ACTIVE_YET, {"controller": late})
-        # none of `needed` leaves: they claim nothing twice, and what is below them is of them
+        # None of `needed` leaves: their claims are free of conflicts, and all controllers below are included.
         return self._step(self._displaced(enter), enter)
 
     def fall_back(self, fallback: str, taken: Sequence[str], failed: Collection[str]) -> Step | None:
-        """Return how a fallback takes over for controllers that were taken out; None: it cannot.
+        """Return the step by which a fallback replaces controllers, or None if it cannot take over.
 
-        Those below them leave too where they hold what the fallback claims, unless one that goes on uses
-        them. `failed` have broken their contract: none of them comes back by a fault of another.
+        Controllers below the replaced ones leave too if they hold a claim of the fallback. They must not be
+        in use by a controller that stays.
+
+        Args:
+            fallback: The fallback.
+            taken: Controllers that were deactivated because of a fault.
+            failed: Controllers that have broken their contract. The fault of another one never reactivates
+                them.
         """
         known, engaged = self.known, self.engaged
         if fallback in engaged:
@@ -192,7 +204,7 @@ class Standing(msgspec.Struct, frozen=True):
         return self._step(leave, enter)
 
     def only_under(self, taken: Sequence[str]) -> set[str]:
-        """Return the controllers below these that no other one which goes on uses."""
+        """Return the controllers below these that no remaining controller uses."""
         plans, engaged = tuple(self.known.values()), self.engaged
         free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()
         while kept := {name for name in free if commander(name, _without(engaged, free))}:
@@ -200,7 +212,7 @@ class Standing(msgspec.Struct, frozen=True):
         return free
 
     def _displaced(self, enter: Sequence[str]) -> set[str]:
-        """Return the controllers that hold what these claim, and those above them."""
+        """Return the controllers whose claims conflict with these, and the controllers above them."""
         engaged = self.engaged
         claimants = [*engaged.values(), *(self.known[name] for name in enter)]
         leave = {conflict.holder for conflict in conflicts(claimants)}

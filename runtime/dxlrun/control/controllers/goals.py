@@ -1,6 +1,6 @@
-"""Goals: what controllers work on, one at a time each; numbered from 1.
+"""Goals: commands that a controller pursues until they end, one at a time, numbered from 1.
 
-Events report when a goal is accepted and how it ends; the topic /goals has its progress beside them.
+Events report that a goal was accepted and its outcome. The topic /goals has its progress too.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
 from dxlwire.joint_unit import ROTARY
 
 FEEDBACK_NS = 100_000_000
-"""Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""
+"""Shortest time between two progress reports of a goal, ns of the run's clock: 10 Hz."""
 GOALS_TOPIC = "/goals"
 KEPT = 256
-"""Of so many goals that ended it is known how."""
+"""Number of ended goals whose outcome is kept."""
 _LONGEST_TEXT = 500
 _UNREACHED = (Outcome.MISSED, Outcome.ABORTED)
 CERTAIN_NS = 500_000_000
-"""How long `reached` waits for replies and torque that are in doubt; at least LOST_CYCLES periods. [i]"""
+"""Longest wait for missing replies and uncertain torque before a goal ends; at least LOST_CYCLES periods.
+[i]"""
 
 
 @dataclass(slots=True)
 class GoalStatus:
-    """Message of the topic /goals: a goal is accepted, goes on, or has ended."""
+    """Message of the topic /goals: a goal was accepted, runs, or has ended."""
 
     header: Header = field(default_factory=Header)
     goal: int = 0
@@ -44,50 +45,51 @@ class GoalStatus:
     kind: str = ""
     origin: str = ""
     status: str = ""
-    """`accepted`, `running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    """`accepted`, `running`, or its outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     progress: float = 0.0
     """0..1"""
     error: float = math.nan
-    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
+    """Largest distance from the desired state; of an ended goal, the worst joint's distance from the goal.
+    SI units."""
     joint: str = ""
     text: str = ""
 
 
 class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one controller is given of a motion: commands by time; one that is a goal stands alone."""
+    """Commands of a motion for one controller, with their times, or a single command that is a goal."""
 
     controller: str
     kind: str
     at_ns: tuple[int, ...]
-    """When each command is handed over, since the motion was taken; they do not decrease."""
+    """Time of each command since the start of the motion; not decreasing."""
     sizes: tuple[int, ...]
-    """How many numbers each command has."""
+    """Number of float64 values of each command."""
     end_ns: int = 0
-    """When the part is over."""
+    """End of the part since the start of the motion."""
     positions: tuple[float | None, ...] = ()
-    """Goal of each joint of the controller at the end, rad or m, None: it has none; empty: the part has no
-    positions."""
+    """Final position of each joint of the controller, rad or m; None: no position for this joint. Empty: the
+    part has no positions."""
 
 
 class PlayedMotion(msgspec.Struct):
-    """Commands that the runtime hands to a controller by time: a goal that no controller sees."""
+    """Timed commands for a controller. The runtime, not the controller, pursues the goal."""
 
     goal: RunningGoal
     part: PlayedPart
     commands: tuple[NDArray[np.float64], ...]
     begun_ns: int
-    """Time of the controllers."""
+    """Start, ns of the controllers' time."""
     next: int = 0
 
     def due(self, time_ns: int) -> NDArray[np.float64] | None:
-        """Return the next command whose time has come."""
+        """Return the next command if it is due, else None."""
         if self.next < len(self.commands) and self.begun_ns + self.part.at_ns[self.next] <= time_ns:
             self.next += 1
             return self.commands[self.next - 1]
         return None
 
     def report(self, time_ns: int) -> None:
-        """Report its progress; at its end hand the goal over to be judged."""
+        """Report the progress. After the last command, let the joints' states decide the outcome."""
         passed_ns, end_ns = time_ns - self.begun_ns, self.part.end_ns
         if self.goal.is_judged:
             return
@@ -100,17 +102,17 @@ class PlayedMotion(msgspec.Struct):
 
 
 class Commanded(NamedTuple):
-    """What a controller commands now, directly or through other controllers."""
+    """Current commands of a controller, directly or through other controllers."""
 
     joints: tuple[str, ...] = ()
     positions: Floats | None = None
-    """rad or m, before any limit; None: it commands no positions"""
+    """rad or m, before any limit; None: no position commands."""
     velocities: Floats | None = None
-    """rad/s or m/s; None: it commands no velocities, or as the speeds of its positions"""
+    """rad/s or m/s; None: no velocity commands, or they are the speeds of position commands."""
 
     @classmethod
     def by_interfaces(cls, joints: tuple[str, ...], interfaces: Sequence[str], commands: Commands) -> Self:
-        """Return what `commands` are for joints whose command interfaces are these."""
+        """Return the values of `commands` that belong to these command interfaces."""
         if not interfaces:
             return cls()
         if "position" in interfaces:
@@ -123,10 +125,10 @@ class _Target(NamedTuple):
 
     joint: JointPlan
     column: int
-    """Its place among the joints of the controller."""
+    """Index among the controller's joints."""
     row: int
     position: float
-    """As it was asked, before any limit, rad or m; NaN: no position."""
+    """Requested position before any limit, rad or m; NaN: no position."""
     tolerance: float
     """rad or m"""
     rest_speed: float
@@ -134,22 +136,22 @@ class _Target(NamedTuple):
 
 
 class _Judgement(NamedTuple):
-    """A goal whose motion has ended: what it is judged by, and until when it may be reached."""
+    """Criteria and deadlines for the outcome of a goal whose motion has ended."""
 
     targets: tuple[_Target, ...]
     text: str
     settle_ns: int
-    """How long a joint may take to come within its tolerance."""
+    """Settling time: a joint may take so long to come within its tolerance."""
     back_ns: int
-    """Last time at which a lost joint may be back, ns of the controllers' time; it settles from then on."""
+    """Deadline for the return of a lost joint, ns of the controllers' time. Its settling time starts then."""
     settled_ns: int
-    """Last time at which a joint may still come within its tolerance, ns of the controllers' time."""
+    """Deadline for joints to come within their tolerances, ns of the controllers' time."""
     certain_ns: int
-    """Last time at which a missing reply, or a torque in doubt, may become certain, ns of the same time."""
+    """Deadline for missing replies and uncertain torque, ns of the controllers' time."""
 
 
 class RunningGoal:
-    """One goal, as its controller sees it (see `controller.Goal`); after its end nothing changes it."""
+    """One goal; implements `controller.Goal`. It does not change any more after it has ended."""
 
     def __init__(self, goals: Goals, number: int, controller: str, kind: str, origin: str) -> None:
         self.number = number
@@ -157,11 +159,11 @@ class RunningGoal:
         self.kind = kind
         self.origin = origin
         self.cancelling = False
-        """True from its cancel on."""
+        """True after a cancel request."""
         self.outcome: Outcome | None = None
         """None while it runs."""
         self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""
-        """As reported last."""
+        """Values of the last report."""
         self.judgement: _Judgement | None = None
         """None until the motion has ended."""
         self.accepted_ns = goals.time_ns
@@ -171,7 +173,7 @@ class RunningGoal:
 
     @property
     def is_judged(self) -> bool:
-        """True from the end of the motion on: the runtime decides how the goal ends."""
+        """True after the end of the motion, when the runtime decides the outcome."""
         return self.judgement is not None
 
     def feedback(self, progress: float, error: float = math.nan) -> None:
@@ -192,7 +194,7 @@ class RunningGoal:
         tolerances: GoalTolerances | None = None,
         text: str = "",
     ) -> None:
-        """Let the joints' states decide how the goal ends, see `controller.Goal.judge`."""
+        """Let the joints' states decide the outcome, see `controller.Goal.judge`."""
         if self.outcome is None and not self.is_judged:
             self._goals.begin_judging(self, positions, joints, tolerances, text)
 
@@ -204,9 +206,9 @@ class RunningGoal:
         error: float = math.nan,
         joints: Sequence[str] | None = None,
     ) -> None:
-        """Report the result; that of a goal that has ended already is ignored.
+        """End the goal with an outcome. Ignored if the goal has already ended.
 
-        Reached and missed are judged by the joints' states, see `controller.Goal.end`.
+        `REACHED` is verified by the joints' states, see `controller.Goal.end`.
         """
         if self.outcome is not None:
             return
@@ -218,7 +220,7 @@ class RunningGoal:
 
 
 class Goals:
-    """All goals of a run. Numbers follow from the commands alone, so a replay gives the same ones."""
+    """All goals of a run. Their numbers depend on the commands only, so a replay assigns the same ones."""
 
     def __init__(
         self,
@@ -227,15 +229,22 @@ class Goals:
         joints: Sequence[JointPlan] = (),
         commanded: Callable[[str], Commanded] = lambda controller: Commanded(),
     ) -> None:
-        """`joints` are the robot's. `commanded` returns what a controller commands now, by its name."""
+        """Create the goals of a run.
+
+        Args:
+            record: The cycle's record.
+            events: Log of events.
+            joints: All joints of the robot, in row order.
+            commanded: Returns the current commands of a controller by its name.
+        """
         self.time_ns = 0
-        """Controllers' time of this cycle, ns. Without pauses, so none shortens a settling time."""
+        """Controllers' time of this cycle, ns. It excludes pauses, which must not shorten a settling time."""
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
-        """Number of the newest one."""
+        """Number of the newest goal."""
         self.running: dict[int, RunningGoal] = {}
-        """By number; at most one of each controller."""
+        """Running goals by number; at most one for each controller."""
         self._record = record
         self._events = events
         self._ended: list[tuple[int, str, Outcome] | None] = [None] * KEPT
@@ -243,17 +252,17 @@ class Goals:
         self._status = GoalStatus()
 
     def open(self, topics: TopicLog) -> None:
-        """Announce the topic /goals, once: the first controller that takes goals is there. Allocates."""
+        """Announce the topic /goals for the first controller that accepts goals. Allocates."""
         if self._publisher is None:
             self._publisher = topics.open(GOALS_TOPIC, GoalStatus)
 
     @property
     def now_ns(self) -> int:
-        """When this cycle woke, ns of the run's clock."""
+        """Wake-up time of this cycle, ns of the run's clock."""
         return self._record.woken_ns
 
     def accept(self, controller: str, kind: str, origin: str) -> RunningGoal:
-        """Return a new goal, and report it; the one before of its controller has ended."""
+        """Create and report a goal. The previous goal of the controller must have ended."""
         self.last += 1
         goal = self.running[self.last] = RunningGoal(self, self.last, controller, kind, origin)
         text = f"goal {goal.number}: {kind} from {origin}"
@@ -261,7 +270,7 @@ class Goals:
         return goal
 
     def found(self, number: int) -> RunningGoal | Refusal:
-        """Return a goal that runs, or why there is none of this number."""
+        """Return the running goal with this number, or a refusal."""
         goal = self.running.get(number)
         if goal is not None:
             return goal
@@ -273,7 +282,7 @@ class Goals:
         return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
 
     def commanded_positions(self, controller: str) -> Floats | None:
-        """Return a copy of the positions that a controller commands now; None: it commands none."""
+        """Return a copy of a controller's current position commands, or None without any."""
         positions = self._commanded(controller).positions
         return None if positions is None else positions.copy()
 
@@ -285,7 +294,7 @@ class Goals:
         tolerances: GoalTolerances | None,
         text: str,
     ) -> None:
-        """Judge a goal whose motion has ended, from this cycle on; see `controller.Goal.judge`."""
+        """Start to judge a goal whose motion has ended; see `controller.Goal.judge`."""
         names = self._commanded(goal.controller).joints
         settle_ns = None if tolerances is None else tolerances.settle_ns
         targets, longest_ns = [], 0
@@ -312,14 +321,14 @@ class Goals:
         self._judge(goal, goal.judgement)
 
     def _settling(self, settle_ns: int) -> tuple[int, int]:
-        """Return until when joints may settle from now on, and until when states may be in doubt."""
+        """Return the deadlines for settling and for uncertain states, ns of the controllers' time."""
         settled_ns = self.time_ns + settle_ns
         return settled_ns, max(
             settled_ns, self.time_ns + max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
         )
 
     def _judge(self, goal: RunningGoal, judgement: _Judgement) -> None:
-        """End a goal as its joints' states decide; a goal that may still be reached continues."""
+        """End a goal if its joints' states decide its outcome. A goal that can still be reached continues."""
         states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.time_ns
         rows = [target.row for target in targets]
         lost = [row for row in rows if states.torque.item(row) == Torque.LOST]
@@ -350,10 +359,10 @@ class Goals:
         self._close(goal, outcome, text, joint, error)
 
     def _find_worst(self, targets: Sequence[_Target], velocities: Floats | None) -> tuple[str, float, str]:
-        """Return the joint that is farthest off, its distance, and why the goal is not reached; empty: it is.
+        """Return the worst joint, its distance from the target, and the reason; no reason means reached.
 
-        A joint that is beyond its tolerance comes before one that moves, that before one that is near enough.
-        A joint that `velocities` command to move is not at rest, however slow it is.
+        Joints outside of their tolerances rank first, moving joints second. A joint whose commanded velocity
+        is not 0 counts as moving, even if it is slow.
         """
         states = self._record.states
         worst: tuple[int, float, str, float, str] = (0, -1.0, "", math.nan, "")
@@ -389,8 +398,11 @@ class Goals:
         error: float,
         joints: Sequence[str] | None,
     ) -> None:
-        """End a goal for its controller. A missed goal becomes aborted if a joint is lost or limp; the report
-        of an aborted one names that joint."""
+        """End a goal with the outcome that its controller reports.
+
+        A missed goal becomes aborted if a joint is lost or limp. The report of an aborted goal names that
+        joint.
+        """
         names = self._commanded(goal.controller).joints if joints is None else joints
         if outcome in _UNREACHED and names:
             rows = [self._joints[name][0] for name in names]
@@ -404,8 +416,10 @@ class Goals:
         self._close(goal, outcome, text, joint, error)
 
     def _describe_unable(self, judgement: _Judgement | None, joint: str, why: str) -> tuple[float, str]:
-        """Return how far a joint that goes nowhere is off its goal, NaN before the motion has ended, and why
-        the goal is not reached."""
+        """Return the distance of a lost or limp joint from its target, and the reason as text.
+
+        The distance is NaN before the motion has ended.
+        """
         row, plan = self._joints[joint]
         targets = () if judgement is None else judgement.targets
         position = next((target.position for target in targets if target.row == row), math.nan)
@@ -448,7 +462,7 @@ class Goals:
         self.publish(goal, status)
 
     def publish(self, goal: RunningGoal, status: str) -> None:
-        """Publish how a goal stands on the topic /goals."""
+        """Publish the status of a goal on the topic /goals."""
         if self._publisher is None:
             return
         message = self._status
@@ -459,5 +473,5 @@ class Goals:
 
 
 def _writable(text: object) -> str:
-    """Return a controller's text with escapes for what no UTF-8 has, as long as reports may have it."""
+    """Return a controller's text, cut to the longest report and with escapes for lone surrogates."""
     return str(text)[:_LONGEST_TEXT].encode(errors="backslashreplace").decode()

@@ -1,8 +1,10 @@
-"""The controller graph: which controllers command which references, and the order of updates.
+"""Controller graph: edges between controllers, the order of updates, and controllers above and below.
 
-An edge goes from the controller that is updated first. `into`: the upper end of a chain before the lower one.
-`reads` of a reference: all that command the reference before the one that reads it; of a state that a
-controller provides: that controller before it.
+An edge starts at the controller that is updated first:
+
+- `into`: the upper controller of a chain is updated before the lower one.
+- `reads` of a reference: all commanders of the reference are updated before its reader.
+- `reads` of a provided state: the provider is updated before the reader.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from dxlrun.plan.loop_plan import ControllerPlan
 Plans = Mapping[str, ControllerPlan]
 """Controllers by their names."""
 Circle = tuple[str, ...]
-"""Names of controllers, each before the next, and the last one before the first."""
+"""Controllers in a circular dependency: each has an edge to the next, and the last one to the first."""
 
 
 class Edge(NamedTuple):
@@ -29,14 +31,14 @@ class Edge(NamedTuple):
 
 
 def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
-    """Return the edges of the graph, each once, in the order of the plans; none to what is not among them."""
+    """Return the edges between the given controllers, without duplicates, in the order of the plans."""
     known = {plan.name for plan in plans}
     found = [Edge(plan.name, lower) for plan in plans for lower in plan.into if lower in known]
     chains = tuple(found)
     providing = {plan.name for plan in plans if plan.provides}
     for plan in plans:
         reads = [name.split("/") for name in plan.reads]
-        # what it provides or commands itself it need not await: it reads its value of the cycle before
+        # A controller that reads a value of its own reads that of the previous cycle, which needs no edge.
         providers = providing - {plan.name}
         found += [Edge(owner, plan.name) for owner, *rest in reads if len(rest) == 1 and owner in providers]
         read = [owner for owner, *rest in reads if len(rest) == 2]
@@ -50,9 +52,10 @@ def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
 
 
 def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
-    """Return the names in the order of updates; where the graph leaves it open, in the order given.
+    """Return the controllers in update order. The given order decides between independent controllers.
 
-    Raises ValueError that draws the circles, where there is one.
+    Raises:
+        ValueError: The graph has circles; the message shows them.
     """
     if found := circles(plans):
         raise ValueError(f"controllers command each other in a circle: {'; '.join(map(drawn, found))}")
@@ -72,9 +75,9 @@ def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
 
 
 def circles(plans: Sequence[ControllerPlan]) -> tuple[Circle, ...]:
-    """Return circles of the graph, so many that it has no other one without an edge of these.
+    """Return circles of the graph. Removing their edges makes the graph acyclic.
 
-    Each begins with the first of its controllers in the order given.
+    Each circle begins with its first controller in the given order.
     """
     place = {plan.name: number for number, plan in enumerate(plans)}
     left = list(edges(plans))
@@ -83,7 +86,7 @@ def circles(plans: Sequence[ControllerPlan]) -> tuple[Circle, ...]:
         try:
             _sorter(plans, left).prepare()
         except CycleError as error:
-            names: list[str] = error.args[1][:-1]  # the first one is repeated at its end
+            names: list[str] = error.args[1][:-1]  # graphlib repeats the first name as the last one
         else:
             return tuple(sorted(found, key=lambda circle: [place[name] for name in circle]))
         first = min(range(len(names)), key=lambda at: place[names[at]])
@@ -99,7 +102,7 @@ def drawn(circle: Circle) -> str:
 
 
 def above(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
-    """Return the controllers that command a controller's references, through others too, the nearest first.
+    """Return the controllers that command a controller's references, directly or indirectly, nearest first.
 
     The controller itself need not be among the plans.
     """
@@ -107,7 +110,7 @@ def above(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
 
 
 def below(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
-    """Return the controllers below one, whose references it commands, through others too, nearest first."""
+    """Return the controllers whose references one commands, directly or indirectly, nearest first."""
     into = {plan.name: plan.into for plan in plans}
     return _reached(plans, name, lambda upper, plan: plan.name in into.get(upper, ()))
 
@@ -126,9 +129,9 @@ def _reached(
 
 
 def lowers_first(names: Iterable[str], known: Plans, without: Collection[str] = ()) -> tuple[str, ...]:
-    """Return controllers with all below them, each behind those below it, else in the order given.
+    """Return controllers and all controllers below them. Each follows the ones below it.
 
-    Those of `without` are left out, with what is below them.
+    The given order decides otherwise. Controllers in `without` are omitted, with the controllers below them.
     """
     found: list[str] = []
     for name in names:
@@ -137,7 +140,7 @@ def lowers_first(names: Iterable[str], known: Plans, without: Collection[str] = 
 
 
 def _add_lowers_first(name: str, known: Plans, without: Collection[str], found: list[str]) -> None:
-    # no closure: one that calls itself is a circle, and the loop collects no garbage
+    # Not a closure: a recursive closure is a reference cycle, and the loop runs without a garbage collector.
     if name in known and name not in found and name not in without:
         for lower in known[name].into:
             _add_lowers_first(lower, known, without, found)
@@ -145,13 +148,13 @@ def _add_lowers_first(name: str, known: Plans, without: Collection[str], found: 
 
 
 def uppers_first(names: Collection[str], known: Plans) -> tuple[str, ...]:
-    """Return these controllers, each behind those above it, else in the order given."""
+    """Return these controllers, each after the ones above it. The given order decides otherwise."""
     order = [name for name in lowers_first(reversed(tuple(names)), known) if name in names]
     return tuple(reversed(order))
 
 
 def commander(name: str, engaged: Iterable[ControllerPlan]) -> str:
-    """Return the first controller that commands references of this one; empty: none does."""
+    """Return the first controller that commands references of this one, or an empty string."""
     return next((plan.name for plan in engaged if name in plan.into), "")
 
 
@@ -163,7 +166,7 @@ def _sorter(plans: Sequence[ControllerPlan], found: Iterable[Edge]) -> Topologic
 
 
 def rate_fits(rate: float | None, period_ns: int) -> bool:
-    """Return whether a controller's own rate can be kept: the loop's is a multiple of it."""
+    """Return whether the loop's rate is a multiple of a controller's own rate (Hz; None: the loop's rate)."""
     if rate is None:
         return True
     divider = 1e9 / period_ns / rate if rate > 0 else 0.0
@@ -173,5 +176,5 @@ def rate_fits(rate: float | None, period_ns: int) -> bool:
 
 
 def rate_divider(rate: float | None, period_ns: int) -> int:
-    """Return every how many cycles a controller is updated; its rate fits."""
+    """Return the number of cycles between two updates of a controller. Requires `rate_fits`."""
     return 1 if rate is None else max(1, round(1e9 / period_ns / rate))

@@ -1,4 +1,4 @@
-"""Keeping: the states that controllers keep, into the loop at its start, and out of it piece by piece."""
+"""Keeping: restore the persistent states of controllers at start, and publish new ones in pieces."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from dxlrun.plan.loop_plan import ControllerPlan
 
 
 class Keeping:
-    """Gives each controller what it kept in an earlier run, and lets out what they keep, a piece a cycle.
+    """Restores the state that a controller kept in an earlier run, and publishes new states a piece a cycle.
 
-    Of one controller, the state that is leaving is finished, and of those that wait only the newest leaves.
+    A state whose publication has begun is completed. Of the states that a controller keeps during that time,
+    only the newest is published.
     """
 
     def __init__(self, states: KeptStates, topics: TopicLog, events: EventSink) -> None:
@@ -37,26 +38,31 @@ class Keeping:
         self._events = events
         self._publisher: Publisher | None = None
         self.controllers: dict[str, Facts] = {}
-        """Those that keep a state, and what it depends on; without any there is nothing to do in a cycle."""
+        """Controllers that keep a state, with the facts that it depends on. Empty: cycles skip `step`."""
         self._waiting: dict[str, bytes] = {}
-        """By controller: at most one state each."""
+        """Unpublished states by controller."""
         self._newest: dict[str, bytes] = {}
-        """By controller, of this run."""
+        """Last state of this run by controller."""
         self._leaving: Iterator[bytes] = iter(())
         self._number = -1
         self._message = KeptPiece(Header(), "", 0, 0, 0, np.empty(0, np.uint8))
 
     def open(self, plan: ControllerPlan, plans: Plans) -> tuple[bytes, Callable[[bytes], None]]:
-        """Return what a controller kept, empty where that is nothing that fits, and what it keeps more with.
+        """Return the kept state of a controller and the function that keeps a new one.
 
-        `plans` has those below it. Announces the topic /kept, once. Allocates.
+        The state is empty if none was kept, or if it does not fit this robot. The first call announces the
+        topic /kept. Allocates.
+
+        Args:
+            plan: The controller.
+            plans: Plans by name, including the controllers below this one.
         """
         if self._publisher is None:
             self._publisher = self._topics.open(TOPIC, KeptPiece)
         before, facts = self.controllers.get(plan.name), self._made_with(plan, plans)
         self.controllers[plan.name] = facts
         keep = partial(self._keep, plan.name)
-        if before == facts and plan.name in self._newest:  # it was unloaded and comes again
+        if before == facts and plan.name in self._newest:  # loaded again in this run
             return self._newest[plan.name], keep
         file = self._states.files.get(plan.name)
         if file is None:
@@ -71,12 +77,12 @@ class Keeping:
         return file.state, keep
 
     def _made_with(self, plan: ControllerPlan, plans: Plans) -> Facts:
-        """Return what a state of this controller depends on: its joints' servos, and what is below it."""
+        """Return the facts that a state depends on: the servos of its joints and the controllers below it."""
         facts = {"type": plan.type, "joints": ", ".join(plan.joints)}
         for joint in plan.joints:
             facts |= {f"{joint} {name}": fact for name, fact in self._states.servos.get(joint, {}).items()}
         lower = list(plan.into)
-        for name in lower:  # grows meanwhile
+        for name in lower:  # the body appends to `lower`
             below = plans.get(name)
             if below is not None:
                 facts[f"below: {name}"] = f"{below.type} {crc32(below.parameters.encode()):08x}"
@@ -84,7 +90,7 @@ class Keeping:
         return facts
 
     def _keep(self, controller: str, state: bytes) -> None:
-        """Take a state. Raises ControllerFault for what is no bytes, or too long."""
+        """Store a state for publication. Raises ControllerFault for a wrong type or size."""
         if not isinstance(state, bytes):
             raise ControllerFault(f"kept {type(state).__name__}, which is no bytes")
         if len(state) > MOST_KEPT:
@@ -92,7 +98,7 @@ class Keeping:
         self._waiting[controller] = self._newest[controller] = state
 
     def step(self) -> None:
-        """Let out one piece, if any is left; called once a cycle."""
+        """Publish the next piece, if any. Called once a cycle."""
         if self._publisher is None:
             return
         data = next(self._leaving, None)
@@ -115,6 +121,6 @@ class Keeping:
         return next(self._leaving)
 
     def finish(self) -> None:
-        """Let out all that is left: the controllers have ended."""
+        """Publish all remaining pieces, after the controllers have ended."""
         while self._waiting or self._message.piece < self._message.pieces:
             self.step()

@@ -1,4 +1,4 @@
-"""Live parameters: which of a model may be changed in a run, their values by dotted name, and the change."""
+"""Live parameters: names and values of the parameters that may change in a run, and their replacement."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def live_names(model: BaseModel) -> Iterator[str]:
-    """Return the dotted names of the live parameters, those of nested models and of mappings too."""
+    """Yield the dotted names of the live parameters, including nested models and mappings."""
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         if any(isinstance(mark, Live) for mark in field.metadata):
@@ -37,9 +37,10 @@ def _inner(value: object, key: str) -> object:
 
 
 def with_values(model: _Model, values: LiveValues) -> _Model:
-    """Return the parameters with other values, unchecked but for their names.
+    """Return a copy of the parameters with new values. The values are not validated.
 
-    Raises ValueError for a name that is none of a live parameter.
+    Raises:
+        ValueError: A name is not that of a live parameter.
     """
     known = frozenset(live_names(model))
     if unknown := [name for name in values if name not in known]:
@@ -51,7 +52,7 @@ def with_values(model: _Model, values: LiveValues) -> _Model:
 
 
 def _changed(inner: object, path: list[str], value: object) -> object:
-    """Return what stands at a place with the value at a path below it."""
+    """Return a copy of a model or mapping with one nested value replaced."""
     if not path:
         return value
     first, *rest = path

@@ -1,4 +1,4 @@
-"""Managed: one controller of a running robot: its state, its arrays, its calls.
+"""Managed controller: state, arrays and method calls of one controller in a run.
 
                  await                    enter
     INACTIVE ------------> ENTERING ---------------> ACTIVE
@@ -6,8 +6,8 @@
         '----------------------------------------------'
     leave, fault: from every state back to INACTIVE
 
-Which controllers are updated, and which have their claims, follows from the state, and is changed nowhere
-else; what drives it is `switching.py`.
+The state alone decides whether a controller is updated and whether it holds its claims. `switching.py`
+causes the transitions.
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
 PERIOD_CAP = 5
-"""A controller never gets a period longer than this many nominal ones: a law that integrates would jump.
-The guardian ends a loop that stops for as long."""
+"""Longest period that a controller gets, in nominal periods: a law that integrates would jump otherwise.
+The guardian ends a loop that stalls for as long."""
 
 
 @unique
 class State(Enum):
-    """What a controller is doing."""
+    """State of a controller."""
 
     INACTIVE = "inactive"
     ENTERING = "entering"
-    """It has its claims, and is active as soon as its joints are in the modes that it needs."""
+    """Holds its claims, and becomes active as soon as its joints are in the required modes."""
     ACTIVE = "active"
 
 
 @unique
 class Event(Enum):
-    """What happens to a controller."""
+    """Event that changes the state of a controller."""
 
-    AWAIT = "a wait for modes"  # It is to be active; joints must change their modes first
-    ENTER = "an entry"  # It took its joints over
-    COMMAND = "a command"  # It was given a command, or one above it commands it now
-    LEAVE = "leave"  # It is deactivated, or need not wait any more
+    AWAIT = "a wait for modes"  # Activation requested; its joints must change their modes first
+    ENTER = "an entry"  # It took over its joints
+    COMMAND = "a command"  # It got a command, or a controller above commands it now
+    LEAVE = "leave"  # It was deactivated, or its wait was cancelled
     FAULT = "fault"  # It broke its contract
 
 
@@ -73,62 +73,68 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
         State.ACTIVE: {Event.AWAIT: State.ACTIVE, Event.COMMAND: State.ACTIVE, **_OUT},
     }
 )
-"""Every legal transition. Another one is a mistake of this program, which ends the controller: only what is
-called where a ControllerFault ends it, `activate` and commands, has events that a state lacks."""
+"""All legal transitions. Another one is a bug of dxlrun, which ends the controller with a ControllerFault.
+Only `activate` and commands can cause one, and their callers handle the fault."""
 
 
 class Request(NamedTuple):
-    """What a controller requests of the run in an update; executed behind all updates of the cycle."""
+    """Request of a controller to the run. It is executed after all updates of the cycle."""
 
     requester: str
     takes_over: tuple[str, ...]
-    """The controllers that are to take over; empty: the run is to end."""
+    """Controllers that shall take over; empty: the run shall end."""
     why: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllersContext:
-    """What the controllers of one run share, those that are loaded later too."""
+    """Objects that the controllers of one run share, including controllers that are loaded later."""
 
     run: ControlContext
     plugins: PlugIns
     activity: Activity
-    """Shows which controller's code runs."""
+    """Publishes which controller's code runs."""
     topics: TopicLog
-    """Takes what they publish."""
+    """Destination of their messages."""
     keeping: Keeping
     requests: list[Request]
-    """What they request of the run in this cycle."""
+    """Requests of this cycle."""
 
 
 class Managed:
-    """A controller with its rows of the robot's arrays: gathered before an update, checked and merged after.
+    """A controller with its rows of the robot's arrays.
 
-    `place` is that of the controller: its bit in the record's masks.
+    Inputs are gathered before an update; commands are checked and merged after it.
+
+    Args:
+        plan: The controller's plan.
+        place: Index of the controller, its bit in the record's masks.
+        context: Objects that the controllers share.
+
+    Raises:
+        ControllerFault: A reference or an interface in `reads` does not exist.
     """
 
     def __init__(self, plan: ControllerPlan, place: int, context: ControllersContext) -> None:
-        """Raises ControllerFault for a reference, or something that it reads, which is not there."""
         record, joints = context.run.record, context.run.plan.joints
         self.plan = plan
         self.place = place
         self.state = State.INACTIVE
         self.failed = False
-        """True when it broke its contract."""
+        """True after the controller broke its contract."""
         self.held = False
-        """True while a joint is lost that it commands, directly or through others. It is updated all the
-        same."""
+        """True while a joint that it commands, directly or through others, is lost. Updates continue."""
         self.withheld = False
-        """True while its commands are kept from the robot: its stream of commands ended, and it has no
-        `on_hold`. It is updated all the same."""
+        """True while its commands are not merged, because its command stream ended and it has no `on_hold`.
+        Updates continue."""
         self.uppers: tuple[Managed, ...] = ()
-        """Those that command its references while they are active."""
+        """Controllers that command its references while they are active."""
         self.due_cycle = 0
-        """The first cycle in which it is updated again; a skipped one is made up for next."""
+        """Cycle of the next update. If that cycle is skipped, the update happens in the following one."""
         self.until_ns = 0
-        """When its stream of commands runs out, ns of the clock; 0: there is none."""
+        """End of the lease of its command stream, ns of the run's clock; 0: no stream."""
         self.controller: Controller[Any]
-        """The controller itself."""
+        """The controller instance of the plug-in."""
         self._bit = 1 << place
         self._goal: RunningGoal | None = None
         rows = {joint.name: row for row, joint in enumerate(joints)}
@@ -141,7 +147,7 @@ class Managed:
         self._inputs = Inputs(plan, record, self.rows)
         self._outputs = Outputs(plan, record, self.rows)
         self.provided = Provided(plan, record) if plan.provides else None
-        """The states that it provides; None: it provides none."""
+        """States that it provides; None: none."""
         self._topics = context.topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * context.run.schedule.period_ns
@@ -164,7 +170,8 @@ class Managed:
             states=self._inputs.states,
             goals=self._inputs.goals,
             commands=self._outputs.commands,
-            # none of them knows this object: a circle would stay when the controller is unloaded
+            # None of these refers to this object: a reference cycle would never be freed after an unload,
+            # because the garbage collector is off.
             say=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
             warn=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
             publish=self._topics.publish,
@@ -186,9 +193,14 @@ class Managed:
     # Life
 
     def configure(self, plans: Plans) -> None:
-        """Build and configure the controller; allocates. Raises PlugInError and ControllerFault.
+        """Build and configure the controller. Allocates.
 
-        `plans` has those below it.
+        Args:
+            plans: Plans by name, including the controllers below this one.
+
+        Raises:
+            PlugInError: The type is not available or its parameters are not valid.
+            ControllerFault: The controller raised.
         """
         name, plugins, activity = self.plan.name, self._shared.plugins, self._shared.activity
         activity.name_controller(self.place, name)
@@ -206,14 +218,14 @@ class Managed:
         plugins.after_each(f"of controller {name}")
 
     def on(self, event: Event) -> None:
-        """Change the state by an event. Raises ControllerFault for one that the state does not have."""
+        """Change the state. Raises ControllerFault if the state has no transition for the event."""
         before, after = self.active, TRANSITIONS[self.state].get(event)
         if after is None:
             text = f"is {self.state.value}, where {event.value} cannot happen"
             raise ControllerFault(f"controller {self.plan.name} {text}")
         self.state = after
         self.failed |= event is Event.FAULT
-        if before and self.state is not State.ACTIVE:  # else the arrays that it claims may be another's
+        if before and self.state is not State.ACTIVE:  # another controller may own the arrays otherwise
             self._outputs.withdraw()
         if self.active:
             self._record.active |= self._bit
@@ -223,11 +235,11 @@ class Managed:
 
     @property
     def active(self) -> bool:
-        """True when it is active."""
+        """True in the state ACTIVE."""
         return self.state is State.ACTIVE
 
     def activate(self, *, restarts: bool = False) -> None:
-        """Let the controller take over its joints, or begin again with them. Raises ControllerFault."""
+        """Activate or restart the controller. Raises ControllerFault."""
         if restarts:
             self._call_without_commands(ControllerMethod.ON_RESTART, self.controller.on_restart)
         else:
@@ -237,24 +249,30 @@ class Managed:
         self.on(Event.ENTER)
 
     def _call_without_commands(self, method: ControllerMethod, call: Callable[[int], None]) -> None:
-        """Call a method with the current states and no commands. Raises ControllerFault."""
+        """Clear the commands, gather the current states and call a method. Raises ControllerFault."""
         self.withheld = False
         self._outputs.forget()
         self._inputs.gather()
         self._call(method, "", call, self._schedule.time_ns)
 
     def deactivate(self, why: str = "") -> None:
-        """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
+        """Release the joints and deactivate the controller.
 
-        `why` its goal is aborted; empty: because it is deactivated.
+        Args:
+            why: Reason for which its goal is aborted; empty: the deactivation itself.
+
+        Raises:
+            ControllerFault: The controller raised. Its joints are released anyway.
         """
         self.release(Event.LEAVE, why or f"{self.plan.name} was deactivated")
         on_deactivate, time_ns = self.controller.on_deactivate, self._schedule.time_ns
         self._call(ControllerMethod.ON_DEACTIVATE, "", on_deactivate, time_ns)
 
     def release(self, event: Event, why: str) -> None:
-        """Take its commands out of the robot's, by an event after which it has none: the gate holds what it
-        last let through. Its goal is aborted for this reason."""
+        """Abort the goal and withdraw the commands by an event that makes the controller inactive.
+
+        The gate then holds the last goals of the joints.
+        """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, why)
         self.on(event)
@@ -262,7 +280,7 @@ class Managed:
     # In a cycle
 
     def give_command(self, kind: str, data: NDArray[np.float64]) -> None:
-        """Hand over a prepared command, which never runs out. Raises ControllerFault."""
+        """Pass a prepared command without a lease to the controller. Raises ControllerFault."""
         self._begin_command()
         if self._inputs.gathered:
             self._inputs.gather()
@@ -270,8 +288,10 @@ class Managed:
         self._call(ControllerMethod.ON_COMMAND, kind, on_command, kind, data, time_ns)
 
     def _begin_command(self) -> None:
-        """End the stream of before; activate the controller again if its commands were withheld, as they are
-        of another time. Raises ControllerFault."""
+        """End the previous command stream, and reactivate a controller whose commands were withheld.
+
+        Withheld commands are outdated: the joints may have moved since. Raises ControllerFault.
+        """
         self.on(Event.COMMAND)
         self.until_ns = 0
         if self.withheld:
@@ -279,22 +299,22 @@ class Managed:
 
     @property
     def goal(self) -> RunningGoal | None:
-        """The goal that it works on."""
+        """The running goal, or None."""
         if self._goal is not None and self._goal.outcome is not None:
             self._goal = None
         return self._goal
 
     @property
     def commanded(self) -> Commanded:
-        """The joints that it commands, and what it commands now, before any limit."""
+        """Its joints and current commands, before any limit."""
         return Commanded.by_interfaces(self.plan.joints, self.plan.command, self._outputs.commands)
 
     def adopt(self, goal: RunningGoal) -> None:
-        """Have a goal that the runtime leads for it, by plain commands."""
+        """Assign a goal that the runtime pursues with plain commands for this controller."""
         self._goal = goal
 
     def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64]) -> None:
-        """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
+        """Pass a goal to the controller. The previous goal must have ended. Raises ControllerFault."""
         self._goal = goal
         self._begin_command()
         self._inputs.gather()
@@ -302,9 +322,9 @@ class Managed:
         self._call(ControllerMethod.ON_GOAL, goal.kind, on_goal, goal, data, time_ns)
 
     def cancel_goal(self, goal: RunningGoal) -> None:
-        """Let the controller bring its goal to an end. Raises ControllerFault.
+        """Request the controller to end its goal. Raises ControllerFault.
 
-        One that the runtime leads ends at once: the controller keeps what it was given last.
+        A goal that the runtime pursues ends at once, and the controller keeps its last command.
         """
         if goal.kind not in self.controller.Goals:
             goal.end(Outcome.CANCELLED)
@@ -313,21 +333,25 @@ class Managed:
         self._inputs.gather()
         on_cancel, time_ns = self.controller.on_cancel, self._schedule.time_ns
         self._call(ControllerMethod.ON_CANCEL, "", on_cancel, goal, time_ns)
-        if judged:  # its controller has handed it over, and does not end it
+        if judged:  # the controller has requested a judgement and does not end it
             goal.end(Outcome.CANCELLED, "stopped at its end")
 
     def change_parameters(self, values: LiveValues) -> None:
-        """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name
-        that is none of a live one: then nothing is changed."""
+        """Replace live parameters in one step.
+
+        Raises:
+            ControllerFault: The controller raised.
+            ValueError: A name is not that of a live parameter. Nothing is changed.
+        """
         self.controller.parameters = with_values(self.controller.parameters, values)
         on_parameters, time_ns = self.controller.on_parameters, self._schedule.time_ns
         self._call(ControllerMethod.ON_PARAMETERS, "", on_parameters, time_ns)
 
     def hold_joints(self) -> None:
-        """Hold its joints: the stream of commands ended. It is updated all the same. Raises ControllerFault.
+        """Hold the joints after the end of the command stream, and abort the goal. Raises ControllerFault.
 
-        A controller without an `on_hold` of its own may go on with the last command, so its commands are
-        withheld until the next one, and the gate holds the joints. A goal would never end: it is aborted.
+        A controller without `on_hold` might keep executing the last command. Its commands are withheld until
+        the next one, and the gate holds the joints. Updates continue in both cases.
         """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, "the stream of commands ended")
@@ -338,29 +362,37 @@ class Managed:
             self._call_without_commands(ControllerMethod.ON_HOLD, self.controller.on_hold)
 
     def follow_upper(self) -> None:
-        """End what clients had it do: one above commands its references now. Raises ControllerFault."""
+        """End streams and goals of clients, because a controller above commands the references now.
+
+        Raises ControllerFault.
+        """
         self._begin_command()
         if (goal := self.goal) is not None and not goal.cancelling:
             self.cancel_goal(goal)
 
     def hold_lost(self, lost: Collection[int], *, below: bool) -> bool:
-        """Hold its joints while it commands a lost one, of these rows, or a controller below it is held.
+        """Hold the joints while the controller commands a lost one, or while a controller below it is held.
 
-        Returns whether that changed anything for the robot.
+        Args:
+            lost: Rows of the lost joints.
+            below: Whether a controller below this one is held.
+
+        Returns:
+            True if an active controller was held or resumed.
         """
         commands = not self._outputs.is_empty
         held = commands and (below or any(row in lost for row in self.rows.tolist()))
         changed = held != self.held
         self.held = held
-        if held and self.active:  # its own rate may be low
+        if held and self.active:  # the next update may be several cycles away
             self._merge()
         return changed and self.active
 
     def _merge(self) -> None:
-        """Write its commands into the robot's, or what holds the joints while one of them is lost.
+        """Write the commands into the robot's arrays, or commands that hold the joints while one is lost.
 
-        A controller that is commanded by another one follows references that are held, so its own commands go
-        on: a PID law keeps the joints where they are.
+        A controller with an active commander follows held references, so its own commands continue: a PID law
+        keeps the joints in place.
         """
         if self.withheld:
             return
@@ -370,13 +402,13 @@ class Managed:
             self._outputs.merge()
 
     def change_period(self, period_ns: int) -> None:
-        """Keep its own rate in another period of the loop."""
+        """Keep the controller's own rate with a new period of the loop, ns."""
         self._divider = rate_divider(self.plan.rate, period_ns)
         self._nominal_ns = self._divider * period_ns
-        self.due_cycle = 0  # counted anew
+        self.due_cycle = 0  # the new divider applies from the next cycle
 
     def update(self, cycle: int) -> None:
-        """Update and merge its commands into the robot's. Raises ControllerFault."""
+        """Update the controller, and check and merge its commands. Raises ControllerFault."""
         time_ns = self._schedule.time_ns
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
@@ -394,7 +426,7 @@ class Managed:
 
 
 def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
-    """Note a takeover. Raises ControllerFault for a controller that is not among `takeovers`."""
+    """Record a takeover request. Raises ControllerFault for a controller that is not in `takeovers`."""
     if other := [name for name in controllers if name not in plan.takeovers]:
         raise ControllerFault(f"requested that {other[0]} takes over, which is none of its takeovers")
     if controllers:
@@ -406,5 +438,5 @@ def _end_run(requests: list[Request], plan: ControllerPlan, why: str) -> None:
 
 
 def _row(values: Sequence[float | None]) -> Floats:
-    """Return the values of the joints; NaN where there is none."""
+    """Return the values as an array, with NaN for None."""
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Manager: configure and update a robot's controllers; give them their commands, goals and motions."""
+"""Manager: configure and update a robot's controllers, and dispatch commands, goals and motions to them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ P = ParamSpec("P")
 
 
 class Manager:
-    """The controllers of a robot; the cycle's record holds the arrays that all of them share."""
+    """Controllers of a robot. The cycle's record holds the arrays that they share."""
 
     def __init__(
         self,
@@ -49,13 +49,13 @@ class Manager:
 
         Args:
             context: The run.
-            plugins: Types of controllers.
-            activity: Shows which controller's code runs.
-            topics: Takes what controllers publish.
-            kept: What controllers kept in earlier runs.
+            plugins: Controller types.
+            activity: Publishes which controller's code runs.
+            topics: Destination of the controllers' messages.
+            kept: States that controllers kept in earlier runs.
         """
         self.switching = Switching(context)
-        """Which of them are active."""
+        """States of the controllers, and switches between them."""
         self._plan = context.plan
         self._record = context.record
         self._events = context.events
@@ -64,7 +64,7 @@ class Manager:
         self._topics = topics or TopicLog(context.record)
         self._keeping = Keeping(kept or KeptStates(), self._topics, context.events)
         self._requests: list[Request] = []
-        """What controllers request of the run in this cycle."""
+        """Requests of controllers in this cycle."""
         self._shared = ControllersContext(
             run=context,
             plugins=plugins,
@@ -75,27 +75,29 @@ class Manager:
         )
         self._schedule = context.schedule
         self._managed: tuple[Managed, ...] = ()
-        """By their places; those that were unloaded keep theirs until another one gets it."""
+        """Controllers by place. An unloaded controller keeps its place until the place is used again."""
         self._named = self.switching.named
         self._order: tuple[Managed, ...] = ()
-        """In the order of updates: those above in a chain before those below."""
+        """Controllers in update order: upper controllers of a chain before lower ones."""
         self.streams: dict[int, Managed] = {}
-        """By place: those whose commands run out; one whose stream has ended leaves with the next look."""
+        """Controllers with a command stream, by place. `stale` removes those whose stream has ended."""
         self.providers: tuple[Provided, ...] = ()
-        """What controllers provide; all of it is older in each cycle."""
-        self._next = 0  # of the plan's commands
-        self._lost: list[int] = []  # rows of the joints that are lost
+        """Provided states of controllers, which age in each cycle."""
+        self._next = 0  # index into the plan's commands
+        self._lost: list[int] = []  # rows of lost joints
         self._goals = Goals(context.record, context.events, context.plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
-        """What is played by commands, by controller."""
+        """Motions that the runtime plays with plain commands, by controller."""
         self._pursued: dict[str, RunningGoal] = {}
-        """Goals that the runtime pursues with commands of the plan, by controller; they may have ended."""
+        """Goals that the runtime pursues with commands of the plan, by controller. They may have ended."""
 
     def configure(self) -> None:
-        """Build and configure every controller; allocates, before real time.
+        """Build and configure every controller. Allocates, so it runs before real time.
 
-        Raises PlugInError (a type is not available, parameters do not fit it) and ControllerFault (one raised
-        in on_configure, or two that start active claim one joint).
+        Raises:
+            PlugInError: A type is not available, or its parameters are not valid.
+            ControllerFault: A controller raised in on_configure, or two initially active controllers claim
+                the same joint.
         """
         clash = conflicts(controller for controller in self._plan.controllers if controller.active)
         if clash:
@@ -109,16 +111,19 @@ class Manager:
     # In a cycle
 
     def update(self, cycle: int) -> None:
-        """Hand over the commands that are due and update every active controller that is due.
+        """Dispatch due commands, then update every active controller that is due.
 
-        `cycle` counts the periods since the first deadline, without pauses. A controller that breaks its
-        contract is ended, its fallback takes over, or its joints are held by the gate; the others are updated
-        all the same.
+        A controller that breaks its contract is deactivated. Its fallback takes over, or the gate holds its
+        joints. The update of other controllers continues.
+
+        Args:
+            cycle: Number of periods since the first deadline, without pauses.
         """
         self._goals.time_ns = self._schedule.time_ns
         self._dispatch_due()
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
-        for left in range(len(self._order), -1, -1):  # one that entered by a request may have one of its own
+        # A controller that entered by a request is updated in this cycle too, and may request one itself.
+        for left in range(len(self._order), -1, -1):
             for managed in self._order:
                 if managed.state is State.ACTIVE and cycle >= managed.due_cycle:
                     begin_ns = now_ns()
@@ -137,7 +142,7 @@ class Manager:
             self._keeping.step()
 
     def _dispatch_due(self) -> None:
-        """Activate what waited for modes, hand over what is due, and judge goals, before the updates."""
+        """Activate controllers whose modes are ready, dispatch due commands, and judge goals."""
         if self.switching.groups:
             self.switching.admit_groups()
         if self._next < len(self._plan.commands):
@@ -148,7 +153,7 @@ class Manager:
             self._play_on()
 
     def _execute_requests(self) -> None:
-        """Let controllers take over as others have requested it; endings of the run behind that."""
+        """Execute the requests of controllers: takeovers first, then ends of the run."""
         requests = sorted(self._requests, key=lambda request: not request.takes_over)
         self._requests.clear()
         for request in requests:
@@ -157,9 +162,9 @@ class Manager:
                 self.switching.execute_request(request)
 
     def deactivate(self) -> None:
-        """Deactivate all controllers, the last one first; raises nothing, a fault is in `switching.fault`.
+        """Deactivate all controllers, in reverse order. Never raises; `switching.fault` has the first fault.
 
-        Goals that are neither reached nor missed by now end as aborted, because the run ended.
+        Goals that are neither reached nor missed are aborted because the run ends.
         """
         self._goals.time_ns = self._schedule.time_ns
         self._goals.judge_running()
@@ -170,16 +175,22 @@ class Manager:
 
     @property
     def settles(self) -> bool:
-        """True while the motion of a goal has ended and its joints may still settle."""
+        """True while the motion of a goal has ended and its joints may still be settling."""
         return self._goals.are_settling
 
     def dispatch_command(self, command: Command, pursued: RunningGoal | None = None) -> int | Refusal:
-        """Hand a prepared command to its controller; return the number of the goal that it is, else 0.
+        """Dispatch a prepared command to its controller.
 
-        `pursued`: the goal that the runtime pursues with this command; another one is preempted.
+        A command with a lease starts or continues a stream, which ends unless another command follows in time
+        (see `stale`). Only the first command of a stream is reported as an event.
 
-        With a lease it runs out unless another one follows (see `stale`). Of a stream, only the first one has
-        an event.
+        Args:
+            command: The command.
+            pursued: Goal that the runtime pursues with this command. Another goal of the controller that the
+                runtime pursues or judges is preempted.
+
+        Returns:
+            The number of the new goal if the command is a goal, else 0; or the refusal.
         """
         self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
@@ -222,7 +233,7 @@ class Manager:
         *arguments: P.args,
         **named: P.kwargs,
     ) -> Refusal | None:
-        """Call something of a controller; where it breaks its contract it is ended, and that is returned."""
+        """Call a method of a managed controller; on a fault, deactivate it and return the refusal."""
         try:
             call(*arguments, **named)
         except ControllerFault as fault:
@@ -247,7 +258,7 @@ class Manager:
         return managed
 
     def _hand_over(self) -> None:
-        """Give each command of the plan whose time has come to its controller, and count those taken."""
+        """Dispatch the due commands of the plan, and count the accepted ones."""
         commands, record = self._plan.commands, self._record
         while self._next < len(commands) and commands[self._next].at_ns <= self._schedule.time_ns:
             place, command = self._next, commands[self._next]
@@ -264,7 +275,7 @@ class Manager:
                 record.command_count += 1
 
     def _pursue(self, command: ScheduledCommand) -> RunningGoal | None:
-        """Return the goal that the runtime pursues with a command of the plan, which may begin with it."""
+        """Return the goal that the runtime pursues with a command of the plan; accept it if it is new."""
         name, planned = command.controller, command.goal
         managed = self._commandable(name) if planned is not None else None
         if planned and isinstance(managed, Managed) and command.kind not in managed.controller.Goals:
@@ -275,7 +286,7 @@ class Manager:
         return self._pursued.get(name)
 
     def change_parameters(self, controller: str, values: LiveValues) -> Refusal | None:
-        """Replace live parameters of a controller, active or not, all of them together."""
+        """Replace live parameters of a controller in one step. The controller need not be active."""
         managed = self._known(controller)
         if isinstance(managed, Refusal):
             return managed
@@ -289,31 +300,39 @@ class Manager:
         return refusal
 
     def stale(self, now_ns: int) -> list[str]:
-        """Return the controllers whose stream of commands has run out, each of them once."""
+        """Remove expired command streams, and return their controllers.
+
+        Args:
+            now_ns: Time of the run's clock.
+        """
         over = [managed for managed in self.streams.values() if managed.until_ns < now_ns]
-        stale = [managed for managed in over if managed.until_ns]  # others have no stream any more
+        stale = [managed for managed in over if managed.until_ns]  # 0: the stream ended before its lease
         for managed in over:
             managed.until_ns = 0
             del self.streams[managed.place]
         return [managed.plan.name for managed in sorted(stale, key=lambda one: one.place)]
 
     def hold_controller(self, controller: str) -> None:
-        """Let a controller hold its joints until it gets another command; it stays active."""
+        """Hold the joints of a controller until its next command. The controller stays active."""
         if (managed := self._named.get(controller)) is not None:
             self._attempt(managed, managed.hold_joints)
 
     def hold_lost(self, lost: Collection[int], until: str = "all its joints answer again") -> tuple[int, ...]:
-        """Hold the controllers that command a lost joint, of these rows, and those above them.
+        """Hold the controllers that command a lost joint, and the controllers above them.
 
-        They are updated, and their other joints stay where they are. So does one that is activated while a
-        joint is lost. Nothing is commanded to the lost joints themselves. A policy may hold others, `until`.
+        Held controllers are updated, but their joints stay where they are. This includes controllers that are
+        activated while a joint is lost. Lost joints get no commands.
+
+        Args:
+            lost: Rows of the joints; a policy may also hold joints that are not lost.
+            until: End of the hold for events, a clause: `all its joints answer again`.
 
         Returns:
-            The rows of the controllers that are not held any more.
+            Rows of the joints whose controllers have resumed.
         """
         self._lost = sorted(lost)
         resumed: list[int] = []
-        for managed in reversed(self._order):  # those below first
+        for managed in reversed(self._order):  # lower controllers first: the upper ones depend on them
             if not managed.hold_lost(self._lost, below=self._holds_below(managed)):
                 continue
             text, severity = f"resumes: {until}", Severity.INFO
@@ -341,7 +360,7 @@ class Manager:
         return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
 
     def cancel_goal(self, number: int, controller: str) -> Refusal | None:
-        """Let a controller end a goal, by the goal's number, or the one that a controller has."""
+        """Cancel the goal of a controller, or the goal with a number if `controller` is empty."""
         if controller:
             managed = self._known(controller)
             if isinstance(managed, Refusal):
@@ -359,9 +378,15 @@ class Manager:
     def play_motion(
         self, parts: Sequence[PlayedPart], numbers: bytes, origin: str
     ) -> tuple[int, ...] | Refusal:
-        """Begin the parts of a motion in this cycle, or none; return the numbers of their goals.
+        """Start all parts of a motion in this cycle, or none of them.
 
-        `numbers` has the commands of all parts in a row, little-endian float64.
+        Args:
+            parts: Parts of the motion.
+            numbers: Concatenated commands of all parts, little-endian float64.
+            origin: Client that sent the motion, for events.
+
+        Returns:
+            The numbers of the goals of the parts, or a refusal.
         """
         self._goals.time_ns = self._schedule.time_ns
         sizes = [size for part in parts for size in part.sizes]
@@ -392,7 +417,7 @@ class Manager:
         self, part: PlayedPart, commands: tuple[NDArray[np.float64], ...], origin: str
     ) -> int | Refusal:
         managed = self._commandable(part.controller)
-        if isinstance(managed, Refusal):  # a fault of another one took it out
+        if isinstance(managed, Refusal):  # deactivated because of a fault in an earlier part
             return managed
         if part.kind in managed.controller.Goals:
             return self._begin_goal(managed, part.kind, commands[0], origin)
@@ -402,10 +427,10 @@ class Manager:
         return goal.number
 
     def _play_on(self) -> None:
-        """Hand over what is due of each motion, and forget those that have ended."""
+        """Dispatch the due commands of each motion, and remove motions that have ended."""
         time_ns = self._schedule.time_ns
         for name, motion in tuple(self._motions.items()):
-            managed, kind = self._named[name], motion.part.kind  # active: else its goal has ended
+            managed, kind = self._named[name], motion.part.kind  # it is active, otherwise its goal has ended
             while motion.goal.outcome is None and (data := motion.due(time_ns)) is not None:
                 self._attempt(managed, managed.give_command, kind, data)
             if motion.goal.outcome is None:
@@ -414,13 +439,13 @@ class Manager:
                 del self._motions[name]
 
     def _commanded(self, controller: str) -> Commanded:
-        """Return the joints that a controller commands, directly or through others, with its commands."""
+        """Return the joints and current commands of a controller."""
         return self._named[controller].commanded
 
     # Loading
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
-        """Configure one more controller, inactive; return its place. Only while the loop is paused."""
+        """Add a controller, which is inactive at first; return its place. Requires a paused loop."""
         place = self._free_place()
         if refusal := next(self._refusals(plan, place), None):
             return refusal
@@ -438,7 +463,7 @@ class Manager:
         return place
 
     def _refusals(self, plan: ControllerPlan, place: int) -> Iterator[Refusal]:
-        """Yield why a controller cannot be loaded into a place; the first reason counts."""
+        """Yield the reasons why a controller cannot be loaded into a place, the most important one first."""
         known, layout = self.switching.standing.known, self._record.layout
         if plan.name in known:
             yield Refusal(Code.NAME_TAKEN, {"controller": plan.name})
@@ -464,18 +489,18 @@ class Manager:
         yield from _refused_rates({**known, plan.name: plan}, self._schedule.period_ns)
 
     def _free_place(self) -> int:
-        """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
+        """Return a free place. Places of the plan's controllers are never used again, even after an unload.
 
-        The log shows each controller by its place.
+        The log identifies each controller by its place.
         """
         for place in range(len(self._plan.controllers), len(self._managed)):
             there = self._managed[place]
-            if self._named.get(there.plan.name) is not there:  # the name may be another's by now
+            if self._named.get(there.plan.name) is not there:  # another controller may have the name now
                 return place
         return len(self._managed)
 
     def unload(self, name: str) -> Refusal | None:
-        """Forget a controller that is not active. Only while the loop is paused."""
+        """Remove an inactive controller. Requires a paused loop."""
         managed = self._known(name)
         if isinstance(managed, Refusal):
             return managed
@@ -490,7 +515,7 @@ class Manager:
         return None
 
     def change_period(self, period_ns: int) -> Refusal | None:
-        """Let every controller keep its own rate in another period of the loop."""
+        """Adapt every controller to a new period of the loop, ns, so that each keeps its own rate."""
         if refusal := next(_refused_rates(self.switching.standing.known, period_ns), None):
             return refusal
         for managed in self._named.values():
@@ -498,18 +523,18 @@ class Manager:
         return None
 
     def controller(self, name: str) -> Controller[Any] | None:
-        """Return a controller that is loaded, for what is done with it outside of the loop."""
+        """Return a loaded controller for use outside of the loop, or None."""
         managed = self._named.get(name)
         return None if managed is None else managed.controller
 
     @property
     def active(self) -> tuple[str, ...]:
-        """Names of the active controllers, in the order of their updates."""
+        """Names of the active controllers in update order."""
         return tuple(managed.plan.name for managed in self._order if managed.active)
 
     @property
     def plans(self) -> tuple[ControllerPlan, ...]:
-        """The plans of all controllers by their places, which are their bits in the record's masks."""
+        """Plans of all controllers by place, which is the bit in the record's masks."""
         return tuple(managed.plan for managed in self._managed)
 
     def _sort(self) -> None:
@@ -540,8 +565,11 @@ def _commanded_by(controller: str, upper: str, hint: str) -> Refusal:
 
 
 def _refused_rates(plans: Plans, period_ns: int) -> Iterator[Refusal]:
-    """Yield why a period does not do: a controller cannot keep its rate in it, or is not updated whenever one
-    above it is."""
+    """Yield the reasons against a period, ns.
+
+    A controller could not keep its own rate, or would not be updated in each cycle that updates a controller
+    above it.
+    """
     rate = 1e9 / period_ns
     for plan in plans.values():
         if not rate_fits(plan.rate, period_ns):

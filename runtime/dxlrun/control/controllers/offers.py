@@ -1,4 +1,4 @@
-"""Offers: classes of plug-ins for the sections of features, checked against the contract when loaded."""
+"""Offers: classes that plug-ins offer for sections of features, and checks of their methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import msgspec
 
 Breach = tuple[str, str]
-"""What is wrong, and how to fix it."""
+"""Problem and fix, two clauses of one message."""
 
 
 DriverClass: TypeAlias = type[Any]
@@ -20,7 +20,7 @@ class DriverOffer(msgspec.Struct, frozen=True):
     """A class that a plug-in offers for the section of a feature."""
 
     type: str
-    """The robot file's name for it."""
+    """Type name in the robot file."""
     driver: DriverClass
     distribution: str
     """Its publisher: `name version`."""
@@ -33,19 +33,19 @@ class OfferStage:
     FILE: ClassVar[str] = "offer"
 
     hook: str
-    """Hook that returns them, by type: `dxlrun_sensors`."""
+    """Hook that returns the classes by type: `dxlrun_sensors`."""
     kind: str
-    """Word for one of them in sentences: `sensor`."""
+    """Noun for messages: `sensor`."""
     form: str
-    """Name of the form of an entry, in whose schema their parameters are."""
+    """Name of the entry's form, whose schema includes the parameters of the classes."""
     find_breach: Callable[[object], Breach | None]
     """Checks a class against the contract when it is loaded."""
     facts: Callable[[DriverClass], Mapping[str, object]] = lambda driver: {}
-    """Returns what `dxlrun plugins --json` has of a class beside its type."""
+    """Returns additional fields of a class for `dxlrun plugins --json`."""
 
 
 def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | None:
-    """Check the methods of a class that derives from the contract's."""
+    """Return the first method that a derived class lacks or declares with other arguments than its base."""
     if missing := sorted(getattr(found, "__abstractmethods__", ())):
         return f"which has no method {' and no method '.join(missing)}", "write it"
     for name in names:
@@ -64,17 +64,17 @@ def is_model(found: object, base: type) -> bool:
 
 
 def takes(found: Callable[..., object], contract: Callable[..., object]) -> bool:
-    """Return whether a method can be called as the contract's: by position, with as many arguments."""
+    """Return whether a method accepts as many positional arguments as the contract's method."""
     if found is contract:  # inherited
         return True
     count = len(inspect.signature(contract).parameters)
     try:
         inspect.signature(found).bind(*range(count))
-    except (TypeError, ValueError):  # ValueError: nothing is known about its arguments
+    except (TypeError, ValueError):  # ValueError: the method has no signature
         return False
     return True
 
 
 def arguments(method: Callable[..., object]) -> str:
-    """Return the arguments of a method, as they are shown."""
+    """Return the argument list of a method for messages, without `self`."""
     return f"({', '.join(str(name) for name in inspect.signature(method).parameters if name != 'self')})"

@@ -1,8 +1,8 @@
 """Plug-ins: find the packages that offer controllers, and check them against the contract.
 
-Foreign code is checked when it is loaded, so that its author reads one sentence with a fix, and no run meets
-a traceback; a plug-in that is broken leaves the others usable. Checked are methods and their arguments, and
-the types of what is declared; the rest is the author's.
+Plug-ins are checked when they are loaded. Their authors get one sentence with a fix, and runs do not fail
+with a traceback. A broken plug-in does not affect the other ones. The checks cover methods, their arguments,
+and the types of declared attributes.
 """
 
 from __future__ import annotations
@@ -57,22 +57,22 @@ _METHODS = (
     "update",
     "on_deactivate",
 )
-"""Called by dxlrun, all by position."""
+"""Methods that dxlrun calls with positional arguments."""
 _DECLARED = {
     "Commands": (dict[str, type], "write {name: class of dxlrun.CommandModel}"),
     "Goals": (frozenset[str], "write frozenset({name})"),
     "Topics": (dict[str, type], 'write Topics = {"state": WaveState}'),
     "publishes": (tuple[str, ...], 'write publishes = ("/joint_states",)'),
 }
-"""What a controller's class declares, with its type and an example."""
+"""Class attributes of a controller, with their types and a fix as an example."""
 _HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
 _NO_FILES: Mapping[str, str] = MappingProxyType({})
 Decide: TypeAlias = Callable[[int, int, int], object]
-"""What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
+"""Hook `dxlrun_overrun` of one plug-in: cycle, scheduled_ns, actual_ns -> policy or None."""
 
 
 class OverrunHook(msgspec.Struct, frozen=True):
-    """One plug-in's hook."""
+    """Overrun hook of one plug-in."""
 
     plugin: str
     """Entry point and distribution."""
@@ -80,17 +80,17 @@ class OverrunHook(msgspec.Struct, frozen=True):
 
 
 class Offer(msgspec.Struct, frozen=True):
-    """A controller that a plug-in offers."""
+    """A controller class that a plug-in offers."""
 
     type: str
-    """The robot file's name for it."""
+    """Type name in the robot file."""
     controller: ControllerClass
     distribution: str
     """Its publisher: `name version`."""
 
 
 Refuse: TypeAlias = Callable[[str, str], PlugInError]
-"""Returns the error of one plug-in: what is wrong with it, and the fix."""
+"""Returns the error of one plug-in for a problem and its fix."""
 Offered = TypeVar("Offered", Offer, DriverOffer)
 Result = TypeVar("Result")
 Make: TypeAlias = Callable[[], Offered]
@@ -102,9 +102,14 @@ def _nothing_else(name: str) -> Never:
 
 
 class Offers(Mapping[str, Offered]):
-    """What plug-ins offer, by type; a class that is named by its place is imported when it is asked for.
+    """Offers of plug-ins by type. A class that is named by its import path is imported on first access.
 
-    Where that fails the type is missing from then on, and `broken` says why.
+    If the import fails, the type is removed and `broken` has the reason.
+
+    Args:
+        makes: Functions that import and check the classes, by type.
+        broken: Receives the error messages, by type.
+        unlisted: Makes an offer that is not in `makes`, such as a type in a single file, or raises KeyError.
     """
 
     def __init__(
@@ -113,7 +118,6 @@ class Offers(Mapping[str, Offered]):
         broken: dict[str, str],
         unlisted: Callable[[str], Offered] = _nothing_else,
     ) -> None:
-        """`unlisted` makes what is not among `makes`, such as types of single files, or raises KeyError."""
         self._makes: dict[str, Make[Offered]] = dict(makes)
         self._unlisted: Callable[[str], Offered] = unlisted
         self._made: dict[str, Offered] = {}
@@ -138,25 +142,25 @@ class Offers(Mapping[str, Offered]):
 
 
 class LoadedPlugIn(msgspec.Struct, frozen=True):
-    """A plug-in that can be used."""
+    """A plug-in that was loaded without errors."""
 
     name: str
-    """Of its entry point."""
+    """Name of its entry point."""
     distribution: str
     """Its publisher: `name version`."""
     package: str
     """Top package of its entry point."""
     contract: int
-    """The one that it was written for."""
+    """Version of the contract that it was written for."""
     controllers: Mapping[str, Make[Offer]]
-    """By type."""
+    """Controllers by type."""
     servo_models: tuple[str, ...]
     overrun: Decide | None
-    """What it decides about late cycles; None: nothing."""
+    """Hook for late cycles; None: not implemented."""
     drivers: Mapping[str, Mapping[str, Make[DriverOffer]]]
     """Classes for the sections of features, by feature and type."""
     verbs: tuple[str, ...]
-    """Of the command line."""
+    """Its command line verbs."""
 
 
 def _any_threads(name: str) -> None:
@@ -164,23 +168,23 @@ def _any_threads(name: str) -> None:
 
 
 class PlugIns(msgspec.Struct, frozen=True):
-    """All controllers that are installed, and why others are not available."""
+    """All installed controllers, and the reasons why others are not available."""
 
     controllers: Mapping[str, Offer]
-    """By type."""
+    """Controllers by type."""
     broken: Mapping[str, str]
-    """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
-    plug-ins offer, by the type's name."""
+    """One sentence for each broken plug-in, by entry point, and for each type that two plug-ins offer, by
+    type."""
     loaded: tuple[LoadedPlugIn, ...] = ()
-    """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
+    """Plug-ins without errors, in load order."""
     after_each: Callable[[str], None] = _any_threads
-    """Called with a name after foreign code prepared something; it may raise PlugInError."""
+    """Called with a name after foreign code was imported or configured. May raise PlugInError."""
     drivers: Mapping[str, Mapping[str, DriverOffer]] = msgspec.field(default_factory=dict)
     """Classes for the sections of features, by feature and type."""
 
     @property
     def overrun_hooks(self) -> tuple[OverrunHook, ...]:
-        """They decide what becomes of a late cycle, in this order."""
+        """Overrun hooks in the order in which they are called."""
         return tuple(
             OverrunHook(f"{one.name} ({one.distribution})", one.overrun)
             for one in self.loaded
@@ -192,9 +196,11 @@ class PlugIns(msgspec.Struct, frozen=True):
         return self.drivers.get(feature, {})
 
     def parameters_of_drivers(self, feature: str, publisher: str = "") -> dict[str, type[ParametersModel]]:
-        """Return the models of parameters of the classes for the section of a feature, by type.
+        """Return the parameter models of the classes for the section of a feature, by type.
 
-        `publisher` is how the name of the distribution begins.
+        Args:
+            feature: Name of the feature.
+            publisher: Prefix of the distribution; empty: all distributions.
         """
         offers = self.drivers_of(feature)
         return {
@@ -204,10 +210,14 @@ class PlugIns(msgspec.Struct, frozen=True):
         }
 
     def packages_of(self, controllers: Sequence[ControllerPlan], models: Container[str]) -> dict[str, str]:
-        """Return the packages that run in a robot with their distributions, by package.
+        """Return the distributions of all packages that run in a robot, by package.
 
-        Those that offer its controllers or servo models, those of the classes, where these are in others, and
-        those that decide about late cycles.
+        These are the packages that offer its controllers or servo models, the packages of the classes if they
+        differ, and the packages with an overrun hook.
+
+        Args:
+            controllers: Controllers of the robot.
+            models: Names of the robot's servo models.
         """
         types = {one.type: one.distribution for one in controllers}
         offering = [
@@ -217,14 +227,16 @@ class PlugIns(msgspec.Struct, frozen=True):
             or one.overrun is not None
             or any(model in models for model in one.servo_models)
         ]
-        # the text of a single file has a hash of its own
+        # A single file belongs to no package. The hash in its name identifies its version.
         classes = {kind: self.controllers[kind].controller for kind in types if file_of(kind) is None}
         return self._name_packages(offering, classes, types)
 
     def packages_of_drivers(self, feature: str, types: Mapping[str, str]) -> dict[str, str]:
-        """Return the packages of classes for the section of a feature, with their distributions.
+        """Return the distributions of the classes for the section of a feature, by package.
 
-        `types` has the publishers of the classes by type.
+        Args:
+            feature: Name of the feature.
+            types: Publishers of the classes by type.
         """
         offering = [one for one in self.loaded if types.keys() & one.drivers.get(feature, {}).keys()]
         classes = {kind: self.drivers_of(feature)[kind].driver for kind in types}
@@ -244,7 +256,7 @@ class PlugIns(msgspec.Struct, frozen=True):
         return {package: distribution_name(publisher) for package, publisher in sorted(found.items())}
 
     def import_all(self) -> None:
-        """Import every controller now: an import in a running loop takes longer than its cycle."""
+        """Import all controllers. An import in a running loop would take longer than a cycle."""
         for name in self.controllers:
             if self.controllers.get(name) is not None:
                 self.after_each(name)
@@ -252,8 +264,9 @@ class PlugIns(msgspec.Struct, frozen=True):
     def built(self, plan: ControllerPlan) -> Controller[Any]:
         """Return a new controller of the plan's type.
 
-        Raises PlugInError (the type is not available, parameters do not fit it), and ControllerFault for
-        whatever else its class raises.
+        Raises:
+            PlugInError: The type is not available, or its parameters are not valid.
+            ControllerFault: The class raised.
         """
         offer = self.controllers.get(plan.type)
         if offer is None:
@@ -272,7 +285,7 @@ class PlugIns(msgspec.Struct, frozen=True):
             ) from error
 
     def unknown_type(self, what: str, kind: str) -> PlugInError:
-        """Return the error of an entry whose type no plug-in offers."""
+        """Return the error for an entry whose type no plug-in offers."""
         why = f" ({'; '.join(self.broken.values())})" if self.broken else ""
         return PlugInError(f"no plug-in offers the type {kind} of {what}{why}")
 
@@ -280,12 +293,14 @@ class PlugIns(msgspec.Struct, frozen=True):
 def load_plugins(
     after_each: Callable[[str], None] = _any_threads, files: Mapping[str, str] = _NO_FILES
 ) -> PlugIns:
-    """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
+    """Import all entry points of the group `dxlrun` and collect their controllers and servo models.
 
-    `files` are the texts of single files by name, whose classes are offered as `./wave.py:Wave` too.
-    `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
-    raises passes through: the loop's process counts its threads there, and again when a controller was
-    configured. Itself raises nothing.
+    Raises only exceptions of `after_each`.
+
+    Args:
+        after_each: Called with the plug-in's name and distribution after each import, broken or not, and
+            later after each configuration of a controller. The loop's process counts its threads there.
+        files: Texts of single files by name. Their classes are offered as `./wave.py:Wave`.
     """
     broken: dict[str, str] = {}
     loaded: list[LoadedPlugIn] = []
@@ -296,7 +311,7 @@ def load_plugins(
         except PlugInError as error:
             broken[plugin.name if plugin.name not in broken else named] = str(error)
         after_each(named)
-    broken = {**broken_features(), **broken}  # not above: it imports every plug-in
+    broken = {**broken_features(), **broken}  # after the loop: this imports every plug-in
     controllers = _together("controller", [(one.distribution, one.controllers) for one in loaded], broken)
     drivers = {
         feature.name: Offers(
@@ -310,7 +325,7 @@ def load_plugins(
 
 
 def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
-    """Return what a single file offers. Raises KeyError for another type, and PlugInError."""
+    """Return the offer of a single file. Raises KeyError for other types, PlugInError for a broken class."""
     controller, file = class_in_file(name, files), file_of(name) or ""
 
     def refuse(what: str, fix: str) -> PlugInError:
@@ -322,7 +337,7 @@ def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
 def _together(
     what: str, offered: Sequence[tuple[str, Mapping[str, Make[Offered]]]], broken: dict[str, str]
 ) -> dict[str, Make[Offered]]:
-    """Return what several plug-ins offer; a type that two of them offer is `broken`."""
+    """Return the offers of several plug-ins. A type that two plug-ins offer is added to `broken`."""
     made: dict[str, Make[Offered]] = {}
     publishers: dict[str, str] = {}
     twice: dict[str, str] = {}
@@ -347,7 +362,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
-    """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
+    """Import and check one plug-in. Raises PlugInError with one sentence that names its distribution."""
     publisher = plugin.publisher
 
     def refuse(what: str, fix: str) -> PlugInError:
@@ -360,7 +375,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
         raise refuse(what, "put @dxlrun.hookimpl above it")
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
-    # pluggy says which hook there is not, and which argument a hook does not have
+    # The errors of pluggy name hooks that do not exist and wrong arguments.
     _asked(refuse, "has a wrong hook", partial(manager.register, module, plugin.name))
     _asked(refuse, "has a wrong hook", manager.check_pending)
     contracts, controllers, servo_models, commands = (
@@ -396,7 +411,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
 
 
 def _asked(refuse: Refuse, what: str, call: Callable[[], Result], also: str = "") -> Result:
-    """Return what foreign code answers; whatever it raises on that is its fault alone."""
+    """Call foreign code, and convert its exceptions to PlugInError."""
     try:
         return call()
     except (Exception, SystemExit) as error:
@@ -404,7 +419,7 @@ def _asked(refuse: Refuse, what: str, call: Callable[[], Result], also: str = ""
 
 
 def _functions(module: object) -> Iterator[tuple[str, object]]:
-    """Yield what a module has under the name of a hook."""
+    """Yield the functions of a module that have the name of a hook."""
     for name in _HOOKS:
         hook = getattr(module, name, None)
         if callable(hook):
@@ -414,7 +429,10 @@ def _functions(module: object) -> Iterator[tuple[str, object]]:
 def _makes(
     mappings: Sequence[object], hook: str, refuse: Refuse, offer: Callable[[str, object], Offered]
 ) -> Iterator[tuple[str, Make[Offered]]]:
-    """Yield types and what makes the offer of each: one that was checked, or that of a place, later."""
+    """Yield types with the functions that make their offers.
+
+    A class is checked at once. An import path is imported and checked later.
+    """
     for mapping in mappings:
         if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
             raise refuse(f"does not return a mapping of names from {hook}", "return {type: class}")
@@ -436,7 +454,7 @@ def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[str, objec
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
-    """Return what the loop calls for the hook `dxlrun_overrun`, with the arguments that the plug-in wants."""
+    """Return a function that calls the hook `dxlrun_overrun` with the arguments that the plug-in declares."""
     found = manager.hook.dxlrun_overrun.get_hookimpls()
     return partial(_call, found[0].function, found[0].argnames) if found else None
 
@@ -449,9 +467,9 @@ def _call(
 
 
 def _add_servo_models(models: object, refuse: Refuse) -> list[str]:
-    """Make the control tables of a plug-in known to this process; return the names of the models.
+    """Register the control tables of a plug-in in this process; return the names of the models.
 
-    Servos and devices come by one hook: each text says which of them it is.
+    One hook returns servos and devices. The text of a table identifies its kind.
     """
     if not isinstance(models, Sequence) or isinstance(models, str | bytes):
         raise refuse(
@@ -497,7 +515,7 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
 
 
 def controller_breach(controller: object) -> Breach | None:
-    """Check a class that is offered as a controller."""
+    """Check a class that is offered as a controller; return the first problem."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is no controller", "derive a class from dxlrun.Controller"
     if breach := methods_breach(controller, Controller, _METHODS) or _laws_breach(controller):
@@ -539,9 +557,12 @@ def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
 
 
 def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | None:
-    """Check what a controller's `interfaces` returned.
+    """Check the result of a controller's `interfaces`; return the first problem.
 
-    `chained`: it commands references of other controllers, of which any may go together; servos have modes.
+    Args:
+        interfaces: The result.
+        chained: True if the controller commands references, which allow any combination of interfaces. The
+            modes of servos allow only some.
     """
     if not isinstance(interfaces, Interfaces):
         return f"returns {interfaces!r} from interfaces", "return dxlrun.Interfaces(joints, command)"
@@ -574,7 +595,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
 
 
 def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
-    """Return what a controller needs of a joint's motor and is not known; None where all is."""
+    """Return the problem if a joint's motor lacks figures that a controller needs, else None."""
     identify = f"let `dxlrun identify {joint.name}` measure it, and name the file that it writes"
     if needed and joint.motor is None:
         return (
@@ -597,9 +618,14 @@ def mismatches(
     joints: Sequence[JointPlan],
     urdf: str | None,
 ) -> list[Mismatch]:
-    """Return what of the robot does not fit a controller: `motors` that it needs, and what its class finds.
+    """Return the mismatches between a robot and a controller. Exceptions of the controller pass through.
 
-    `joints` are its own. What foreign code raises passes through.
+    Args:
+        controller: Class of the controller; its `mismatches` is called if no figure of a motor is missing.
+        parameters: Parameters of the controller.
+        motors: Figures that the controller needs of each motor.
+        joints: Joints of the controller.
+        urdf: URDF of the robot.
     """
     lacking = [(joint.name, motor_breach(motors, joint)) for joint in joints]
     if found := [Mismatch(*breach, name) for name, breach in lacking if breach is not None]:

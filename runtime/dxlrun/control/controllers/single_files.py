@@ -1,7 +1,7 @@
-"""Single files: controllers of a file of Python beside the robot file, `type: ./wave.py:Wave`.
+"""Single files: controllers in a Python file next to the robot file, `type: ./wave.py:Wave`.
 
-The text is read once, when the robot is compiled, and is part of the plan: every process of the run, and a
-replay, executes that text, whatever became of the file.
+The text is read once, when the robot is compiled, and is part of the plan. All processes of the run and a
+replay execute that text, even if the file has changed.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from dxlrun.plan.loop_plan import ControllerPlan
 
 _TYPE = re.compile(r"\./([A-Za-z_]\w*\.py):([A-Za-z_]\w*)", re.ASCII)
 _HASH = 12
-"""Digits of a SHA-256 that tell one version of a file from another; the log has all of them."""
+"""Digits of the SHA-256 in names of file versions; the log has all 64."""
 
 
 def is_of_file(type_name: str) -> bool:
-    """Return whether a type is meant to be a class of a file, however it is written."""
+    """Return whether a type refers to a file, including misspelled references."""
     return "/" in type_name or ".py" in type_name
 
 
 def file_of(type_name: str) -> str | None:
-    """Return the name of the file of a type, `wave.py` of `./wave.py:Wave`; None: it is not written so."""
+    """Return the file name in a type: `wave.py` for `./wave.py:Wave`. None if the type has another form."""
     match = _TYPE.fullmatch(type_name)
     return match and match[1]
 
 
 def publisher_of(file: str, text: str) -> str:
-    """Return a file's name with its hash, as packages are named with their version."""
+    """Return the file name with the hash of its text, in analogy to a package name with its version."""
     return f"{file} {sha256(text.encode()).hexdigest()[:_HASH]}"
 
 
 def published_by(
     controllers: Sequence[ControllerPlan], texts: Mapping[str, str]
 ) -> tuple[ControllerPlan, ...]:
-    """Return the plans of controllers; those of files in `texts` are published by these texts.
+    """Return the plans with the publisher of each controller whose file is in `texts`.
 
     Args:
         controllers: The plans of all controllers.
@@ -60,9 +60,15 @@ def published_by(
 
 
 def class_in_file(type_name: str, files: Mapping[str, str]) -> object:
-    """Return the class of a type from the files' texts, by name.
+    """Return the class that a type refers to.
 
-    Raises KeyError where no file has it, PlugInError with the file's line where it cannot be executed.
+    Args:
+        type_name: `./wave.py:Wave`.
+        files: Texts by file name.
+
+    Raises:
+        KeyError: The type does not refer to one of the files.
+        PlugInError: The text has no such class, or cannot be executed; the message has the line.
     """
     file = file_of(type_name)
     if file is None:
@@ -80,7 +86,7 @@ def class_in_file(type_name: str, files: Mapping[str, str]) -> object:
 
 
 class _Text(ExecutionLoader):
-    """Loads a module from a text; tracebacks show the file's name."""
+    """Module loader for a text. Tracebacks show the file's name."""
 
     def __init__(self, file: str, text: str) -> None:
         self._file, self._text = file, text
@@ -96,11 +102,11 @@ class _Text(ExecutionLoader):
 
 @cache
 def _executed(file: str, text: str) -> ModuleType:
-    """Return a file as a module, executed once in a process."""
+    """Return the module of a text, which is executed once a process."""
     loader = _Text(file, text)
     module = ModuleType(publisher_of(file, text).replace(".py ", "_"))
     module.__loader__ = loader
-    sys.modules[module.__name__] = module  # where annotations look for their names
+    sys.modules[module.__name__] = module  # annotations are resolved in this module
     try:
         loader.exec_module(module)
     except (Exception, SystemExit) as error:
@@ -110,7 +116,7 @@ def _executed(file: str, text: str) -> ModuleType:
 
 
 def _line_of(error: BaseException, file: str) -> int:
-    """Return the line of a file at which it could not go on."""
+    """Return the line of the file at which its execution failed."""
     if isinstance(error, SyntaxError) and error.filename == file:
         return error.lineno or 1
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

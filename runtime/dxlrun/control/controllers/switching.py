@@ -1,9 +1,9 @@
-"""Switching: which controllers are active; one that breaks its contract leaves, and a fallback takes over.
+"""Switching: activate and deactivate controllers, and replace a controller that broke its contract.
 
-A chain enters from below and leaves from above, in one step. Where joints must change their modes first, the
-controllers that enter wait, together, until all their joints have: a joint that is claimed, or about to be,
-is brought into the mode of its claim. One that is not claimed stays in position or velocity mode, where it
-holds still, and is brought from others into its rest mode.
+A chain of controllers enters from below and leaves from above, in one step. If joints must change their modes
+first, all entering controllers wait until all their joints have done so. A claimed joint enters the mode of
+its claim. A joint without a claim stays in position or velocity mode, where it holds still; from other modes
+it enters its rest mode.
 """
 
 from __future__ import annotations
@@ -25,45 +25,45 @@ from dxlrun.errors import ControllerFault
 from dxlwire.modes import Mode
 
 MODE_TIMEOUT_NS = 5_000_000_000
-"""How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than
-one second, a servo that came back from a reset some more. [i]"""
+"""Timeout for mode changes. Twenty servos, one after the other in short idle times, need less than one
+second; a servo after a reset needs somewhat more. [i]"""
 _STILL = (Mode.POSITION, Mode.VELOCITY)
-"""Modes in which a joint holds still by itself: it stays in them when no controller claims it."""
+"""Modes in which a joint without commands holds still, so it stays in them when no controller claims it."""
 
 _Failed = tuple[tuple[Managed, ...], str]
-"""A controller that broke its contract, those that left with it, and why; not the fault itself, which holds
-a frame: the collector is off, so such a circle would stay."""
+"""A controller that broke its contract, the controllers that left with it, and the reason as text. The
+exception is not stored: it refers to a frame, and the loop has no collector for reference cycles."""
 
 
 class Group(msgspec.Struct, frozen=True):
-    """Controllers that wait for modes, and become active together."""
+    """Controllers that wait for modes and become active together."""
 
     entering: tuple[Managed, ...]
     until_ns: int
-    """The controllers' time at which they are given up."""
+    """Deadline in the controllers' time. The group is dropped then."""
     number: int | None
-    """Of the command that asked for it; None: none did."""
+    """Number of the client's command; None: no command requested the switch."""
     why: str
-    """The fault of the one that they stand in for; empty: they were asked for."""
+    """Fault of the controller that they replace; empty: the switch was requested."""
 
 
 class Switching:
-    """The states of a run's controllers, and what changes them; times are the controllers'."""
+    """State changes of a run's controllers. All times are the controllers' time."""
 
     def __init__(self, context: ControlContext) -> None:
         self.fault: str | None = None
-        """Why the run is to end: the sentence of the first controller that requested it, or that broke its
-        contract and for which no other one took over."""
+        """Reason to end the run; None: it continues. Set by the first controller that requested the end or
+        broke its contract without a fallback that took over."""
         self.named: dict[str, Managed] = {}
-        """The controllers that are loaded."""
+        """Loaded controllers by name."""
         self.ended: list[tuple[int, Refusal | None]] = []
-        """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
+        """Results of switches that waited for modes: number of the command, and its refusal or None."""
         self.groups: list[Group] = []
         """Controllers that wait for modes."""
         self.released: set[int] = set()
-        """Rows of joints whose torque clients switched off; the states show it a cycle later."""
+        """Rows of joints whose torque clients disabled. The states show that a cycle later."""
         self.modes_requested = True
-        """False when claims have changed since modes were requested."""
+        """False if claims have changed since the last request of modes."""
         self._joints = context.plan.joints
         self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
         self._states = context.record.states
@@ -73,7 +73,7 @@ class Switching:
 
     @property
     def standing(self) -> Standing:
-        """The controllers that are loaded, and what they are doing."""
+        """Snapshot of the loaded controllers and their states."""
         named = self.named.items()
         return Standing(
             {name: managed.plan for name, managed in named},
@@ -82,7 +82,7 @@ class Switching:
         )
 
     def start_controllers(self) -> None:
-        """Activate the controllers that are active from the start."""
+        """Activate the initially active controllers."""
         known = self.standing.known
         names = [name for name, managed in self.named.items() if managed.plan.active and not managed.active]
         self._enter([name for name in lowers_first(names, known) if name in names], None, "")
@@ -90,12 +90,18 @@ class Switching:
     def switch_controllers(
         self, activate: Sequence[str], deactivate: Sequence[str], number: int | None = None
     ) -> Refusal | Waiting | None:
-        """Deactivate and activate controllers in one step, or refuse all of it; None: it is done.
+        """Deactivate and activate controllers in one step, or refuse the whole switch.
 
-        A controller in both lists begins anew. Claims are those of all that are active afterwards. Where
-        joints must change their mode first, those that leave do so at once, and those that enter do together
-        in the first cycle in which all joints have. How that ends is in `ended`, under `number`, the
-        command's; None: no command asked for it.
+        Claims are checked for the controllers that are active afterwards. If joints must change their modes
+        first, controllers leave at once and enter together in the first cycle in which all joints are ready.
+
+        Args:
+            activate: Controllers to activate.
+            deactivate: Controllers to deactivate. A controller in both lists restarts.
+            number: Number of the client's command, for the result in `ended`; None: no command.
+
+        Returns:
+            None if the switch is complete, `Waiting` if it waits for modes, or the refusal.
         """
         step = self.standing.switch(activate, deactivate)
         if isinstance(step, Refusal):
@@ -103,8 +109,10 @@ class Switching:
         return self._refuse_limp(step.enter) or self._take(step, number)
 
     def execute_request(self, request: Request) -> None:
-        """Let controllers take over because an active one requests it, or report why they do not; or end the
-        run behind this cycle, by the policy for faults."""
+        """Execute the request of an active controller: a takeover, or the end of the run after this cycle.
+
+        A refused takeover is reported as an event. The run ends by the policy for faults.
+        """
         requester, names, why = request
         if not names:
             self.fault = self.fault or f"controller {requester} ended the run: {why}"
@@ -125,15 +133,19 @@ class Switching:
         self._take(step, None, f"{requester}: {why}")
 
     def restart_controllers(self, joints: Collection[str], why: str) -> None:
-        """Activate again every active controller that commands one of these joints, with those above it.
+        """Restart every active controller that commands one of these joints, and the controllers above it.
 
-        Each begins where its joints and their goals are now. Its goal is aborted; the reason is the names of
-        its joints, followed by `why`. The commands of one whose stream ended stay withheld.
+        Each controller starts from the current positions and goals of its joints. Its goal is aborted. After
+        the end of a command stream, commands stay withheld.
+
+        Args:
+            joints: Names of the joints.
+            why: Reason for the abort; follows the names of the joints in the message.
         """
         again = [managed for name in self.commanding(joints) if (managed := self.named[name]).active]
         withheld = [managed for managed in again if managed.withheld]
         for managed in again:
-            # one above others may name no joint of its own
+            # A controller above others may command none of these joints itself.
             own = [joint for joint in managed.plan.joints if joint in joints] or list(joints)
             reason = f"{list_names(own)} {why}"
             text = f"restarted at the measured positions: {reason}"
@@ -151,11 +163,11 @@ class Switching:
                 managed.hold_joints()
 
     def end_controller(self, managed: Managed, fault: ControllerFault) -> None:
-        """Take a controller that broke its contract out of the robot, and let a fallback take over.
+        """Deactivate a controller that broke its contract, and activate a fallback.
 
-        Those above it leave too. Its own fallback comes first, then theirs, the nearest first. One that waits
-        for modes waits no more, and the command that asked for it is refused. One that has no joints is taken
-        out alone: there is nothing that a fallback would take over.
+        The controllers above it leave too. Its own fallback is tried first, then theirs, the nearest first.
+        If the controller waits for modes, the wait ends and the command is refused. An inactive controller
+        holds no joints, so it needs no fallback.
         """
         if managed.state is State.INACTIVE:
             self._take_out(managed, fault)
@@ -163,7 +175,7 @@ class Switching:
             self._fall_back(*self._take_out_with_uppers(managed, fault))
 
     def deactivate_all(self) -> None:
-        """Deactivate all controllers, those above first, else the last one first; raises nothing."""
+        """Deactivate all controllers, upper ones first, otherwise in reverse order. Never raises."""
         standing = self.standing
         for name in uppers_first(tuple(standing.active)[::-1], standing.known):
             self._deactivate(self.named[name], RUN_ENDED)
@@ -177,19 +189,19 @@ class Switching:
     def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
         """Return the controllers that command one of these joints, directly or through a chain.
 
-        Active ones, and those that wait for modes; upper ends of chains first.
+        The result includes active controllers and those that wait for modes, upper ends of chains first.
         """
         engaged = [one.plan for one in self.named.values() if one.state is not State.INACTIVE]
         engaged.sort(key=lambda plan: self.named[plan.name].place)
         found = [
             plan.name for plan in engaged if plan.commands_servos and not set(joints).isdisjoint(plan.joints)
         ]
-        for lower in found:  # grows meanwhile
+        for lower in found:  # the body appends to `found`
             found += [plan.name for plan in engaged if lower in plan.into and plan.name not in found]
         return tuple(reversed(found))
 
     def stopped_by(self, joints: Mapping[str, int]) -> tuple[str, ...]:
-        """Return the controllers that command one of these joints and do not go on without their torque."""
+        """Return the controllers that command one of these joints and must stop without its torque."""
         return tuple(
             name
             for name in self.commanding(joints)
@@ -198,12 +210,12 @@ class Switching:
         )
 
     def _torqued(self, managed: Managed) -> list[int]:
-        """Return the rows of a controller's joints that have torque, or are to have it."""
+        """Return the rows of a controller's joints that have torque or will get it."""
         torque = self._states.torque
         return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
 
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
-        """Refuse controllers for limp joints: they would command what cannot move."""
+        """Return a refusal if entering controllers command limp joints, which cannot move."""
         limp: dict[str, str] = {}
         limp_rows: list[int] = []
         names: list[str] = []
@@ -216,7 +228,7 @@ class Switching:
                 names += [managed.plan.name] if rows else []
         if not limp:
             return None
-        named = list(limp) if len(limp) <= MOST_NAMED else names  # a controller stands for its joints
+        named = list(limp) if len(limp) <= MOST_NAMED else names  # too many joints: name the controllers
         hint = f"`dxlrun torque on {' '.join(named)}` gives it torque"
         outside = [self._joints[row].name for row in limp_rows if self._is_outside(row)]
         if outside:
@@ -224,17 +236,17 @@ class Switching:
         return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
 
     def _is_outside(self, row: int) -> bool:
-        """Check whether a joint is where it gets no torque."""
+        """Return whether a joint is outside of its limits, where its torque is not enabled."""
         joint, position = self._joints[row], float(self._states.position[row])
         return joint.bounded and (position < joint.lower or position > joint.upper)
 
     # Modes
 
     def admit_groups(self) -> None:
-        """Activate controllers whose modes are there now; give up those that waited too long.
+        """Activate the groups whose joints are in their modes, and drop the groups that cannot be activated.
 
-        Given up after the timeout, and when a joint is in another mode although another was requested: a
-        joint that changes its mode is in none.
+        A group is dropped after the timeout, or when a joint is in a wrong mode after modes were requested.
+        The mode of a joint is `UNKNOWN` during a change, so a known wrong mode means that the change failed.
         """
         ready, late = [], []
         for group in self.groups:
@@ -256,7 +268,7 @@ class Switching:
         self._fall_back_all(failed)
 
     def request_modes(self) -> None:
-        """Request modes from the hardware, by the claims of the controllers that are active or wait."""
+        """Request modes from the hardware according to the claims of active and waiting controllers."""
         self.modes_requested = True
         claimed = claimed_modes(self.standing.engaged.values())
         modes = np.zeros(len(self._joints), dtype=np.uint8)
@@ -271,13 +283,13 @@ class Switching:
             self._hardware.set_modes(modes)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
-        """Return the joints that are not in their modes, with the mode that they need and theirs."""
+        """Return the required and the current mode of each joint in a wrong mode, by joint name."""
         claimed = claimed_modes(managed.plan for managed in entering)
         now = {joint: Mode(int(self._states.mode[self._rows[joint]])) for joint in claimed}
         return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
 
     def _mode_problem(self, group: Group) -> str:
-        """Return which joints did not come into their modes, in words."""
+        """Return a text that names the joints that did not enter their modes."""
         missing = self._missing(group.entering)
         stays = [
             f"{joint} stays in {_shown(now)} mode instead of {_shown(mode)} mode"
@@ -292,7 +304,7 @@ class Switching:
         return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
 
     def _await_no_more(self, managed: Managed) -> Group | None:
-        """Take a controller out of its group, and return what is left of that; None: it does not wait."""
+        """Remove a controller from its group, and return the remaining group; None if it does not wait."""
         for index, group in enumerate(self.groups):
             if managed in group.entering:
                 left = tuple(one for one in group.entering if one is not managed)
@@ -302,7 +314,7 @@ class Switching:
         return None
 
     def _drop_group(self, managed: Managed, why: str) -> None:
-        """Give up the group of a controller that is not activated any more."""
+        """Drop the group of a controller that cannot be activated any more."""
         for group in self.groups:
             if managed in group.entering:
                 self.groups = [one for one in self.groups if one is not group]
@@ -321,9 +333,12 @@ class Switching:
     # Entering and leaving
 
     def _take(self, step: Step, number: int | None, why: str = "") -> Refusal | Waiting | None:
-        """Deactivate and activate controllers as planned; None: it is done (see `switch_controllers`).
+        """Execute a step. Returns the same as `switch_controllers`.
 
-        `why`: the fault for which these take over; empty: they were asked for.
+        Args:
+            step: The controllers that leave and enter.
+            number: Number of the client's command; None: no command.
+            why: Fault of the controller that is replaced; empty: the switch was requested.
         """
         for managed in (self.named[name] for name in step.leave):
             if managed.active:
@@ -339,7 +354,7 @@ class Switching:
         return self._enter(step.enter, number, why)
 
     def _enter(self, names: Sequence[str], number: int | None, why: str) -> Refusal | Waiting | None:
-        """Activate controllers whose claims were checked together, at once or when their modes are there."""
+        """Activate controllers with checked claims, at once or as soon as their joints are in their modes."""
         entering = [self.named[name] for name in names]
         self.modes_requested = False
         if not self._missing(entering):
@@ -357,10 +372,14 @@ class Switching:
     def _activate_all(
         self, entering: Sequence[Managed], failed: list[_Failed], *, restarts: bool = False
     ) -> Refusal | None:
-        """Activate controllers whose claims were checked together; add what fails to `failed`.
+        """Activate controllers with checked claims, and append the ones that fail to `failed`.
 
-        Their fallbacks come when all have entered: one that came before could have a joint that belongs to
-        another. Returns the first fault; the other controllers are active all the same, but for those above.
+        The caller activates fallbacks after all controllers have entered. An earlier fallback could take a
+        joint that belongs to a controller that has not entered yet.
+
+        Returns:
+            The first fault; None without any. Controllers above a failed one are not activated, other ones
+            are.
         """
         begun = len(failed)
         for managed in entering:
@@ -380,7 +399,7 @@ class Switching:
                 failed.append(((managed, *(self.named[upper] for upper in uppers)), str(fault)))
                 continue
             self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
-            for lower in (one for one in lowers if one.active):  # from now on this one commands them
+            for lower in (one for one in lowers if one.active):  # commanded by this controller from now on
                 try:
                     lower.follow_upper()
                 except ControllerFault as fault:
@@ -395,7 +414,7 @@ class Switching:
         try:
             managed.deactivate(why)
         except ControllerFault as fault:
-            self._take_out(managed, fault)  # without a fallback: it was leaving anyway
+            self._take_out(managed, fault)  # no fallback: the controller was to leave anyway
             self.fault = self.fault or str(fault)
         else:
             self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
@@ -403,14 +422,14 @@ class Switching:
     # Faults
 
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
-        """Take a controller that broke its contract out of the robot, and nothing else."""
+        """Deactivate a controller that broke its contract, without a fallback, and report the fault."""
         managed.release(Event.FAULT, str(fault))
         self.modes_requested = False
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
 
     def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault) -> _Failed:
-        """Take out one that broke its contract, and those above it; return them, the nearest first."""
+        """Deactivate a controller that broke its contract and those above it; return all, nearest first."""
         engaged = tuple(self.standing.engaged.values())
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
         self._take_out(managed, fault)
@@ -428,10 +447,10 @@ class Switching:
             self._fall_back(taken, why)
 
     def _fall_back(self, taken: Sequence[Managed], why: str) -> None:
-        """Let the first fallback of these take over that can, else the policy for faults applies.
+        """Activate the first available fallback of these controllers; without one, end the run with a fault.
 
-        None can that broke its own contract before: two that fall back on each other would do so for ever.
-        Nor one for joints without torque.
+        A controller that broke its contract before is not available: two that are each other's fallback would
+        alternate forever. Neither is a fallback for joints without torque.
         """
         names = [managed.plan.name for managed in taken]
         failed = {name for name, managed in self.named.items() if managed.failed}
@@ -453,7 +472,7 @@ class Switching:
             self.ended.append((number, refusal))
 
     def report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
-        """Leave in the log that a command was refused."""
+        """Report a refused command as an event."""
         data = msgspec.json.encode(outcome)
         self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
 
@@ -465,7 +484,7 @@ class Switching:
 
 
 def fault_of(managed: Managed, problem: str) -> Refusal:
-    """Return the refusal of a command that a controller broke its contract with."""
+    """Return the refusal of a command during which a controller broke its contract."""
     return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
 
 

@@ -1,6 +1,6 @@
-"""Topics of the loop: messages of controllers, and of the runtime itself, on their way to log and clients.
+"""Topics of the loop: messages that controllers and the runtime publish to the log and to clients.
 
-A message is checked and encoded where it is published, in the loop's process; nothing of it is kept there.
+The loop's process checks and encodes a message when it is published, and keeps no reference to it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dxlrun.errors import ControllerFault
 from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
 
 MOST_PER_CYCLE = 16
-"""Messages that one controller may publish in a cycle; it is a limit for what is out of control."""
+"""Messages that one controller may publish in a cycle. The limit catches runaway controllers."""
 OWN_PACKAGE = "dxlrun_msgs"
-"""Of the runtime's own messages."""
+"""Package of the runtime's own messages."""
 
 
 class Publisher:
-    """One topic: takes its messages, at the time of the cycle."""
+    """Publisher of one topic. Messages are stamped with the time of the cycle."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Publisher:
         self._epoch_offset_ns = epoch_offset_ns
 
     def publish(self, message: object) -> None:
-        """Publish a message. Raises WrongMessage, with one sentence, when it does not fit its topic."""
+        """Publish a message. Raises WrongMessage if it does not fit the topic."""
         t_ns = self._record.woken_ns
         data = self._message.pack(message, divmod(max(0, t_ns + self._epoch_offset_ns), 1_000_000_000))
         if len(data) > LONGEST_MESSAGE:
@@ -46,12 +46,17 @@ class Publisher:
 
 
 class TopicLog:
-    """Where the loop's topics are opened; `record` has the cycle's time."""
+    """Opens the loop's topics.
+
+    Args:
+        record: The cycle's record, for the time of messages.
+        sink: Destination of the messages; None drops them.
+        epoch_offset_ns: Offset of wall time to the run's clock, ns, for stamps.
+    """
 
     def __init__(
         self, record: CycleRecord, sink: MessageSink | None = None, epoch_offset_ns: int = 0
     ) -> None:
-        """`epoch_offset_ns` + time of the run's clock is wall time, for stamps."""
         self._record = record
         self._sink = sink or MessageSink()
         self._epoch_offset_ns = epoch_offset_ns
@@ -59,18 +64,22 @@ class TopicLog:
     def open(
         self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
     ) -> Publisher:
-        """Announce a topic of messages of a dataclass; allocates. Raises WrongMessage when it is none."""
+        """Announce a topic whose messages are instances of a dataclass. Allocates.
+
+        Raises:
+            WrongMessage: `message` is not a valid message class.
+        """
         declared = declared_message(message, package)
         topic = PublishedTopic(name, declared.type, joints)
         return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
 
     def of_controller(self, name: str, bit: int) -> ControllerTopics:
-        """Return what a controller publishes with; its topics are opened later."""
+        """Return the publisher of a controller. Its topics are opened later."""
         return ControllerTopics(self, self._record, name, bit)
 
 
 class ControllerTopics:
-    """What `Context.publish` calls: the topics of one controller."""
+    """Topics of one controller. Implements `Context.publish`."""
 
     def __init__(self, log: TopicLog, record: CycleRecord, name: str, bit: int) -> None:
         self._log = log
@@ -82,7 +91,16 @@ class ControllerTopics:
         self._left = 0
 
     def open(self, topics: Mapping[str, type], distribution: str, joints: tuple[str, ...]) -> None:
-        """Open its topics; messages are of the package of the distribution that offers the controller."""
+        """Open the controller's topics.
+
+        Args:
+            topics: Message classes by topic.
+            distribution: Distribution that offers the controller; names the package of the messages.
+            joints: Joints of the controller.
+
+        Raises:
+            ControllerFault: A message class is not valid.
+        """
         package = package_of(distribution)
         for topic, message in topics.items():
             try:
@@ -92,9 +110,11 @@ class ControllerTopics:
                 raise ControllerFault(f"controller {self._name}: topic {topic}: {error}") from None
 
     def publish(self, topic: str = "", message: object = None) -> None:
-        """Publish a message on a topic; without one, mark this cycle for the topics of `publishes`.
+        """Publish a message on a topic. Without a topic, mark this cycle for the topics of `publishes`.
 
-        Raises ControllerFault for what its declaration does not allow, and for more than MOST_PER_CYCLE.
+        Raises:
+            ControllerFault: The topic is not declared, the message does not fit, or the controller published
+                more than MOST_PER_CYCLE messages.
         """
         record = self._record
         if not topic:

@@ -1,7 +1,8 @@
-"""Wiring: a controller's views of the robot's arrays: what it sees, and where its commands go.
+"""Wiring: a controller's views of the robot's arrays, for its inputs and its commands.
 
-Done once, before the loop. What lies in equal distances is shown as it is; everything else is copied before
-each call. A controller that is `into` others writes into their references instead of the servos' commands.
+The views are built once, before the loop. Rows at equal distances are views of the robot's arrays. Other rows
+are copied before each call. A controller that is `into` others writes into their references instead of the
+servos' commands.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import COMMAND_INTERFACES
 
 READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
-"""States of a joint that any controller may read as `JOINT/position`; the age in s."""
+"""States of a joint that any controller may read, as `JOINT/position`. The age is in s."""
 
 _Element = TypeVar("_Element", bound=np.generic)
 Columns = slice | NDArray[np.intp]
-"""Rows of some joints: a slice where they are equally far apart, which numpy takes in a tenth of the time."""
+"""Rows of joints. Rows at equal distances are a slice, which numpy indexes in a tenth of the time."""
 
 
 def _columns(rows: NDArray[np.intp]) -> Columns:
-    """Return the rows as a slice if they are equally far apart, in either direction: any two are."""
+    """Return the rows as a slice if they are at equal distances, ascending or descending."""
     if not rows.size:
         return rows
     first, last = int(rows[0]), int(rows[-1])
@@ -42,25 +43,25 @@ def _places(names: Sequence[str], known: Sequence[str]) -> NDArray[np.intp]:
 
 
 class Provided:
-    """The states that a controller provides: taken after its updates, older with each cycle without one."""
+    """States that a controller provides. They are published after its updates and age in other cycles."""
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord) -> None:
         self.own = np.full(len(plan.provides), np.nan)
-        """The controller's own array, which it writes."""
+        """Array that the controller writes."""
         sources = record.sources
         self._place = record.layout.sources.index(plan.name)
         self._shown = sources.values[record.layout.source_slice(plan.name)]
         self._valid, self._age_ns = sources.valid, sources.age_ns
 
     def grow_old(self, period_ns: int) -> None:
-        """Begin a cycle, this long after the one before."""
+        """Mark the states as not updated and increase their age by a period, ns."""
         place, age_ns = self._place, self._age_ns
         self._valid[place] = False
         if age_ns[place] >= 0:
             age_ns[place] += period_ns
 
     def take(self) -> None:
-        """Show what the controller has written: valid where all of it is finite; all NaN: nothing new."""
+        """Publish the controller's array. It is valid if all values are finite; all NaN: no new values."""
         known = np.count_nonzero(np.isfinite(self.own))
         if not known and np.isnan(self.own).all():
             return
@@ -71,16 +72,21 @@ class Provided:
 
 
 class Inputs:
-    """What a controller sees, read-only for it: states and goals of its joints, its references, its reads.
+    """Read-only inputs of a controller: states and goals of its joints, its references, its reads.
 
-    Raises ControllerFault for something that it reads which is not there.
+    Args:
+        plan: The controller.
+        record: The cycle's record.
+        rows: Rows of the controller's joints.
+
+    Raises:
+        ControllerFault: The record lacks a reference or an interface in `reads`.
     """
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
-        """`rows` are those of its joints."""
         place = _columns(rows)
         self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
-        """What is copied: the robot's array, the controller's, and the rows."""
+        """Copies before each call: source array, controller's array, source rows."""
         sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(self._shown(record.goals.values, place))
@@ -100,14 +106,14 @@ class Inputs:
         if at.size:
             self._pairs.append((record.floats, self._reads, at))
         self._aged = [slot for slot, name in enumerate(plan.reads) if name.endswith("/age")]
-        """Which of the reads are ages: integers of ns in the record."""
+        """Indices of the reads that are ages, which the record has as integers in ns."""
         self._ages_ns, self._age_places = record.floats.view("<i8"), at[self._aged]
         self.reads = _read_only(self._reads)
         self.gathered = bool(self._pairs)
-        """True when something must be copied."""
+        """True if `gather` has values to copy."""
 
     def gather(self) -> None:
-        """Copy what must be copied."""
+        """Copy the inputs that are not views, and convert ages to s."""
         for source, own, place in self._pairs:
             source.take(place, axis=-1, out=own, mode="clip")
         if self._aged:
@@ -128,7 +134,7 @@ def _read_only(values: NDArray[_Element]) -> NDArray[_Element]:
 
 
 def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
-    """Yield every interface that can be read without a claim, and where it is in `CycleRecord.floats`."""
+    """Yield each interface that can be read without a claim, with its index in `CycleRecord.floats`."""
     for sequence, names in (
         ("reference", layout.references),
         ("source_state", layout.source_states),
@@ -141,48 +147,54 @@ def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
 
 
 _CARRYING = ("effort", "pwm")
-"""Interfaces that carry a joint's load: without their commands it falls."""
+"""Interfaces that carry a joint's load. The joint falls without their commands."""
 
 
 class _Part(NamedTuple):
     """One interface of a controller's commands."""
 
     own: Floats
-    """Of the controller's array."""
+    """View of the controller's array."""
     merged: Floats
-    """The robot's array that it goes to."""
+    """Array of the robot that receives the commands."""
     place: Columns
-    """Its rows there."""
+    """Rows in `merged`."""
     goes_on: bool = True
-    """It is written while the joints are held, too."""
+    """True if the command is also written while the joints are held."""
     held: float | None = None
-    """What is written instead of another one while the joints are held; None: the last command stays."""
+    """Value that is written while the joints are held; None: the last command stays."""
 
 
 class Outputs:
-    """What a controller commands: its own arrays, where they go, and what of them was ever finite.
+    """Commands of a controller: its arrays, their destinations, and the check for finite values.
 
-    It commands the servos of its joints, or references of those that it is `into`, and devices. Raises
-    ControllerFault for a reference or a source that is not there.
+    The destinations are the servos of its joints or the references of the controllers in `into`, and devices.
+
+    Args:
+        plan: The controller.
+        record: The cycle's record.
+        rows: Rows of the controller's joints.
+
+    Raises:
+        ControllerFault: The record lacks a reference or a device command.
     """
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
-        """`rows` are those of its joints."""
         layout, count = record.layout, len(plan.joints)
         own = np.full(len(COMMAND_INTERFACES) * count + len(plan.source_commands), np.nan)
         sources = own.size - len(plan.source_commands)
         self.own: Floats = own
-        """All that it writes, in one array."""
+        """All commands of the controller in one array."""
         self.commands = Commands(own[:sources].reshape(len(COMMAND_INTERFACES), count))
         self.source_commands: Floats = own[sources:]
         self.taken = b""
-        """The bytes of `own` that were checked last."""
+        """Bytes of `own` at the last check."""
         self._parts: list[_Part] = []
         self._owner = plan.name
         self._names = [""] * own.size
-        """What its elements command: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
+        """Name of each element: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
         self._rows: NDArray[np.intp] | None = None if plan.into else rows
-        """Rows of the joints whose servos it commands; None: it commands references."""
+        """Rows of the commanded servos; None: the controller commands references."""
         self._clamped = record.clamped
         for interface in plan.command:
             begin = COMMAND_INTERFACES.index(interface) * count
@@ -209,26 +221,27 @@ class Outputs:
             goes_on = not interface or interface in _CARRYING
             held: float | None = np.nan
             if self._rows is None:
-                # Without a reference the one below would hold the measured position: a joint that sags below
-                # its reference would sag as far again.
+                # Without a reference, the lower controller would hold the measured position. A joint that
+                # sags below its reference would sag by the same distance again.
                 held = {"position": None, "velocity": 0.0}.get(interface)
             self._parts.append(_Part(self.own[begin:end], merged, _columns(rows), goes_on, held))
 
     @property
     def is_empty(self) -> bool:
-        """True when it commands nothing."""
+        """True if the controller has no command interface."""
         return not self._parts
 
     def forget(self) -> None:
-        """Begin anew: nothing was commanded yet."""
+        """Reset all commands to NaN, as before the first command."""
         self.own.fill(np.nan)
         self._seen.fill(False)
         self.taken = b""
 
     def check(self) -> None:
-        """Check what the controller has written; NaN is accepted where nothing was commanded yet.
+        """Check the controller's commands. NaN is accepted until the first finite value.
 
-        Raises ControllerFault for what was finite and is not any more, and for infinity.
+        Raises:
+            ControllerFault: A command is infinite, or is NaN after a finite value.
         """
         own, seen, wrong = self.own, self._seen, self._wrong
         np.greater(self._claimed, np.isfinite(own, self._finite), wrong)
@@ -245,14 +258,14 @@ class Outputs:
         self.taken = own.tobytes()
 
     def merge(self) -> None:
-        """Write it into the robot's arrays."""
+        """Write the commands into the robot's arrays."""
         for own, merged, place, _, _ in self._parts:
             merged[place] = own
 
     def hold(self) -> None:
-        """Let the joints stay where they are: a position stays as it was, a velocity becomes 0.
+        """Write commands that hold the joints: positions stay unchanged, velocities become 0.
 
-        Efforts and PWM go on, as they carry the joints' load, and so do commands of devices.
+        Efforts and PWM are still written because they carry the joints' load, and so are device commands.
         """
         for own, merged, place, goes_on, held in self._parts:
             if goes_on:
@@ -261,7 +274,7 @@ class Outputs:
                 merged[place] = held
 
     def withdraw(self) -> None:
-        """Take it out of the robot's commands."""
+        """Replace the commands in the robot's arrays with NaN."""
         for _, merged, place, _, _ in self._parts:
             merged[place] = np.nan
 
