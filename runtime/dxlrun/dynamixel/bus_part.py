@@ -1,4 +1,4 @@
-"""Bus part: the share of a feature on one bus, next to its servos, and the stages that ask for it."""
+"""Bus part: the runtime of a feature on one bus, and the stages that create it."""
 
 from __future__ import annotations
 
@@ -23,44 +23,44 @@ if TYPE_CHECKING:  # the guardian makes the robot safe without numpy
 
 @dataclass(frozen=True, slots=True)
 class BusContext:
-    """One bus, as the part of a feature sees it.
+    """One bus with the objects that a feature's part uses on it.
 
-    Writes and reads of a part are programs: generators that yield transactions of `plan_line(idle.plan)` and
-    get a `Reply` for each. `idle` executes them between two cycles, by their `Urgency`.
+    A part reads and writes with programs: generators that yield transactions of `plan_line(idle.plan)` and
+    receive a `Reply` for each. `idle` executes them between two cycles, in the order of their `Urgency`.
     """
 
     idle: IdleScheduler
-    """Programs for the time between two cycles; it has the plan of the bus, too."""
+    """Scheduler of the time between two cycles; it also has the plan of the bus."""
     reads: CyclicReads
-    """The reads of each cycle."""
+    """The reads of every cycle."""
     samples: BusSamples
-    """Newest samples of the bus."""
+    """The newest samples of the bus."""
     commands: Floats
-    """Commands of all sources in the cycle's record, SI units; NaN is not commanded."""
+    """Commands of all sources in the cycle's record, SI units; NaN where nothing is commanded."""
     command_names: Sequence[str]
     """Names of these commands, such as `light/led`."""
     plan: bytes
     """`Contribution.plan` of the feature; empty if it has none."""
     events: EventSink
-    """Events for the log."""
+    """Sink of events for the log."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureParts:
-    """Features of a robot, and the commands that they execute on its buses."""
+    """Features of a robot and the commands that they execute on its buses."""
 
     features: Sequence[Feature]
     command_names: Sequence[str]
     """Names of the commands of all sources, in the order of the cycle's record."""
     commands: Floats
-    """These commands in the record."""
+    """Values of these commands in the record, SI units."""
     plans: Mapping[str, bytes]
-    """`Contribution.plan` by feature."""
+    """`Contribution.plan` of each feature, by its name."""
 
     def attach(
         self, idle: IdleScheduler, reads: CyclicReads, samples: BusSamples, events: EventSink
     ) -> tuple[BusPart, ...]:
-        """Return the parts of features on one bus, in the order of the features."""
+        """Return the features' parts on one bus, in the order of the features."""
         found: list[BusPart] = []
         for feature, stage in stages(BusStage, self.features):
             plan = self.plans.get(feature.name, b"")
@@ -71,28 +71,30 @@ class FeatureParts:
 
 
 class BusPart(Protocol):
-    """Part of a feature on one bus. All methods are called in the loop's thread, and none of them waits."""
+    """Part of a feature on one bus. The loop's thread calls all methods; none of them may block."""
 
     def judge_replies(self, now_ns: int) -> None:
-        """Report what changed with the replies of this cycle.
+        """Report changes that the replies of this cycle show.
 
-        Called only in cycles that the parser read: the exchange kernel reads the others, in which every reply
-        came as planned. What is due by time belongs in `schedule_idle_work`.
+        Called only in cycles that the parser read. The exchange kernel reads the other cycles, in which every
+        reply came as planned. Work that is due at a certain time belongs in `schedule_idle_work`.
 
         Args:
-            now_ns: Time of the run's clock, that of `Reply.last_ns`.
+            now_ns: Time of the run's clock, the same as `Reply.last_ns`.
         """
 
     def recover_line(self) -> None:
-        """Assume that whatever is on the bus was without power: its line was gone and is open again.
+        """Assume that all nodes of the bus lost power: their line was lost and has been opened again.
 
-        Its servos answer later, each with a call of `recover_servo`.
+        The servos answer later; `recover_servo` is called for each.
         """
 
     def recover_servo(self, servo: int) -> None:
-        """Assume that a servo has forgotten its registers: it was lost or rebooted, and is in order again.
+        """Assume that a servo has lost its RAM registers: it was lost or rebooted, and has been checked
+        again.
 
-        Also called when a client gave the servo torque, because a limp servo may have rebooted unnoticed.
+        Also called when a client switched the servo's torque on, because a limp servo may have rebooted
+        unnoticed.
 
         Args:
             servo: Index in the plan's servos.
@@ -101,67 +103,70 @@ class BusPart(Protocol):
     def schedule_idle_work(self, time_ns: int) -> None:
         """Add programs to the idle time before the coming cycle; called once a cycle.
 
-        A program that is added in each cycle fills the bus: add one when it has something to do and the one
-        before has ended.
+        A program that is added in every cycle fills the bus. Add a program only when it has work to do and
+        the previous one has ended.
 
         Args:
-            time_ns: Controllers' time of the coming cycle, from 0. It stands still while the run is paused.
+            time_ns: Controllers' time of the coming cycle, from 0. It does not advance while the run is
+                paused.
         """
 
 
 def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
-    """Read nothing at the start."""
+    """Read nothing at start-up."""
     yield from ()
 
 
 @dataclass(frozen=True)
 class BusStage:
-    """`STAGE` of `runtime.py`: the part of a feature in the loop's process."""
+    """`STAGE` of `runtime.py`: creates the part of a feature in the loop's process."""
 
     FILE: ClassVar[str] = "runtime"
 
     attach: Callable[[BusContext], BusPart | None]
-    """Called once for each bus before the start. None if the feature has nothing on this bus."""
+    """Called once for each bus before the start. Returns None if the feature has nothing on this bus."""
     inspect: Callable[[BusPlan, Findings], Program[None]] = inspect_nothing
-    """Reads at the start, after the servos were inspected and before any of them gets torque. What it adds to
-    `Findings.problems`, one sentence each, refuses the start. It does not get `Contribution.plan`."""
+    """Reads at start-up, after the servos were inspected and before any of them gets torque. A sentence that
+    it adds to `Findings.problems` refuses the start. It does not receive `Contribution.plan`."""
 
 
 @dataclass(frozen=True)
 class SafeStage:
-    """`STAGE` of `safe.py`: what a feature leaves safe at the end of a run.
+    """`STAGE` of `safe.py`: makes the outputs of a feature safe at the end of a run.
 
-    Called at every end of a run, after torque off, or after the joints were stopped where torque stays on.
-    The loop's process does that, or the guardian after the loop died, so the file imports no numpy and uses
-    nothing that `runtime.py` has found.
+    Called at every end of a run: after torque off, or after the joints were stopped if torque stays on. The
+    caller is the loop's process, or the guardian after the loop process died. The file therefore does not
+    import numpy and uses nothing that `runtime.py` has found.
     """
 
     FILE: ClassVar[str] = "safe"
 
     make_safe: Callable[[Lines, bytes], tuple[str, ...]]
-    """Gets the lines and `Contribution.plan` of the feature. Returns a sentence for each failure: they
-    become warnings in the log. Raises nothing. `lines.run` executes one program for each of `lines.plans`."""
+    """Receives the lines and `Contribution.plan` of the feature. Returns a sentence for each failure, which
+    becomes a warning in the log. Must not raise. `lines.run` executes one program for each of `lines.plans`.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class SafeEnd:
-    """The stages that make a robot safe, each with its feature and the plan of that."""
+    """The stages that make a robot safe, each with its feature and that feature's plan."""
 
     stages: tuple[tuple[Feature, SafeStage, bytes], ...]
 
     @classmethod
     def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
-        """Import what `make_safe` needs: when that is called, an import may not be possible any more."""
+        """Import the code of every `make_safe` now: at the end of a run an import may be impossible."""
         found = stages(SafeStage, features)
         return cls(tuple((feature, stage, plans.get(feature.name, b"")) for feature, stage in found))
 
     def make_safe(self, lines: Lines) -> tuple[str, ...]:
-        """Leave safe what features have on the lines; return a sentence for each failure."""
+        """Make the features' outputs on the lines safe; return a sentence for each failure."""
         sentences: list[str] = []
         for feature, stage, plan in self.stages:
             try:
                 sentences += stage.make_safe(lines, plan)
-            except Exception as error:  # foreign code: the other features are made safe all the same
+            # Foreign code may raise anything; the other features must be made safe all the same.
+            except Exception as error:
                 author = (
                     f"; report it to the author of {feature.distribution}" if feature.distribution else ""
                 )

@@ -1,4 +1,4 @@
-"""Findings: what programs of the start, of a return and of tools find on the servos of one bus."""
+"""Findings: problems and events that start-up, servo recovery and tools found on one bus."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import msgspec
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlwire.control_table import FoundDeviation
 
-_MOST_NAMED = 6  # Settings of one servo that an event names
+_MOST_NAMED = 6  # settings of one servo that an event lists, to keep it readable
 
 
 class Findings(msgspec.Struct):
     """Problems and events, in the order in which they were found."""
 
-    problems: list[str] = []  # Why a servo, and with it the robot, must not start, one sentence each
+    problems: list[str] = []  # reasons to refuse the start, one sentence each
     events: list[tuple[EventCode, Severity, str, str]] = []
-    """What a log has of it: code, severity, joint or device, text."""
+    """Events for the log: code, severity, joint or device, text."""
     deviations: list[tuple[str, str, FoundDeviation]] = []
-    """Settings that are not the factory's: joint, `ID 4 on bus main`, what was found there."""
+    """Settings that differ from the factory's: joint, `ID 4 on bus main`, and the deviation."""
 
     def note(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
-        """Add what a log shall have."""
+        """Add an event for the log."""
         self.events.append((code, severity, source, text))
 
     def texts(self, code: EventCode) -> list[tuple[str, str]]:
-        """Return the events of a code, each as its source and text."""
+        """Return the events with a code, each as its source and text."""
         return [(source, text) for each, _, source, text in self.events if each is code]
 
     def describe_deviations(self) -> list[tuple[str, str]]:
-        """Return a sentence about each servo with settings that are not the factory's, with its joint."""
+        """Return a sentence for each servo whose settings differ from the factory's, with its joint."""
         sentences: list[tuple[str, str]] = []
         for joint, place in dict.fromkeys((joint, place) for joint, place, _ in self.deviations):
             own = [each for _, where, each in self.deviations if where == place]
@@ -46,7 +46,7 @@ class Findings(msgspec.Struct):
         return sentences
 
     def log(self, events: EventSink) -> None:
-        """Log the events, and one for all settings of a servo that are not the factory's."""
+        """Log the events, and one event per servo for its settings that differ from the factory's."""
         for event in self.events:
             events.emit(*event)
         for joint, text in self.describe_deviations():

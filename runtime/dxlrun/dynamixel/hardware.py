@@ -34,34 +34,34 @@ from dxlwire.exchange.samples import Samples
 from dxlwire.packets import PacketLog
 from dxlwire.plan.retry import limit_patience, pause
 
-STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
-LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then
+STOP_LIMIT_NS = 1_000_000_000  # deadline for retries of torque off: half of the default exit timeout
+LINE_TIMEOUT_NS = 300_000_000  # an adapter that was just unplugged may be back by then
 LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
-"""Note of what `start` raises when every servo confirmed that."""
+"""Note on an exception of `start` after every servo confirmed torque off."""
 FIRST_READS_NS = (0, 60_000_000, 240_000_000)
-"""Pauses before the readings of the first states, which must all be fresh: noise, or a host or an adapter
-that stands still, may spoil one or two."""
+"""Pauses before the attempts to read the first states, which must all be fresh. Noise, or a host or adapter
+that stalls, may spoil one or two attempts."""
 IDLE_MARGIN_NS = 150_000
-"""The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
+"""Time that stays free before the deadline: a stock kernel wakes about 50-100 us late."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServoArrays:
-    """Arrays of a robot as its servos have them: those of the cycle's record, or those below a layer."""
+    """States and goals of the servos: the cycle's record, or the arrays below a hardware layer."""
 
     states: States
     goals: Commands
     sources: SourceStates = field(default_factory=SourceStates.empty)
-    """Of devices."""
+    """States of the devices."""
 
 
 class DynamixelHardware:
-    """Reads all servos, writes all goals, once a cycle; `contract.hardware.Hardware` has the contract.
+    """Reads all servos and writes all goals once a cycle; implements `contract.hardware.Hardware`.
 
-    States and goals are the robot's arrays, one row a joint. A row whose reply was lost is invalid and keeps
-    its values while its age grows. A servo that missed a read, or whose torque enable was not read as 1, gets
-    no goal until it was, because writing a goal switches torque on (protocol.md).
+    States and goals are the robot's arrays, one row per joint. A row whose reply was lost is invalid: it
+    keeps its values while its age grows. A servo gets no goal after a missed read, or while its torque enable
+    has not been read as 1, because writing a goal switches torque on (protocol.md).
     """
 
     def __init__(
@@ -75,17 +75,17 @@ class DynamixelHardware:
         refusals: Callable[[], Sequence[str]] | None = None,
         take_over: bool = False,
     ) -> None:
-        """Plan the exchange; nothing is sent yet.
+        """Plan the exchange without sending anything.
 
         Args:
             lines: The robot's lines.
-            packets: Takes every packet, also those of `lines`.
-            arrays: Where states go, and where goals are.
-            events: Events for the log.
-            parts: Features of the robot; None: ours, without commands.
-            refusals: Called when the states have the positions of the servos, before any gets torque. Returns
-                why the robot must not start, one sentence each.
-            take_over: The servos may have torque already.
+            packets: Log of every packet, including those of `lines`.
+            arrays: Destination of the states and source of the goals.
+            events: Sink of events for the log.
+            parts: Features of the robot; None: the built-in features, without commands.
+            refusals: Called when the states have the positions of the servos, before any servo gets torque.
+                Returns reasons to refuse the start, one sentence each.
+            take_over: True if the servos may have torque already.
 
         Raises:
             NotCompiled: The exchange kernel was not compiled.
@@ -102,13 +102,13 @@ class DynamixelHardware:
         self._refusals = refusals
         self._full_torque: list[list[int]] = []
         self._by_kernel: bool | None = None
-        """Whether the kernel reads the next states, or the parser; None: not planned yet."""
+        """True if the kernel reads the next states, False if the parser does; None: not planned yet."""
         self._look = True
-        """There is something to look at in this cycle, beside reading and writing. `_rest` ends that; then
-        the kernel's answers, requests, and `_due_ns` begin it again."""
-        self._due_ns = 0  # when idle time has something to do,
+        """True while a cycle needs more than reading and writing. `_rest` clears it; an answer of the kernel,
+        a request, or `_due_ns` sets it again."""
+        self._due_ns = 0  # time at which idle work is due
         self._waiting: list[tuple[array[int], int]] = []
-        """or where it is so long, ns, on a line, whose words these are."""
+        """Words of each line with waiting idle work, and the shortest idle time (ns) for that work."""
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
         self._samples = Samples(self._plans, states, arrays.sources, reports)
@@ -124,7 +124,7 @@ class DynamixelHardware:
             for plan, servos in zip(self._plans, self._servos, strict=True)
             for index, servo in enumerate(plan.servos)
         }
-        """Row of a joint -> where its servo is."""
+        """Servo of each joint by row: the servos of its bus and the index there."""
         shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
         self._kernel = Kernel(self._lines, shared, self._samples, goals.values, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
@@ -132,11 +132,17 @@ class DynamixelHardware:
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Look at every servo, hold each where it stands, fill the first states and goals.
+        """Check every servo, hold each at its present position, and fill the first states and goals.
 
-        `engaging` is called before any of them gets torque. Raises StartUpError with every problem of every
-        servo, PortError when a line is gone; torque that was given is taken back, and a note of the exception
-        says whether every servo confirmed that.
+        After a failure torque is switched off again. A note on the exception says whether every servo
+        confirmed it.
+
+        Args:
+            engaging: Called before any servo gets torque.
+
+        Raises:
+            StartUpError: The servos' problems, all in one message.
+            PortError: A line is gone.
         """
         self._look = True
         self._start_up.look(self._take_over)
@@ -153,16 +159,19 @@ class DynamixelHardware:
             self._start_up.watch()
             self._collect_limits()
             for bus in self._buses:
-                bus.words[LATE_NS] = 0  # servos that write their EEPROM answer late: no cycle does that
-        except BaseException as error:  # also an interrupt: nothing may leave here with torque on
+                # A servo that writes its EEPROM answers late; no cycle writes EEPROM, so these delays must
+                # not count.
+                bus.words[LATE_NS] = 0
+        except BaseException as error:  # Also on KeyboardInterrupt: `start` must not exit with torque on.
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
             raise
 
     def read(self) -> None:
-        """Read every servo once, on all lines at once; of a line that is lost every row is invalid.
+        """Read every servo once, on all lines at once; all rows of a lost line become invalid.
 
-        The kernel reads as long as everything comes as planned; the parser continues where it does not.
+        The kernel reads while every reply comes as planned. The parser takes over at the first deviation from
+        the plan.
         """
         if self._look:
             self._prepare_read()
@@ -184,7 +193,7 @@ class DynamixelHardware:
             self._collect_limits()
 
     def _collect_limits(self) -> None:
-        """Hand the registers that limit the servos' goals to the loop."""
+        """Publish the registers that limit the servos' goals to the loop."""
         self.servo_limits = {row: own for servos in self._servos for row, own in servos.limits.items()}
         for servos in self._servos:
             servos.goals.limits_changed = False
@@ -193,7 +202,7 @@ class DynamixelHardware:
         while (answer := self._kernel.finish_read(code)) is Answer.SILENCE:
             self._look = True
             self._prepare_read()
-            code = self._read()  # this process may have stood still again
+            code = self._read()  # the process may have stalled again
         if answer is Answer.UNEXPECTED:
             self._look = True
             if self._by_kernel:
@@ -208,7 +217,8 @@ class DynamixelHardware:
                 self._samples.judge(self._clock.now_ns())
         if self._look:
             self._by_kernel = None
-            # A reply with an error puts torque in doubt: the states that it brought are not judged without.
+            # A reply with an error puts torque in doubt; the loop must not judge the new states without that
+            # doubt.
             self._show_torque()
 
     def _show_torque(self) -> None:
@@ -219,7 +229,8 @@ class DynamixelHardware:
     def _plan_reads(self) -> bool:
         """Plan the next reads, once a cycle and before any of them is sent.
 
-        Return whether the kernel does them: every line that is there has a program for it.
+        Returns:
+            True if the kernel can do the reads: every open line has a program for it.
         """
         kernel, ready = self._kernel, True
         for index, (bus, servos) in enumerate(self._pairs):
@@ -248,7 +259,7 @@ class DynamixelHardware:
         self._kernel.abandon()
 
     def _parse(self) -> None:
-        """Read packet by packet what was not read in this cycle."""
+        """Read packet by packet the lines that were not read yet in this cycle."""
         waiting = [(bus, servos) for bus, servos in self._pairs if not servos.reads.begun]
         self._lines.clear([bus for bus, _ in waiting])
         for bus, servos in waiting:
@@ -267,7 +278,7 @@ class DynamixelHardware:
             self._report_plain_reads()
 
     def write(self) -> None:
-        """Send the goals, one sync write a line and layout, on every line that is there."""
+        """Send the goals on every open line, one sync write per line and goal layout."""
         if self._look:
             for servos in self._servos:
                 servos.prepare_goals(self._goals, self._states)
@@ -280,7 +291,7 @@ class DynamixelHardware:
             self._rest()
 
     def _rest(self) -> None:
-        """Look at nothing any more where all is as planned, until that changes."""
+        """Stop looking for changes if everything is as planned, until an event requires it again."""
         self._due_ns = min((servos.due_ns for servos in self._servos), default=NEVER)
         self._waiting = [
             (bus.words, work.least_ns)
@@ -296,13 +307,13 @@ class DynamixelHardware:
         self._look = self._by_kernel is None
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into modes in idle time; UNKNOWN leaves one as it is."""
+        """Change the operating modes of joints in idle time; UNKNOWN keeps the mode."""
         self._look = True
         for servos in self._servos:
             servos.desired.change_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write a RAM item of a joint's servo in idle time, and read it back; see `DesiredState`."""
+        """Write a RAM item of a joint's servo in idle time and read it back; see `DesiredState`."""
         servos, index = self._place(row)
         servos.desired.write_register(index, item, value, done)
 
@@ -317,7 +328,7 @@ class DynamixelHardware:
         (servos.requests.torque_on if on else servos.requests.torque_off)(index, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Let the servos of joints that were given torque get goals; see `Servos.follow_goals`."""
+        """Start sending goals to servos that were given torque; see `Servos.follow_goals`."""
         for row in rows:
             servos, index = self._place(row)
             servos.follow_goals(index)
@@ -328,12 +339,12 @@ class DynamixelHardware:
         servos.requests.reboot(index, done)
 
     def _place(self, row: int) -> tuple[Servos, int]:
-        """Return where the servo of a joint is, which is to be looked at."""
+        """Return the servo of a joint, and look at all servos in the next cycle."""
         self._look = True
         return self._places[row]
 
     def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit; the next start restores it."""
+        """Limit the torque of every servo to a fraction of its own limit until the next start."""
         self._look = True
         for servos in self._servos:
             servos.goals.weaken(fraction)
@@ -341,11 +352,18 @@ class DynamixelHardware:
             self._plans, self._buses, self._servos, self._full_torque, strict=False
         ):
             for packet in reduced_torque_limits(plan, full, fraction, servos.goals.modes):
-                with suppress(PortError):  # as with goals: the next read names the bus
+                with suppress(PortError):  # as for goals: the next read reports the bus
                     bus.send(packet)
 
     def idle(self, until_ns: int, time_ns: int = 0) -> None:
-        """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so."""
+        """Execute waiting idle work on each line if it fits before the deadline.
+
+        `IdleScheduler` lists the work that it executes even if it does not fit.
+
+        Args:
+            until_ns: Deadline, the start of the next cycle.
+            time_ns: Controllers' time of the next cycle.
+        """
         if not self._look:
             now_ns = self._now_ns()
             left_ns = until_ns - IDLE_MARGIN_NS - now_ns
@@ -374,10 +392,10 @@ class DynamixelHardware:
         if working:
             self._lines.clear(self._buses)
             self._lines.pump()
-        self._by_kernel = self._plan_reads()  # here nothing waits for it
+        self._by_kernel = self._plan_reads()  # Plan here, where no deadline is near.
 
     def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo, and read it back; return a sentence per failure."""
+        """Switch torque off on every servo and read it back; return a sentence for each failure."""
         outcomes = self._limp()
         self._make_rest_safe()
         failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
@@ -395,12 +413,12 @@ class DynamixelHardware:
         return failures
 
     def release(self) -> None:
-        """Leave the robot with its torque on: nothing is sent any more, and no servo may stop for that.
-        Features leave the rest safe.
+        """Leave the robot with its torque on: stop sending, and keep every servo from stopping because of
+        that.
 
-        A servo that its Bus Watchdog has stopped already stays stopped.
+        Features make their outputs safe. A servo that its Bus Watchdog has already stopped stays stopped.
         """
-        # first: the watchdogs stop the servos after a time in which a silent device may be awaited
+        # Disarm first: a silent device can delay the programs by more than the watchdogs' timeout.
         programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
         for problems in self._lines.run(programs):
             for problem in problems or ():
@@ -412,31 +430,33 @@ class DynamixelHardware:
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
-        """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""
+        """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the other servos must still stop
+        without a host."""
         for plan, bus in zip(self._plans, self._buses, strict=True):
             servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
             for packet in watchdog.to_all(plan, servos, 0):
-                with suppress(PortError):  # a servo that stops without a host stays as it is
+                with suppress(PortError):  # an armed servo without a host stops, which is safe
                     bus.send(packet)
 
     def _reopen_lines(self) -> None:
-        """Open lines again that were lost, and continue on those that are back."""
+        """Try to reopen lost lines, and resume the exchange on those that are back."""
         for index, (bus, servos) in enumerate(self._pairs):
             if bus.failure is not None and self._lines.ports.reopen(index):
                 bus.renew(self._lines.ports.ports[index])
                 servos.goals.renew()
                 servos.found()
-                servos.reads.plan()  # without its servos: none is read before it was found in order
+                # Plan without the line's servos: no servo is read before it was checked again.
+                servos.reads.plan()
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
-        """Torque off at once wherever there is a line, and once more when one that was gone is back soon."""
+        """Switch torque off at once on every open line, and again if a lost line comes back in time."""
         now_ns = self._clock.now_ns()
         deadline_ns, timeout_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_TIMEOUT_NS
         while True:
             self._reopen_lines()
             for bus, servos in zip(self._buses, self._servos, strict=True):
                 servos.withhold_goals()
-                bus.retry()  # a line that is back, or was only stuck, gets its chance
+                bus.retry()  # Give a line that is back, or was only blocked, another chance.
             outcomes = limp(self._lines, deadline_ns)
             gone = [index for index, bus in enumerate(self._buses) if bus.failure is not None]
             if not gone or not self._wait_for_lines(gone, timeout_ns):
@@ -474,7 +494,7 @@ class DynamixelHardware:
         self._start_up.confirm()
 
     def _await_states_of_all(self, when: str) -> None:
-        """Read until the states of all servos are fresh; raises StartUpError when some stay silent."""
+        """Read until the states of all servos are fresh; raise StartUpError if some stay silent."""
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
                 self._lines.run([pause(pause_ns) for _ in self._plans])

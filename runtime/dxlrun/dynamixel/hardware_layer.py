@@ -1,7 +1,7 @@
 """Hardware layers: transforms between the joints of the loop and the servos, such as couplings of servos.
 
-A layer takes the goals of the layer above and gives the one below goals in arrays of its own, and the states
-the other way round, if it changes them. Without layers the servos' hardware has the arrays of the loop.
+A layer converts the goals of the layer above into arrays of its own for the layer below. It converts states
+in the other direction if it changes them. Without layers the servos' hardware uses the arrays of the loop.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dxlrun.plan.robot_plan import Plan
 
 
 class HardwareLayer:
-    """Passes every request on to the hardware below.
+    """Forwards every request to the hardware below.
 
-    A layer overrides what it changes. One that only transforms goals needs `start`, after which the goals
-    below are where the joints are, `write` and `follow_goals`.
+    A layer overrides the methods whose behaviour it changes. A layer that transforms only goals needs
+    `start`, after which the goals below equal the present positions, `write` and `follow_goals`.
     """
 
     def __init__(self, hardware: Hardware) -> None:
@@ -37,7 +37,7 @@ class HardwareLayer:
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each joint's servos."""
+        """Registers that limit the goals of each joint's servos, by row of the joint."""
         return self._hardware.servo_limits
 
     def read(self) -> None:
@@ -49,7 +49,7 @@ class HardwareLayer:
         self._hardware.write()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into modes."""
+        """Change the operating modes of joints."""
         self._hardware.set_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
@@ -65,7 +65,7 @@ class HardwareLayer:
         self._hardware.switch_torque(row, on, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Let joints that were just given torque get goals."""
+        """Start sending goals to joints that were just given torque."""
         self._hardware.follow_goals(rows)
 
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
@@ -73,11 +73,11 @@ class HardwareLayer:
         self._hardware.reboot(row, done)
 
     def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit."""
+        """Limit the torque of every servo to a fraction of its own limit."""
         self._hardware.limit_torque(fraction)
 
     def idle(self, until_ns: int, time_ns: int) -> None:
-        """Use the idle time of the buses."""
+        """Execute waiting work in the idle time of the buses."""
         self._hardware.idle(until_ns, time_ns)
 
     def stop(self) -> tuple[str, ...]:
@@ -94,28 +94,29 @@ class PreparedLayer:
     """A layer of this robot, before the hardware below it is built."""
 
     states: States
-    """Filled by the hardware below."""
+    """States that the hardware below fills."""
     goals: Commands
-    """Sent by the hardware below."""
+    """Goals that the hardware below sends."""
     build: Callable[[Hardware], Hardware]
-    """Puts the layer in front of that hardware."""
+    """Puts the layer in front of the hardware below."""
     refusals: Callable[[], Sequence[str]] | None = None
-    """Returns why the robot must not start where its servos are, one sentence each; None: it always may."""
+    """Returns reasons to refuse the start at the present positions, one sentence each; None: no check."""
 
 
 @dataclass(frozen=True)
 class LayerStage:
     """`STAGE` of `layer.py`: called when a robot is assembled, before the hardware of its servos is built.
 
-    Features are asked in their order: the first is next to the loop, the last next to the servos. Each gets
-    the arrays of the layer above, and returns None where the plan has nothing for it to do.
+    The stages are called in the order of their features: the first is next to the loop, the last next to the
+    servos. Each receives the arrays of the layer above. It returns None if the plan does not need its layer.
     """
 
     FILE: ClassVar[str] = "layer"
 
     prepare: Callable[[Plan, States, Commands, EventSink], PreparedLayer | None]
     to_servos: bool = False
-    """The arrays below have a row for each servo, those above for each joint: so it is the last."""
+    """True if the arrays below have a row per servo and those above a row per joint. Such layers come last.
+    """
 
 
 class HardwareLayers:
@@ -134,12 +135,12 @@ class HardwareLayers:
 
     @property
     def refusals(self) -> Callable[[], Sequence[str]] | None:
-        """What is checked before any servo gets torque, from the lowest layer up; None: nothing is."""
+        """Checks before any servo gets torque, from the lowest layer up; None: no layer has one."""
         checks = [one.refusals for one in reversed(self._layers) if one.refusals is not None]
         return (lambda: [text for check in checks for text in check()]) if checks else None
 
     def build(self, hardware: Hardware) -> Hardware:
-        """Put the layers in front of the servos' hardware; without any it is returned as it is."""
+        """Put the layers in front of the servos' hardware; without layers return the hardware unchanged."""
         for layer in reversed(self._layers):
             hardware = layer.build(hardware)
         return hardware

@@ -1,7 +1,8 @@
-"""Remedies for late and missing replies: what a person is asked to do, decided in one place.
+"""Remedies for late and missing replies: the instruction to the user, decided in one place.
 
-Start-up, the cycle, tools, the end of a run and the analysis of a log use it. A machine that was too busy
-comes first; of simulated servos no part is to be checked; a cause is named by direct evidence alone.
+Start-up, the cycle, tools, the end of a run and the analysis of a log share these rules. A machine that was
+too busy is named first. For simulated servos no hardware check is suggested. A cause is named only on direct
+evidence.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ _IDLE = MachineLoad()
 def choose_remedy(
     port: str, hardware: str = CHECK, *, simulated: str = INJECTED, load: MachineLoad = _IDLE
 ) -> str:
-    """Return the remedy for late or missing replies on a bus, imperative and without its full stop.
+    """Return the remedy for late or missing replies on a bus, in the imperative and without a full stop.
 
     Args:
-        port: The bus' port, as in the robot file.
-        hardware: Remedy where servos are real and the machine was idle, such as "check its cable and power".
-        simulated: Remedy where they are simulated and the machine was idle.
+        port: Port of the bus, as in the robot file.
+        hardware: Remedy for real servos on an idle machine, such as "check its cable and power".
+        simulated: Remedy for simulated servos on an idle machine.
         load: Load of the machine at that time, as far as it is known.
 
     Example:
@@ -39,7 +40,7 @@ def choose_remedy(
 
 
 def free_machine(ports: Iterable[str]) -> str:
-    """Return the remedy for a machine that was too busy for a robot with these ports, as `choose_remedy`."""
+    """Return the remedy for a machine that was too busy for a robot with these ports; see `choose_remedy`."""
     virtual = ", or use --virtual" if any(map(is_simulated, ports)) else ""
     return f"end other programs{virtual}"
 
@@ -47,16 +48,15 @@ def free_machine(ports: Iterable[str]) -> str:
 def late_replies(
     bus: str, port: str, extra_ns: float, planned_ns: float, load: MachineLoad = _IDLE
 ) -> tuple[str, str]:
-    """Return a sentence about replies that usually come later than planned, and what shortens that.
+    """Return a sentence about replies that usually come later than planned, and the remedy.
 
-    Both are without their full stops; the second is empty where nothing is known. What looks like the latency
-    timer of an FTDI adapter as it is shipped is named, unless the bus is simulated or the machine was too
-    busy.
+    Both have no full stop; the remedy is empty if none is known. A delay that looks like the default latency
+    timer of an FTDI adapter is named, unless the bus is simulated or the machine was too busy.
 
     Args:
         bus: Name of the bus.
         port: Its port, as in the robot file.
-        extra_ns: Time by which replies come later than wire and return delay need.
+        extra_ns: Delay of the replies beyond the time on the wire and the return delay.
         planned_ns: Time that was planned for the adapter.
         load: Load of the machine at that time, as far as it is known.
     """
@@ -77,17 +77,17 @@ def late_replies(
 def describe_late_start(
     bus: str, port: str, late_ns: Sequence[int], planned_ns: int, system: Path = SYSTEM
 ) -> str:
-    """Return the sentence about late replies at the start, without its full stop.
+    """Return a sentence about late replies at start-up, without a full stop.
 
-    It reports what was observed. The adapter's latency timer is named where the kernel shows that it is
-    longer than planned.
+    The sentence reports the observation. It names the adapter's latency timer if the kernel reports that the
+    timer is longer than planned.
 
     Args:
         bus: Name of the bus.
         port: Its port, as in the robot file.
-        late_ns: Time by which each reply came later than wire and return delay need.
+        late_ns: Delay of each reply beyond the time on the wire and the return delay.
         planned_ns: Time that was planned for the adapter.
-        system: Where the kernel shows its devices, for tests.
+        system: Directory in which the kernel lists its devices, for tests.
     """
     late = [each for each in late_ns if each > planned_ns]
     total, most_ms = counted(len(late_ns), "reply", "replies"), max(late, default=0) / 1e6

@@ -1,4 +1,4 @@
-"""Access: a servo or a device on its line, whose control items programs read and write by name."""
+"""Access: a servo or a device on its line, with reads and writes of control items by name."""
 
 from __future__ import annotations
 
@@ -12,53 +12,60 @@ from dxlwire.plan.planning import plan_line
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
-NEAR = 16  # Bytes between two items for which another read would take longer than to read them
-LONGEST_READ = 64  # Bytes; a longer reply would not fit between two cycles
+NEAR = 16
+"""Gap in bytes up to which one longer read is faster than a second read."""
+LONGEST_READ = 64  # bytes; a longer reply would not fit between two cycles
 
 
 class ItemAccess:
-    """Something with an ID as programs reach it; as text it is what messages call it."""
+    """A node with an ID, as programs reach it. Its `str` is its name in messages."""
 
     __slots__ = ("line", "name", "servo_id")
 
     def __init__(self, line: Line, servo_id: int, name: str) -> None:
-        """`line` decides how long replies may take; `name` is that in events."""
+        """Store the address.
+
+        Args:
+            line: Makes the transactions and decides their timeouts.
+            servo_id: ID on the line.
+            name: Source of its events.
+        """
         self.line = line
         self.servo_id = servo_id
         self.name = name
 
     @property
     def table(self) -> Table:
-        """Its control table."""
+        """Control table of the node."""
         raise NotImplementedError
 
     @property
     def items(self) -> Mapping[str, ControlItem]:
-        """Its control items, by name."""
+        """Control items of the node, by name."""
         return self.table.items
 
     def spare(self, end: int) -> int:
-        """Return how many bytes behind an end can be read too."""
+        """Return the number of readable bytes after an end address."""
         return self.table.spare(end, MOST_SPARE)
 
     def reading(self, address: int, size: int) -> Transaction:
-        """Return the read of some bytes."""
+        """Return a transaction that reads bytes."""
         return self.line.read(self.servo_id, address, size, self.spare(address + size))
 
     def writing(self, address: int, data: bytes) -> Transaction:
-        """Return the write of some bytes."""
+        """Return a transaction that writes bytes."""
         return self.line.write(self.servo_id, address, data)
 
     def read_bytes(self, address: int, size: int) -> Program[Reply]:
-        """Read bytes, up to three times."""
+        """Read bytes, with up to three attempts."""
         return retry(self.reading(address, size))
 
     def write_bytes(self, address: int, data: bytes) -> Program[Reply]:
-        """Write bytes, up to three times."""
+        """Write bytes, with up to three attempts."""
         return retry(self.writing(address, data))
 
     def read_one(self, name: str) -> Program[int | None]:
-        """Read an item; None when it does not come, or the model has none of that name."""
+        """Read an item; None without a reply, or if the model does not have the item."""
         item = self.items.get(name)
         if item is None:
             return None
@@ -66,7 +73,7 @@ class ItemAccess:
         return item.decode(reply.parameters) if reply.answered else None
 
     def read(self, names: Iterable[str]) -> Program[dict[str, int] | None]:
-        """Read items, those side by side at once; None when one of them does not come."""
+        """Read items, adjacent ones with one read; None if one reply is missing."""
         found = dict[str, int]()
         for block in side_by_side(self.items[name] for name in names):
             start, end = block[0].address, block[-1].address + block[-1].size
@@ -79,16 +86,16 @@ class ItemAccess:
     def read_near(
         self, names: Iterable[str], optional: Collection[str] = ()
     ) -> Program[tuple[dict[str, int], Reply]]:
-        """Read items with few reads: what is between two that are near each other is read with them.
+        """Read items with few reads: a read covers the bytes between two items that are close together.
 
-        A servo that refuses a read is asked for less at once, down to single items.
+        A read that the servo refuses is split at once, down to single items.
 
         Args:
             names: The items to read.
-            optional: Items without which the others are complete: a servo may refuse them.
+            optional: Items that the servo may refuse.
 
         Returns:
-            The items, and the reply to the last read. If that is not answered, the items are not complete.
+            The values by item, and the last reply. If that reply is not answered, the values are incomplete.
         """
         found, reply = dict[str, int](), Reply(Outcome.OK, 0, b"", 0, 0, False)
         left = _near(self.items[name] for name in names)
@@ -110,10 +117,13 @@ class ItemAccess:
         return found, reply
 
     def write(self, name: str, value: int) -> Program[str]:
-        """Write an item, the integer on the wire, and read it back.
+        """Write an item, as the integer on the wire, and read it back.
 
-        The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by
-        Status Return Level, and EEPROM wears. Returns what went wrong, after the servo's name, or nothing.
+        The read-back decides about success and about another attempt. An acknowledgement may be lost, or
+        switched off by Status Return Level, and EEPROM wears.
+
+        Returns:
+            The problem, without the servo's name at the start; empty on success.
         """
         item, problem = self.items[name], ""
         for _ in range(ATTEMPTS):
@@ -132,7 +142,7 @@ class ItemAccess:
         return (yield from self._explain(item, value, problem))
 
     def _explain(self, item: ControlItem, value: int, problem: str) -> Program[str]:
-        """Return why a value was not taken: the closed EEPROM, or the item that bounds it; else `problem`."""
+        """Return the cause of a failed write: closed EEPROM or the bounding item; else `problem`."""
         if item.area == "EEPROM":
             closed = yield from self.closed_eeprom(f"{item.title} = {value}", unread=problem)
             return closed or problem
@@ -143,19 +153,19 @@ class ItemAccess:
         return f"{problem}; its {title} is {bound}: write {abs(value)} or more there"
 
     def read_bound(self, name: str) -> Program[int | None]:
-        """Read the item that bounds another one, such as PWM Limit of Goal PWM; None: none is known."""
+        """Read the item that bounds another item, such as PWM Limit for Goal PWM; None: no bound is known."""
         return (yield from self.read_one(self.items[name].limited_by))
 
     def closed_eeprom(self, names: str, *, release: str = "", unread: str = "") -> Program[str]:
-        """Return why nothing can be written into the EEPROM now, and the remedy; nothing where it can.
+        """Return the reason why the EEPROM cannot be written now, and the remedy; empty if it can.
 
         Lock (47) closes the EEPROM of Protocol 1.0 until the power is switched off (e-Manual AX-12A, Lock
         (47)), torque that of Protocol 2.0 (e-Manual XM430-W350, Control Table of EEPROM Area).
 
         Args:
-            names: What is to be written.
-            release: Remedy where the servo holds torque.
-            unread: Sentence for a servo that does not answer; by default a sentence about its torque.
+            names: Items to be written, for the message.
+            release: Remedy if the servo holds torque.
+            unread: Message for a servo that does not answer; by default a sentence about its torque.
         """
         if (yield from self.read_one("lock")):
             lock = self.items["lock"].title
@@ -171,14 +181,14 @@ class ItemAccess:
         return ""
 
     def reason(self, reply: Reply) -> str:
-        """Return why the write was refused, behind a colon; nothing where it was not."""
+        """Return the error of a refused write after a colon; empty if the reply is not a refusal."""
         return (
             f": {self.line.dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""
         )
 
 
 class Access(ItemAccess):
-    """A servo of a bus: `reach` has the timeouts of the plan, `first_reach` the longest."""
+    """A servo of a bus. `reach` uses the timeouts of the plan, `first_reach` the longest ones."""
 
     __slots__ = ("plan", "servo")
 
@@ -192,11 +202,11 @@ class Access(ItemAccess):
 
     @property
     def table(self) -> ControlTable:
-        """Its control table."""
+        """Control table of the servo's model."""
         return find_table(self.servo.model, self.plan.protocol)
 
     def spare(self, end: int) -> int:
-        """Return how many bytes behind an end can be read too."""
+        """Return the number of readable bytes after an end address."""
         return _spare(self.servo.model, self.plan.protocol, end)
 
     def read_torque(self) -> Program[Reply]:
@@ -214,17 +224,17 @@ def _spare(model: str, protocol: float, end: int) -> int:
 
 
 def reach(plan: BusPlan, servo: ServoPlan) -> Access:
-    """Return the access to a servo whose return delay is as planned."""
+    """Return access to a servo whose return delay is as planned."""
     return Access(plan, servo, plan_line(plan))
 
 
 def first_reach(plan: BusPlan, servo: ServoPlan) -> Access:
-    """Return the access to a servo before its return delay is known."""
+    """Return access to a servo whose return delay is not known yet."""
     return Access(plan, servo, setup_line(plan))
 
 
 def _near(items: Iterable[ControlItem]) -> list[list[ControlItem]]:
-    """Group items by address, so that one read gets a group with what is between."""
+    """Group items by address; one read covers a group and the gaps in it."""
     groups: list[list[ControlItem]] = []
     for item in sorted(items, key=lambda one: one.address):
         if groups:

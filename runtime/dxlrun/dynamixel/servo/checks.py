@@ -1,8 +1,8 @@
-"""Checks: what must hold for a servo before it may get torque, at the start and when it returns.
+"""Checks: conditions that a servo must meet before it may get torque, at start-up and when it returns.
 
-`CHECKS` is the table of what is compared with the plan: control item, predicate, sentence. Every other
-setting that is not the factory's is judged by its control table (`deviations.toml`). `inspect` reads one
-servo and does both; `survey` looks at a whole bus: presence, registers, states. All of it only reads.
+`CHECKS` is the table of comparisons with the plan: control item, predicate, sentence. The control table
+(`deviations.toml`) judges every other setting that differs from the factory's. `inspect` applies both to one
+servo; `survey` checks a whole bus: presence, registers, states. All of them only read.
 """
 
 from __future__ import annotations
@@ -36,49 +36,51 @@ from dxlwire.plan.retry import ATTEMPTS, retry
 from dxlwire.transaction import Outcome, Program, Reply
 from dxlwire.wire.protocol1 import describe_error
 
-RETURN_ALL = 2  # Status Return Level: every instruction is answered
+RETURN_ALL = 2  # Status Return Level: the servo answers every instruction
 PINGS = 3  # Two servos of one ID collide in most of three answers
 LISTEN_NS = 2_000_000
-"""After a ping: a second servo of the same ID may answer with another return delay, at most 0.508 ms."""
+"""Listening time after a ping. A second servo with the same ID may answer with another return delay, at most
+0.508 ms."""
 STATUS_ERROR = "status_error"
-"""Stands in for a control item: the error byte of Protocol 1.0; in 2.0 an item has the hardware errors."""
+"""Pseudo item for the error byte of Protocol 1.0. In Protocol 2.0 an item reports hardware errors."""
 
 _IDENTITY = ("model_number", "firmware_version")
 _MODES = {"operating_mode", "control_mode"}
-_MOST_NAMED = 4  # Servos that a sentence about several names
+_MOST_NAMED = 4  # servos that one message names, to keep it readable
 
 
 class Inspected(msgspec.Struct, frozen=True):
-    """What was read of one servo, and what it is compared with."""
+    """Register values of one servo, and the plan with which they are compared."""
 
     plan: BusPlan
     servo: ServoPlan
     items: Mapping[str, ControlItem]
     values: Mapping[str, int]
-    """By item; where the robot file declares a register, what the start will have written."""
+    """Integers on the wire, by item. A register that the robot file declares has the declared value, because
+    start-up writes it."""
     errors: HardwareErrors
     take_over: bool
 
     def title(self, name: str) -> str:
-        """Return an item as messages name it."""
+        """Return the title of an item for messages."""
         return self.items[name].title
 
 
 class Check(NamedTuple):
     """One row of the table."""
 
-    item: str  # The check applies where the servo has this item
-    fails: Callable[[Inspected, int], bool]  # Predicate on the item's value
+    item: str  # the check applies if the servo has this item
+    fails: Callable[[Inspected, int], bool]  # predicate on the item's value
     sentence: Callable[[Inspected, int], str]
-    """What is wrong and how to fix it, behind the servo's name."""
-    refuses: bool = True  # The servo gets no torque; False: the difference is reported
+    """Problem and fix, without the servo's name at the start."""
+    refuses: bool = True  # True: the servo gets no torque. False: the difference is only reported
 
 
 def _limits(low: str, high: str, names: str) -> Check:
     def fails(found: Inspected, lowest: int) -> bool:
         servo, highest = found.servo, found.values[high]
         if servo.continuous or (found.plan.protocol == 1.0 and lowest >= highest):
-            return False  # not in joint mode: the start brings it there
+            return False  # not in joint mode yet: start-up switches it
         return lowest > servo.lower_tick or highest < servo.upper_tick
 
     def sentence(found: Inspected, lowest: int) -> str:
@@ -166,7 +168,7 @@ CHECKS: tuple[Check, ...] = (
         lambda found, raw: f"reports in {found.title(found.errors.item)}: {found.errors.describe(raw)}",
         refuses=False,
     ),
-    Check(  # the start clears what an earlier run left; reported where this run arms none itself
+    Check(  # Start-up clears a watchdog that an earlier run left armed; report it if this run arms none.
         "bus_watchdog",
         lambda found, raw: raw != 0 and not found.plan.watchdog_ticks,
         _watchdog_sentence,
@@ -189,11 +191,11 @@ CHECKS: tuple[Check, ...] = (
         ),
     ),
 )
-"""In the order in which problems are reported; what each refuses is in failures.md."""
+"""Checks in the order in which problems are reported; failures.md lists the condition that each refuses."""
 
 
 def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
-    """Look at every servo of the bus, and collect all problems of all servos."""
+    """Check every servo of the bus and collect the problems of all of them."""
     yield listen(LISTEN_NS)
     every = [first_reach(plan, servo) for servo in plan.servos]
     if every and (yield from _echoes(every[0], found)):
@@ -217,14 +219,15 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
 
 
 def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
-    """Read the registers that matter, walk the table, and judge what another program left there.
+    """Read the relevant registers of a servo, apply the table, and judge settings that another program left.
 
-    Returns the mode in which the servo is, which is brought into its first one before it gets torque; None
-    when it cannot be read.
+    Returns:
+        The present mode of the servo, which start-up changes to the first mode before torque on; None if it
+            cannot be read.
     """
     plan, servo = one.plan, one.servo
     wanted: tuple[str, ...] = _IDENTITY
-    # an older firmware may refuse to read the items that came later
+    # Read the firmware version first: an older firmware may refuse to read items that came later.
     read, reply = yield from one.read_near(wanted)
     if reply.answered:
         items = one.table.with_firmware(read["firmware_version"]).items
@@ -250,7 +253,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
                 found.problems.append(f"{one} {sentence}")
             else:
                 found.note(EventCode.REGISTER_DIFFERS, Severity.WARNING, servo.joint, sentence)
-    # torque control mode of Protocol 1.0 is RAM, and only of some models: it is not read here
+    # Torque control mode of Protocol 1.0 is in RAM, and only some models have it: it is not read here.
     mode = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
     for each in deviations(one, values, mode, declared):
         if each.refused:
@@ -263,10 +266,10 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
 def deviations(
     one: Access, values: Mapping[str, int], mode: Mode, declared: Collection[str] = ()
 ) -> tuple[FoundDeviation, ...]:
-    """Return which values of a servo are not the factory's and matter.
+    """Return the values of a servo that differ from the factory's and matter.
 
-    Neither `declared` items nor the goals of its mode, or of that in which it starts, are judged: these are
-    written before torque.
+    `declared` items are not judged, nor are the goals of the present mode or the start mode: all of these are
+    written before torque on.
     """
     known = one.servo.modes
     goals = [goal for each in known if each.mode in (mode, one.servo.start_mode) for goal in each.goals]
@@ -283,7 +286,7 @@ def deviations(
 
 @functools.cache
 def _inspected(model: str, protocol: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the items of a model that decide about a start, and those that only may differ."""
+    """Return the items of a model that can refuse a start, and those that can only differ."""
     items = find_table(model, protocol).items
     essential = {check.item for check in CHECKS} | _MODES
     optional = set[str]()
@@ -306,7 +309,12 @@ def _refusal(one: Access, found: FoundDeviation) -> str:
 
 
 def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
-    """Read every state twice, each of a servo in a mode: inside the limits, and no jump in between."""
+    """Read every state twice, and check that it is within the limits and does not jump.
+
+    Args:
+        servos: Each servo with its present mode.
+        found: Collects the problems.
+    """
     before: dict[int, tuple[int, int]] = {}
     for again in (False, True):
         for one, mode in servos:
@@ -329,7 +337,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
 
 
 def _echoes(one: Access, found: Findings) -> Program[bool]:
-    """Find out whether the adapter echoes: a read cannot be mistaken for its own answer."""
+    """Return True if the adapter echoes. A read is sent because it cannot be mistaken for its own answer."""
     reply = yield one.reading(0, 3)
     if reply.echoed:
         found.problems.append(
@@ -340,7 +348,7 @@ def _echoes(one: Access, found: Findings) -> Program[bool]:
 
 
 def _answers(one: Access, found: Findings) -> Program[bool | None]:
-    """Ping a servo three times; report collisions and loose contacts. None: it is silent."""
+    """Ping a servo three times, and report ID collisions and loose contacts. None: no answer."""
     answered = disturbed = 0
     for _ in range(PINGS):
         reply = yield one.line.ping(one.servo.servo_id)
@@ -364,7 +372,7 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
 
 
 def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
-    """Return one sentence about all servos of a bus that do not answer, with the command that looks."""
+    """Return one sentence about all silent servos of a bus, with the command that finds them."""
     look = "" if plan.port == SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
     rate = f"that it runs at {plan.baud_rate} bit/s{look}"
     if len(silent) == 1:
@@ -387,7 +395,10 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
 
 
 def _unreadable(one: Access, title: str, reply: Reply) -> str:
-    """Return why a servo that answered its pings could not be read. Silence says nothing about a register."""
+    """Return the reason why a servo that answered its pings could not be read.
+
+    A timeout is not evidence against a certain register.
+    """
     if reply.outcome is Outcome.TIMEOUT:
         level = one.items["status_return_level"].title
         remedy = choose_remedy(one.plan.port, f"{CHECK}, and its {level}")
@@ -400,9 +411,9 @@ def _unreadable(one: Access, title: str, reply: Reply) -> str:
 
 def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
     if mode != servo.start_mode:
-        return ""  # its position counts in another mode; it is looked at again before it gets torque
+        return ""  # the position counts differently in another mode; it is checked before torque on
     if not servo.torque_at_start:
-        return ""  # a person moves it as far as it goes; `hold` looks at it before it gets torque
+        return ""  # a person may move it anywhere; `hold` checks it before torque on
     if raw > servo.max_tick and not servo.continuous:
         return f"reports position {raw}, beyond its {servo.max_tick} ticks"
     if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
@@ -411,7 +422,7 @@ def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
 
 
 def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> str:
-    """Return what is wrong between two positions, each (ticks, time in ns), or nothing."""
+    """Return the problem between two positions, each (ticks, time in ns), or an empty string."""
     moved = abs(after[0] - before[0]) * servo.rad_per_tick
     fastest = servo.max_speed_tick * servo.rad_s_per_tick * (after[1] - before[1]) * 1e-9
     if moved <= fastest + 2 * servo.rad_per_tick:

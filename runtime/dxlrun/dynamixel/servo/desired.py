@@ -1,7 +1,7 @@
-"""Desired state of the servos of one bus: mode and registers, changed in the run, kept over a reset.
+"""Desired state of the servos of one bus: modes and registers that can change in a run and survive a reset.
 
-Clients and controllers request changes; programs carry them out in idle time and read them back. A servo that
-was offline is brought to the newest of it again.
+Clients and controllers request changes. Programs write them in idle time and read them back. A servo that was
+offline is brought to the newest desired state again.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ from dxlwire.plan.line import listen
 from dxlwire.transaction import Program
 
 PAUSES_NS = (50_000_000, 150_000_000, 0)
-"""After attempts to reach a register: a stalled machine or adapter is no reason to fail a request."""
+"""Pauses after attempts to reach a register. A request must not fail because the machine or the adapter
+stalls for a moment."""
 RegisterDone = Callable[[str, int | None], None]
-"""Takes what went wrong with a register, or an empty text, and what the servo had there; None: not known."""
+"""Callback with the problem (empty on success) and the previous value of the register; None: not known."""
 
 
 class DesiredState:
-    """The mode in which each servo of one bus shall be, and the registers that it shall hold.
+    """The desired mode and the desired registers of each servo of one bus.
 
-    While a mode changes, the robot's `mode` shows UNKNOWN and no goal is sent. Where a servo refuses or does
-    not answer, its mode is read again; one that cannot be read stays UNKNOWN until the servo is taken back.
+    While a mode changes, the robot's `mode` is UNKNOWN and no goal is sent. If a servo refuses or does not
+    answer, its mode is read again. If that fails, the mode stays UNKNOWN until the servo has been recovered.
     """
 
     def __init__(self, life: Life, goals: GoalArrays, reboots: Reboots, mode: NDArray[np.uint8]) -> None:
-        """`mode` is the robot's array of the modes in which the joints are."""
+        """Store the arrays; `mode` is the robot's array of the joints' present modes."""
         self._servos = life.plan.servos
         self._life = life
         self._goals = goals
@@ -51,25 +52,29 @@ class DesiredState:
         self._settings = [servo.settings for servo in self._servos]
 
     def mode(self, index: int) -> Mode:
-        """Return the mode in which a servo is, or shall be as soon as it can."""
+        """Return the desired mode of a servo: its present mode, or the one into which it will change."""
         return self._modes[index]
 
     def mode_shown(self, index: int) -> Mode:
-        """Return the mode that the robot's states show; UNKNOWN while the mode changes."""
+        """Return the mode in the robot's states; UNKNOWN while the mode changes."""
         return self._goals.modes[index]
 
     def resting(self, index: int) -> tuple[int, bytes] | None:
-        """Return where a servo that is led to no position has its goal, and that of standing still."""
+        """Return address and bytes of the goal that stops a servo; None if it follows a position."""
         mode = self._goals.modes[index]
         goal = None if mode is Mode.UNKNOWN else self._servos[index].mode_plan(mode).goals[-1]
         return None if goal is None or goal.position is not None else (goal.address, bytes(goal.length))
 
     def settings(self, index: int) -> tuple[RegisterValue, ...]:
-        """Return what a servo that was reset shall hold again, in the order in which it is written."""
+        """Return the desired registers of a servo, in the order in which a reset servo gets them again."""
         return self._settings[index]
 
     def change_modes(self, requested: NDArray[np.uint8]) -> None:
-        """Let servos change into modes, shape (joints,), UNKNOWN: none; a later request replaces this one."""
+        """Request modes for servos; a later request replaces this one.
+
+        Args:
+            requested: Mode of each joint, shape (joints,); UNKNOWN: no change.
+        """
         for index, servo in enumerate(self._servos):
             mode = Mode(int(requested[servo.row]))
             if mode is Mode.UNKNOWN:
@@ -79,19 +84,19 @@ class DesiredState:
                 self._begin_change(index)
 
     def entered(self, index: int, mode: Mode) -> None:
-        """Record that a servo was brought into a mode: at the start, by a change, or when it returned."""
+        """Record that a servo is in a mode: after start-up, after a change, or on its return."""
         self._modes[index] = mode
         self._show(index, mode)
 
     def returned(self, index: int, mode: Mode) -> None:
-        """Record that a servo returned in a mode; another one that was requested meanwhile follows.
+        """Record that a servo returned in a mode; start a change if another mode was requested by then.
 
-        Features restore what they wrote to it.
+        Features restore the registers that they wrote.
         """
         for part in self._life.parts:
             part.recover_servo(index)
         if self._changing[index]:
-            return  # its change is next in idle time, and reads the mode then
+            return  # its change waits for idle time, and will read the mode
         if mode == self._modes[index]:
             self.entered(index, mode)
         else:
@@ -107,11 +112,12 @@ class DesiredState:
         self._life.do(index, self._change_mode(index), "the mode", Urgency.MODE)
 
     def _change_mode(self, index: int) -> Program[None]:
-        """Change into the newest mode that is requested, and report what came of it.
+        """Change to the newest requested mode and report the result.
 
-        A servo that reboots meanwhile gets no torque back by that: it is lost, and returns by the policy. One
-        that is lost already is left alone: its watchdog may have stopped it, and then it would refuse the
-        goal that it needs to hold in another mode. Its return brings it into the newest mode.
+        A servo that reboots during the change does not get its torque back here: it counts as lost, and
+        returns by the policy. A servo that is already lost is not changed: its watchdog may have stopped it,
+        and then it would refuse the goal that it needs to hold in another mode. Its recovery switches it to
+        the newest mode.
         """
         life, one, mode = self._life, self._life.reach(index), self._modes[index]
         if life.offline(index):
@@ -144,14 +150,14 @@ class DesiredState:
             life.report(EventCode.MODE, Severity.ERROR, index, f"{problem}; it is in {_words(mode)}")
             self._show(index, mode)
             self._modes[index] = mode or self._modes[index]
-        elif self._modes[index] != mode:  # another request came meanwhile
+        elif self._modes[index] != mode:  # a newer request came during the change
             self._begin_change(index)
         else:
             self.entered(index, mode)
             life.report(EventCode.MODE, Severity.INFO, index, f"is in {_words(mode)}")
 
     def read_limits(self, index: int) -> Program[None]:
-        """Read the limits beyond which a servo refuses goals: another one may have taken its place."""
+        """Read the limits beyond which a servo refuses goals; the servo may have been replaced."""
         self._goals.set_limits(index, (yield from modes.read_limits(self._life.reach(index))))
 
     def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
@@ -160,7 +166,7 @@ class DesiredState:
             yield from restore_torque_limit(self._life.reach(index), mode, found)
 
     def read_register(self, index: int, item: str, done: RegisterDone) -> None:
-        """Read an item in idle time; `done` takes what went wrong, and what the servo has."""
+        """Read an item in idle time; `done` receives the problem and the value."""
         one = self._life.reach(index)
         entry = one.items.get(item)
         if entry is None:
@@ -181,9 +187,9 @@ class DesiredState:
         done("" if found is not None else f"{one} did not answer when {title} was read", found)
 
     def write_register(self, index: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write a RAM item in idle time, if the servo has something else.
+        """Write a RAM item in idle time if the servo has another value.
 
-        `done` takes what went wrong, and what the servo had before.
+        `done` receives the problem and the previous value.
         """
         one = self._life.reach(index)
         entry = one.items.get(item)
@@ -194,7 +200,7 @@ class DesiredState:
         self._life.do(index, self._write(index, register, done), entry.title, Urgency.STEERED)
 
     def _write(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
-        """Write one register, and try again later while the servo is silent."""
+        """Write one register, and retry after a pause if the servo is silent."""
         life, one = self._life, self._life.reach(index)
         for pause_ns in PAUSES_NS:
             found = Findings()

@@ -1,4 +1,4 @@
-"""A servo's life as one state machine: its states, the events that lead from one to the next, the table.
+"""Life of a servo as one state machine: its states, its events, and the table of transitions.
 
            engaged          torque on             doubt: back to HOLDING
     LIMP ---------> HOLDING ---------> TORQUED
@@ -11,27 +11,28 @@
       lost ---> OFFLINE -- returned limp --> LIMP
       release -> RELEASED -- requested --> LIMP -- torque given --> GIVEN
 
-TORQUE_GIVEN is the one way to torque after the start, from any state but RELEASED. Only `modes.hold` writes
-torque on: it sets the goal to the measured position first. The servo then gets no goal until the loop's goal
-is where the joint is, too (ANCHORED), and its torque was read once more.
+TORQUE_GIVEN is the only way to torque after the start, from any state but RELEASED. Only `modes.hold` writes
+torque on, after it has set the goal to the measured position. The servo then gets no goal until the loop's
+goal equals its position (ANCHORED) and its torque enable has been read once more.
 
-What drives it are programs, generators that yield transactions to a bus and end in an event:
+Programs drive the state machine. A program is a generator that yields transactions to a bus and ends in an
+event:
 
 | program | file | events |
 |---|---|---|
 | start-up: check, set up, hold, confirm | `startup.py`, `checks.py` | ENGAGED, TORQUE_ON |
 | read torque enable, hardware error, torque limit | `servos.py` | TORQUE_ON, TORQUE_OFF, DOUBT, LOST |
-| probe an offline servo, and take it back | `offline.py` | TORQUE_GIVEN; RETURNED, TORQUE_ON; RETURNED_LIMP |
+| probe and recover an offline servo | `offline.py` | TORQUE_GIVEN; RETURNED, TORQUE_ON; RETURNED_LIMP |
 | read Realtime Tick, which shows a reboot | `offline.py`, `slow_registers.py` | LOST |
 | switch torque off, until it is requested | `requests.py` | RELEASE, then LOST where it fails |
 | switch torque on at a client's request | `requests.py` | REQUESTED; TORQUE_GIVEN or RELEASE |
 | reboot at a client's request | `requests.py` | LOST; its return is that of an offline servo |
 | change a mode | `desired.py`, `modes.py` | TORQUE_GIVEN; DOUBT where the mode is not confirmed |
-| revive a servo its watchdog stopped | `watchdog_monitor.py` | WATCHDOG, then LOST where it fails |
+| revive a servo that its watchdog stopped | `watchdog_monitor.py` | WATCHDOG, then LOST where it fails |
 
-The cyclic exchange itself has three events: a lost reply is DOUBT, many in a row are LOST, and a position
-near the goal is CAUGHT_UP. The loop has one: ANCHORED. Which servos get goals, how fast they may follow them,
-and which are read in a cycle follows from the state, and is changed nowhere else.
+The cyclic exchange has three events: a lost reply is DOUBT, many in a row are LOST, and a position near the
+goal is CAUGHT_UP. The loop has one: ANCHORED. The state alone decides which servos get goals, how fast they
+may follow them, and which servos a cycle reads.
 """
 
 from __future__ import annotations
@@ -56,54 +57,58 @@ from dxlwire.transaction import Program
 
 @unique
 class ServoState(Enum):
-    """What a servo is doing."""
+    """State of a servo."""
 
     LIMP = "limp"
-    """Read in every cycle, without torque; it gets no goals, because a goal may switch torque on."""
+    """Read in every cycle, without torque. It gets no goals, because a goal may switch torque on."""
     HOLDING = "holding"
-    """Read in every cycle; holds its last goal, and gets no other before its torque enable was read as 1."""
-    TORQUED = "torqued"  # Has torque for certain, and gets goals
+    """Read in every cycle. It holds its last goal, and gets no other before its torque enable was read as 1.
+    """
+    TORQUED = "torqued"  # torque is confirmed; gets goals
     STOPPED = "stopped"
-    """As HOLDING, after its watchdog stopped it or it was offline: it will go to its goal slowly."""
+    """Like HOLDING, after its watchdog stopped it or after it was offline. It will move to its goal slowly.
+    """
     RETURNING = "returning"
-    """Has torque for certain, and goes to its goal at RETURN_SPEED at most, until it has caught up."""
+    """Torque is confirmed; it moves to its goal at RETURN_SPEED at most, until it has caught up."""
     GIVEN = "given torque"
-    """Has torque again, and holds where it is: it gets no goals before the loop's goals are there, too."""
+    """Has torque again and holds its position. It gets no goals before the loop's goals equal that position.
+    """
     OFFLINE = "offline"
-    """Out of the cyclic reads; probed now and then, and taken back when it is in order."""
+    """Not in the cyclic reads. It is probed periodically, and recovered when it passes the checks."""
     RELEASED = "released"
-    """Read in every cycle; its torque was switched off by a client, a policy or the robot file, and stays off
-    whatever policies say, until a client requests it."""
+    """Read in every cycle. A client, a policy or the robot file switched its torque off. No policy switches
+    it on again; only a client's request does."""
 
 
 @unique
 class ServoEvent(Enum):
-    """What happens to a servo."""
+    """Event in the life of a servo."""
 
-    ENGAGED = "engaged"  # Start-up: its goal is where it stands, torque is on, both were read back
-    TORQUE_ON = "torque on"  # Torque enable was read as 1
+    ENGAGED = "engaged"  # start-up: goal = present position, torque on, both read back
+    TORQUE_ON = "torque on"  # torque enable was read as 1
     TORQUE_OFF = "torque off"
-    """Torque enable was read as 0 for a reason that is known, or a shutdown made it powerless."""
+    """Torque enable was read as 0 for a known reason, or a shutdown cut the torque."""
     DOUBT = "doubt"
-    """Torque may be off: a reply was lost, an error raised, a mode changed without a confirmation."""
-    WATCHDOG = "watchdog"  # Its Bus Watchdog has stopped it
-    CAUGHT_UP = "caught up"  # It is near its goal again
+    """Torque may be off: a reply was lost, an error was raised, or a mode change was not confirmed."""
+    WATCHDOG = "watchdog"  # its Bus Watchdog has stopped it
+    CAUGHT_UP = "caught up"  # it is near its goal again
     LOST = "lost"
-    """It leaves the cyclic reads: silent, rebooted, its line was gone, or it cannot be trusted."""
-    RETURNED = "returned"  # It takes part again, and kept its torque and its goal meanwhile
-    RETURNED_LIMP = "returned limp"  # It is in order again, without torque
+    """It leaves the cyclic reads: it is silent, it rebooted, its line was lost, or it cannot be trusted."""
+    RETURNED = "returned"  # back in the exchange, and kept its torque and its goal while offline
+    RETURNED_LIMP = "returned limp"  # back in the exchange, without torque
     TORQUE_GIVEN = "torque given"
-    """Its torque was switched on where it is, or it has torque with a goal that this run did not give it."""
-    ANCHORED = "anchored"  # The loop's goals for it are where it is
+    """Its torque was switched on at its present position, or it has torque with a goal that this run did not
+    send."""
+    ANCHORED = "anchored"  # the loop's goals for it equal its position
     REQUESTED = "requested"
-    """A client requests torque: TORQUE_GIVEN follows, or RELEASE when the servo cannot get it."""
-    RELEASE = "release"  # A client, a policy or the robot file switches its torque off
+    """A client requests torque. TORQUE_GIVEN follows, or RELEASE if the servo cannot get it."""
+    RELEASE = "release"  # a client, a policy or the robot file switches its torque off
 
 
 _ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
-"""From every state in which a servo is read."""
+"""Transitions from every state in which a servo is read."""
 _ENGAGED = {**_ONLINE, ServoEvent.TORQUE_GIVEN: ServoState.GIVEN}
-"""From every state in which a servo may have torque."""
+"""Transitions from every state in which a servo may have torque."""
 _S, _E = ServoState, ServoEvent
 
 TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
@@ -139,7 +144,7 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
             _E.ANCHORED: _S.STOPPED,
         },
         _S.OFFLINE: {
-            # of RELEASE, `Loss.released` is kept until the servo is back
+            # RELEASE sets `Loss.released`, which takes effect when the servo is back.
             **dict.fromkeys((_E.DOUBT, _E.LOST, _E.RELEASE), _S.OFFLINE),
             _E.RETURNED: _S.STOPPED,
             _E.TORQUE_GIVEN: _S.GIVEN,
@@ -152,11 +157,11 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
         },
     }
 )
-"""Every legal transition; another event in a state is a mistake of this program."""
+"""Every legal transition. Any other event in a state is a bug in this program."""
 
 GETS_GOALS = frozenset((ServoState.TORQUED, ServoState.RETURNING))
 IN_DOUBT = frozenset((ServoState.HOLDING, ServoState.STOPPED))
-"""Their torque enable is read as soon as there is time for it."""
+"""States of servos whose torque enable is read as soon as idle time permits."""
 POWERLESS = frozenset((ServoState.LIMP, ServoState.RELEASED))
 _SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE))
 _SHOWN: Mapping[ServoState, Torque] = {
@@ -167,70 +172,78 @@ _SHOWN: Mapping[ServoState, Torque] = {
     ServoState.OFFLINE: Torque.LOST,
     ServoState.RELEASED: Torque.RELEASED,
 }
-"""What the robot's states have of a servo's state."""
+"""Torque value in the robot's states for each servo state."""
 
 Done = Callable[[str], None]
-"""Takes what came of a request for a servo: what went wrong, or an empty text."""
+"""Callback with the problem of a request for a servo; empty on success."""
 
 
 class IllegalTransition(LookupError):
-    """An event in a state that does not have it."""
+    """An event that the present state does not allow."""
 
 
 class RequestedReboot(msgspec.Struct):
-    """A reboot that a client requested, until the servo is back or the time for that is over."""
+    """A reboot that a client requested, until the servo is back or the timeout has passed."""
 
-    had_torque: bool  # It had torque before, and gets it back
-    until_ns: int  # When the client gets its answer at the latest
-    done: Done  # Takes what went wrong, or an empty text
+    had_torque: bool  # had torque before, and gets it back
+    until_ns: int  # deadline for the answer to the client
+    done: Done  # receives the problem, or an empty text
 
 
 class Loss(msgspec.Struct):
-    """What is known of a servo while it is OFFLINE."""
+    """Record of a servo while it is OFFLINE."""
 
     had_torque: bool
-    """It had torque when it was lost: torque that is off now shows a reboot, where no clock does."""
-    kept_goal: bool  # Its goal is the last one that the loop sent
-    limp_reported: bool  # That it has no torque was reported already
-    released: bool  # It is to be RELEASED when it is back
-    rebooted: bool  # A reboot was counted since it took part
-    probe_at_ns: int  # When it is probed next
-    probing: bool = False  # A probe is under way, or waits for idle time
-    problem: str = ""  # Why it could not be taken back, as reported last
-    reboot: RequestedReboot | None = None  # The client's request that it is offline for
+    """True if it had torque when it was lost. Torque off on its return then shows a reboot, which matters for
+    servos without Realtime Tick."""
+    kept_goal: bool  # its goal is the last one that the loop sent
+    limp_reported: bool  # the missing torque has been reported
+    released: bool  # becomes RELEASED when it is back
+    rebooted: bool  # a reboot was counted since the loss
+    probe_at_ns: int  # time of the next probe
+    probing: bool = False  # a probe runs or waits for idle time
+    problem: str = ""  # last reported reason why it could not be recovered
+    reboot: RequestedReboot | None = None  # the client's reboot request that caused the loss
 
     @property
     def kept_torque(self) -> bool:
-        """True where torque that is still on is the torque that the servo had, with the goal that it had."""
+        """True if torque that is still on is the servo's own earlier torque, with its earlier goal."""
         return self.had_torque and self.kept_goal and not self.rebooted
 
 
 class Life:
-    """The state of each servo of one bus, and what follows from it; programs that drive it wait in `idle`."""
+    """The state of each servo of one bus, with the consequences of each state.
+
+    Programs that change states are scheduled in `idle`.
+    """
 
     def __init__(
         self, idle: IdleScheduler, reads: CyclicReads, events: EventSink, parts: Sequence[BusPart] = ()
     ) -> None:
-        """`parts`: of features, which learn that a servo returned."""
+        """Start with every servo LIMP; `parts` are the features' parts that learn of a servo's return."""
         count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
         self.plan = idle.plan
         self.events = events
         self.parts = parts
         self.idle = idle
-        self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
-        self.states = [ServoState.LIMP] * count  # The state of each servo
-        self.losses: dict[int, Loss] = {}  # Of each servo that is OFFLINE, by its index
+        self.reads = reads  # the cyclic reads, without OFFLINE servos
+        self.states = [ServoState.LIMP] * count  # state of each servo
+        self.losses: dict[int, Loss] = {}  # record of each OFFLINE servo, by index
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
-        """Shape (servos,): the servos that get goals; memory that the exchange kernel shares."""
+        """Servos that get goals, shape (servos,); memory shared with the exchange kernel."""
         self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
-        """Shape (servos,), a Torque: what the robot's states have of each servo from the next read on."""
-        self.torque_changed = True  # It is another one than the robot's states show
+        """A Torque per servo, shape (servos,): published in the robot's states from the next read on."""
+        self.torque_changed = True  # `torque` differs from the robot's states
         self.ceiling: Floats = np.full(count, np.nan)
-        """Shape (servos,): the highest speeds toward positions, rad/s; NaN: no limit but that of the goal."""
+        """Highest speed toward a position, rad/s, shape (servos,); NaN: only the goal's own limit."""
 
     def on(self, index: int, event: ServoEvent) -> ServoState:
-        """Change a servo's state by an event, and return it; raises IllegalTransition."""
+        """Change a servo's state by an event and return the new state.
+
+        Raises:
+            IllegalTransition: The present state does not allow the event.
+        """
         before = self.states[index]
         after = TRANSITIONS[before].get(event)
         if after is None:
@@ -255,28 +268,31 @@ class Life:
         return after
 
     def give_torque(self, index: int) -> None:
-        """Record that `modes.hold` gave a servo torque where it is; of a lost one: its goal is another."""
+        """Record that `modes.hold` gave a servo torque at its present position.
+
+        A lost servo stays lost; only its goal changed.
+        """
         if self.offline(index):
             self.losses[index].kept_goal = False
         elif self.states[index] not in POWERLESS:
             self.on(index, ServoEvent.TORQUE_GIVEN)
 
     def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
-        """Take a servo out of the exchange, to be probed after a while until it is in order."""
+        """Take a servo out of the exchange. It is probed after a delay, until it passes the checks."""
         self.on(index, ServoEvent.LOST)
         loss = self.losses[index]
         loss.probe_at_ns += probe_after_ns
         return loss
 
     def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
-        """Take a servo that reboots by request out of the exchange, until it is back or `answered`."""
+        """Take a servo out of the exchange for a requested reboot, until it is back or has `answered`."""
         loss = self.lose(index, probe_after_ns)
         loss.reboot = request
         self._show(index, Torque.REBOOTING)
         return loss
 
     def answered(self, index: int) -> None:
-        """Show a servo whose requested reboot is over and that is still OFFLINE as lost."""
+        """Show a servo as lost if its requested reboot is over and it is still OFFLINE."""
         if self.offline(index):
             self._show(index, Torque.LOST)
 
@@ -285,7 +301,7 @@ class Life:
         self.torque_changed = True
 
     def _loss(self, before: ServoState, earlier: Loss | None) -> Loss:
-        """Return what is known of a servo that is lost, in a state or once more."""
+        """Return the record of a lost servo; `earlier` is its record if it was OFFLINE already."""
         powerless = before in POWERLESS if earlier is None else earlier.limp_reported
         return Loss(
             had_torque=not powerless,
@@ -299,15 +315,15 @@ class Life:
 
     @property
     def calm(self) -> bool:
-        """True when every servo gets goals: none is offline, none in doubt."""
-        return self.torqued.tobytes() == self._all_torqued  # a tenth of the time of looking at the states
+        """True if every servo gets goals: none is offline, none in doubt."""
+        return self.torqued.tobytes() == self._all_torqued  # ten times faster than comparing the states
 
     def offline(self, index: int) -> bool:
-        """Return whether a servo is out of the exchange."""
+        """Return True if a servo is out of the exchange."""
         return self.states[index] is ServoState.OFFLINE
 
     def now_ns(self) -> int:
-        """Return the time."""
+        """Return the time of the run's clock."""
         return self.idle.now_ns()
 
     def reach(self, index: int) -> Access:
@@ -315,15 +331,16 @@ class Life:
         return reach(self.plan, self.plan.servos[index])
 
     def name(self, index: int) -> str:
-        """Return what messages call a servo."""
+        """Return the name of a servo for messages."""
         return self.plan.label(self.plan.servos[index])
 
     def do(self, index: int, program: Program[None], what: str, urgency: Urgency = Urgency.REPAIR) -> None:
-        """Let a program about a servo be carried out in idle time; `what`: as `torque enable`."""
+        """Schedule a program for a servo in idle time; `what` names its object in messages, as in `torque
+        enable`."""
         self.idle.add(program, urgency, f"{what} of {self.name(index)}", index)
 
     def report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
-        """Log an event of a servo; `text` stands behind its name."""
+        """Log an event of a servo; its name is put before `text`."""
         self.events.emit(code, severity, self.plan.servos[index].joint, f"{self.name(index)} {text}")
 
     def report_limp(self, index: int, enabled: int) -> None:

@@ -1,10 +1,11 @@
-"""Mode switches of one servo: torque off, what selects the mode, what that resets, a goal that moves nothing.
+"""Mode switches of one servo: torque off, mode registers, registers that the switch resets, a goal without
+motion.
 
-Programs for the start and for idle time. A switch leaves the torque as it was: on again only where it had
-been on, where a servo refuses in the mode that it keeps.
+These programs run at start-up and in idle time. A switch keeps the torque as it was: it is switched on again
+only if it was on before. A servo that refuses the new mode gets torque back in its old mode.
 
-Sources: e-Manual XM430-W350, Operating Mode (11), for what a change needs and what it resets; MX-64, CW/CCW
-Angle Limit (6, 8) and Torque Control Mode Enable (70).
+Sources: e-Manual XM430-W350, Operating Mode (11), for the conditions and side effects of a change; MX-64,
+CW/CCW Angle Limit (6, 8) and Torque Control Mode Enable (70).
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from dxlwire.plan.mode_plan import in_mode, mode_in
 from dxlwire.transaction import Outcome, Program
 
 ENGAGE_SPEED = 0.5
-"""rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
+"""rad/s. The goal is the present position; if that was misread, the servo moves to the goal slowly."""
 FARTHEST_INWARD = 1.0
-"""rad, no farther is a wheel taken back [i]: one that made more turns than its servo counts would wind all of
-them up."""
-LONGEST_BACK = 64  # Bytes; items farther apart are read back one by one
+"""rad [i]. A continuous servo is not moved back into its limits from farther away: after more turns than its
+counter holds it would unwind all of them."""
+LONGEST_BACK = 64  # bytes; items farther apart are read back one by one
 STARTED_ANEW = "started anew while its mode was changed"
 _RESET = (
     "velocity_i_gain",
@@ -41,18 +42,19 @@ _RESET = (
     "feedforward_1st_gain",
     "profile_acceleration",
 )
-"""What a change of the operating mode resets, beside the goals and the profile velocity beside them."""
+"""Registers that a change of the operating mode resets, in addition to the goals and the profile velocity in
+their blocks."""
 
 
 class Held(msgspec.Struct, frozen=True):
-    """What came of holding a servo where it stands."""
+    """Result of holding a servo at its present position."""
 
-    problem: str  # What went wrong, or nothing
-    goal: int | None = None  # Goal position in ticks; None where the mode has none
+    problem: str  # problem; empty on success
+    goal: int | None = None  # goal position in ticks; None if the mode has none
 
 
 def never() -> Program[bool]:
-    """Return that a servo did not reboot, without a look: no policy is to be kept yet."""
+    """Return False without a read: at start-up no reboot policy applies yet."""
     yield from ()
     return False
 
@@ -65,11 +67,22 @@ def enter(
     inward: bool = False,
     rebooted: Callable[[], Program[bool]] = never,
 ) -> Program[str]:
-    """Bring one servo into a mode in which it then stands still; return what went wrong, or nothing.
+    """Switch one servo into a mode, in which it then holds its position.
 
-    `again`: also one that has torque in this mode is held anew; without, it is left alone. `inward`: as in
-    `hold`. `rebooted` finds out whether the servo rebooted meanwhile: then it is left without torque, and
-    what is returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
+    Args:
+        one: The servo.
+        mode: Desired mode.
+        again: True: a servo that already has torque in this mode gets a new holding goal. False: it is not
+            changed.
+        inward: As in `hold`.
+        rebooted: Finds out whether the servo rebooted during the switch. After a reboot the servo stays
+            without torque.
+
+    Returns:
+        The problem, empty on success; STARTED_ANEW after a reboot.
+
+    Raises:
+        LookupError: The model does not have the mode.
     """
     desired = one.servo.mode_plan(mode)
     torque = yield from one.read_torque()
@@ -85,7 +98,7 @@ def enter(
     if enabled and (yield from rebooted()):
         return STARTED_ANEW
     if problem and enabled:
-        # a joint that does not change shall not fall for that
+        # A servo that refuses the mode must not let its joint fall.
         now = yield from mode_now(one)
         if now is not Mode.UNKNOWN:
             back = yield from hold(one, now, inward=inward)
@@ -93,16 +106,17 @@ def enter(
     elif enabled:
         problem = (yield from hold(one, mode, inward=inward)).problem
     if enabled and (yield from rebooted()):
-        # between that look and torque on
+        # It may have rebooted after the check above and before torque on.
         yield from one.torque_off()
         return STARTED_ANEW
     return problem
 
 
 def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, int]]]:
-    """Bring every servo into its first mode, where it is in another one, before it gets torque.
+    """Switch every servo that is in another mode into its start mode, before it gets torque.
 
-    Returns, in the order of the plan's servos, the limits beyond which each refuses goals, ticks.
+    Returns:
+        The limits in ticks beyond which each servo refuses goals, in the order of the plan's servos.
     """
     limits = []
     for servo in plan.servos:
@@ -112,7 +126,7 @@ def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, 
         before = yield from one.read(register.name for register in desired.operating)
         if before is not None and in_mode(desired, before):
             continue
-        # one that has torque takes no goal while its watchdog has stopped it
+        # A servo with torque accepts no goal while its tripped watchdog holds it stopped.
         problem = yield from watchdog.disarm(one)
         problem = problem or (yield from enter(one, servo.start_mode))
         if problem or before is None:
@@ -127,7 +141,7 @@ def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, 
 
 
 def mode_now(one: Access) -> Program[Mode]:
-    """Read in which mode a servo is; UNKNOWN where it does not answer, or the plan has none for it."""
+    """Read the present mode of a servo; UNKNOWN if it does not answer, or the plan does not have its mode."""
     names = dict.fromkeys(register.name for mode in one.servo.modes for register in mode.operating)
     found = yield from one.read(names)
     return Mode.UNKNOWN if found is None else mode_in(one.servo, found)
@@ -148,7 +162,7 @@ def read_limits(
 
 
 def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimit, ...]:
-    """Return the registers that keep a servo's goals below the highest of its modes, as its joint counts."""
+    """Return the registers that limit a servo's goals below the maximum of its modes, in joint units."""
     servo, table, found = one.servo, one.table, list[ServoLimit]()
     for limit, raw in limits.items():
         scales = [scale for mode in servo.modes if (scale := getattr(mode, limit.of)) is not None]
@@ -168,10 +182,11 @@ def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimi
 
 
 def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
-    """Hold a servo where it stands: a goal that moves nothing, torque on, both read back.
+    """Hold a servo at its present position: write a goal that causes no motion, switch torque on, read both
+    back.
 
-    One that stands outside its limits is refused; `inward`: it goes back to them, slowly, because one that
-    followed an effort may have coasted over them, and without torque it would fall.
+    A servo outside its limits is refused. With `inward` it moves back to them slowly instead: a servo that
+    followed an effort may have coasted beyond its limits, and without torque its joint would fall.
     """
     servo, mode, position = one.servo, one.servo.mode_plan(wanted), None
     if mode.goals[-1].position is not None:
@@ -193,7 +208,7 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
         most_effort, problem = yield from _most_effort(one, mode)
         if problem:
             return Held(problem)
-    # the goal comes first: torque on a stale goal would move the joint
+    # Write the goal first: torque on with a stale goal would move the joint.
     data = b""
     for layout in mode.goals:
         data = _resting(mode, layout, position, slow, most_effort)
@@ -211,9 +226,10 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
 
 
 def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
-    """Return the servo's own limit of the effort, ticks, and why it must not be its goal, or nothing.
+    """Return the servo's own effort limit in ticks, and the reason why it must not become its goal (or
+    empty).
 
-    Where the goal is its Torque Limit, 0 shows a shutdown, which a goal would undo.
+    If the goal register is Torque Limit, a value of 0 shows a shutdown, which a goal would undo.
     """
     limits = yield from read_limits(one, ("effort",))
     most = next(iter(limits.values()), 0)
@@ -227,7 +243,7 @@ def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
 
 
 def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, slow: int, most_effort: int) -> bytes:
-    """Return a block of goals that moves nothing: the present position, a slow speed, full effort; else 0."""
+    """Return a block of goals without motion: present position, slow speed, full effort; 0 in other modes."""
     block = bytearray(layout.length)
     goals: list[tuple[Field, int]] = []
     if layout.position is not None and position is not None:
@@ -235,7 +251,7 @@ def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, slow: int
         if layout.speed is not None and slow:
             goals.append((layout.speed, slow))
     elif layout.effort is not None and mode.effort is not None:
-        # the limit was read of the servo, whose answer may be anything
+        # The limit comes from the servo's reply, which may contain any value.
         goals.append((layout.effort, min(most_effort, mode.effort.most)))
     for place, ticks in goals:
         signed = place.encoding == "twos_complement"
@@ -266,7 +282,7 @@ def _read_back(one: Access, layout: GoalLayout, data: bytes) -> Program[str]:
 
 
 def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled: bool) -> Program[str]:
-    """Change the mode with torque off, and give the servo again what it forgets over that."""
+    """Change the mode with torque off, and restore the registers that the change resets."""
     kept = yield from one.read(_forgotten(one, desired, found))
     if kept is None:
         return "did not answer when its gains were read before its mode was changed"
@@ -284,10 +300,10 @@ def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled
         return "did not answer when its gains were read after its mode was changed"
     declared = one.servo.declared
     for name, value in kept.items():
-        # what had its initial value begins with the one of the new mode, which may be another
+        # A register at its initial value keeps the initial value of the new mode, which may differ.
         if now[name] == value or (value == one.items[name].initial and name not in declared):
             continue
-        # a lower limit, written after the last power-up, would refuse it
+        # A lower limit that was written after power-up would refuse the old value.
         bound = yield from one.read_bound(name)
         kept_value = value if bound is None else max(-bound, min(value, bound))
         if now[name] != kept_value and (problem := (yield from one.write(name, kept_value))):
@@ -296,12 +312,12 @@ def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled
 
 
 def _forgotten(one: Access, desired: ModePlan, found: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the items whose values a change of the operating mode resets, and that outlive it."""
+    """Return the items that a change of the operating mode resets and that must be restored."""
     items = one.items
     if "operating_mode" not in items:
         return ()
     names = [name for name in _RESET if name in items]
     names += [name for name in one.servo.declared if items[name].area == "RAM"]
     if Mode.PWM not in {desired.mode, mode_in(one.servo, found)} and "goal_pwm" in items:
-        names.append("goal_pwm")  # it limits every other mode, for a policy too
+        names.append("goal_pwm")  # it limits the effort in every other mode, also for a policy
     return tuple(dict.fromkeys(names))

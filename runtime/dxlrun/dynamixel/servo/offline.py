@@ -1,8 +1,8 @@
-"""Offline servos of one bus: probed in idle time, checked as at the start, and taken back.
+"""Offline servos of one bus: probed in idle time, checked as at start-up, and recovered.
 
-A servo returns in its desired mode and with its desired registers. It has torque only when it kept it, when
-the policy for returned servos gives it back after a reboot and the servo does not reboot repeatedly, or when
-it had torque before a reboot that a client requested.
+A servo returns in its desired mode and with its desired registers. It has torque in three cases only: it kept
+its torque; the policy for returned servos gives torque back after a reboot and the servo does not reboot
+repeatedly; or it had torque before a reboot that a client requested.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from dxlwire.modes import Mode
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry
 from dxlwire.transaction import Outcome, Program, Reply
 
-PROBE_NS = 1_000_000_000  # An offline servo is probed once a second (failures.md)
+PROBE_NS = 1_000_000_000  # probe period of an offline servo (failures.md)
 FIRST_PROBE_NS = 200_000_000
-"""The first time a little earlier: most losses are a loose plug or a boot, which is over by then."""
+"""Delay of the first probe. Most losses are a loose plug or a boot, which is over by then."""
 REBOOT_NS = 3_000_000_000
-"""How long a servo that a client rebooted may take until it is in order again [i]."""
+"""Timeout for a servo that a client rebooted to pass the checks again [i]."""
 
 
 class Offline:
-    """Probes the offline servos of one bus and takes them back."""
+    """Probes the offline servos of one bus and recovers them."""
 
     def __init__(self, life: Life, reboots: Reboots, desired: DesiredState) -> None:
         self.life = life
@@ -42,14 +42,15 @@ class Offline:
         self.desired = desired
 
     def lose(self, index: int) -> None:
-        """Take a silent servo out of the exchange, and stop it where it would go on without an end."""
+        """Take a silent servo out of the exchange, and stop it if it follows no position."""
         loss = self.life.lose(index, FIRST_PROBE_NS)
         if loss.had_torque and self.desired.resting(index) is not None:
             loss.kept_goal = False
             self.life.do(index, limit_patience(self._stop(index)), "the stop")
 
     def _stop(self, index: int) -> Program[None]:
-        """Write a goal of 0 to a servo that follows a velocity, an effort or a PWM: it may hear that."""
+        """Write a goal of 0 to a servo that follows no position: it may still receive even if it does not
+        answer."""
         for _ in range(ATTEMPTS):
             goal = self.desired.resting(index)
             if goal is None or not self.life.offline(index):
@@ -58,7 +59,7 @@ class Offline:
                 return
 
     def look(self) -> None:
-        """Let the coming idle time probe the servos that are due; called while one is offline."""
+        """Schedule probes of the servos that are due; called once a cycle while a servo is offline."""
         self.expire()
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
@@ -67,7 +68,7 @@ class Offline:
                 self.life.do(index, self._probe(index, loss), "the return")
 
     def expire(self) -> None:
-        """Answer the clients whose reboots take too long."""
+        """Answer the clients whose reboot requests have timed out."""
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
             if loss.reboot is not None and loss.reboot.until_ns <= now:
@@ -76,18 +77,22 @@ class Offline:
                 self._answer(index, loss, f"{text}: {remedy}; it is probed until it is in order")
 
     def switch_off(self, index: int, done: Done) -> None:
-        """Switch the torque of a RELEASED servo off in the coming idle time."""
+        """Switch off the torque of a RELEASED servo in idle time."""
         self.life.do(index, self._switch_off(index, done), "torque off")
 
     def _switch_off(self, index: int, done: Done) -> Program[None]:
         problem = ""
-        # in another state torque was requested since, or it is lost: its return keeps it limp
+        # In any other state a client requested torque since then, or the servo is lost; its return keeps it
+        # limp.
         if self.life.states[index] is ServoState.RELEASED and not (yield from self.limp(index)):
             problem = f"{self.life.name(index)} did not confirm torque off; it is tried again"
         done(problem)
 
     def limp(self, index: int) -> Program[bool]:
-        """Switch a servo's torque off and read it back; where that fails, again when it is in order."""
+        """Switch a servo's torque off and read it back.
+
+        A servo that does not confirm counts as lost, so its return switches its torque off.
+        """
         one = self.life.reach(index)
         for _ in range(ATTEMPTS):
             yield replace(one.writing(one.servo.torque_address, b"\0"), patience_ns=0)
@@ -98,7 +103,7 @@ class Offline:
         return False
 
     def _probe(self, index: int, loss: Loss) -> Program[None]:
-        """Ping a servo; when it answers, see what became of it and take it back."""
+        """Ping a servo; when it answers, check and recover it."""
         life, one = self.life, self.life.reach(index)
         reply = yield one.line.ping(one.servo.servo_id)
         if reply.answered and (read := self.reboots.read(index)) is not None:
@@ -111,7 +116,9 @@ class Offline:
             found = Findings()
             torqued, mode = yield from self._rejoin(index, reply, found)
             if life.losses.get(index) is not loss:
-                return  # the line was gone meanwhile: it counts as lost anew, and the next probe decides
+                # The line was lost during the check: the servo counts as lost again, and the next probe
+                # decides.
+                return
             if not found.problems:
                 found.log(life.events)
                 self._take_back(index, loss, torqued, mode)
@@ -125,7 +132,7 @@ class Offline:
         loss.probing, loss.probe_at_ns = False, life.now_ns() + PROBE_NS
 
     def _rejoin(self, index: int, reply: Reply, found: Findings) -> Program[tuple[bool, Mode]]:
-        """Bring a servo that answered to its desired state; return whether it has torque, and its mode."""
+        """Bring a servo that answered to its desired state; return True if it has torque, and its mode."""
         life, one, servo = self.life, self.life.reach(index), self.life.plan.servos[index]
         if self.reboots.judge(index, reply) is None:
             enabled = yield from one.read_torque()
@@ -133,7 +140,7 @@ class Offline:
             if loss is not None and loss.had_torque and enabled.answered and not enabled.parameters[0]:
                 self.reboots.count(index)
         if (loss := life.losses.get(index)) is not None and loss.released:
-            # before its mode: a change of it leaves the torque as it was
+            # Switch torque off before the mode: a change of the mode would restore it.
             yield from one.torque_off()
         if problem := (yield from watchdog.disarm(one)):
             found.problems.append(problem)
@@ -159,8 +166,11 @@ class Offline:
         return torqued, mode
 
     def _may_get_torque(self, index: int) -> bool:
-        """Return whether a servo gets torque back: by the policy once after a reboot, and after a reboot that
-        a client requested where it had torque; not if released."""
+        """Return True if a servo gets torque back.
+
+        The policy gives it back after a reboot, unless the servo reboots repeatedly. A requested reboot gives
+        it back if the servo had torque before. A released servo gets none.
+        """
         loss = self.life.losses.get(index)
         if loss is None or loss.released or not loss.rebooted:
             return False
@@ -203,20 +213,29 @@ class Offline:
 
 
 def ignore(problem: str) -> None:
-    """Take what came of a request that no client made; an event reports what went wrong."""
+    """Ignore the result of an internal request; an event reports a problem."""
 
 
 def rejoin(
     one: Access, found: Findings, mode: Mode, registers: Sequence[RegisterValue], *, torque: bool
 ) -> Program[bool]:
-    """Take one servo back that was lost or was reset, as at the start: check, set registers, then hold it.
+    """Recover one servo that was lost or reset, as at start-up: check it, write its registers, then hold it.
 
-    `torque`: switch it on; without, a limp servo stays limp and gets no goal, as a goal may switch torque on
-    (protocol.md), and one that still holds keeps its torque: were torque written to it, a reboot a moment ago
-    would be a way to torque that no policy gave. Returns whether torque enable was read as 1, and it is in
-    order.
+    Without `torque` a limp servo stays limp and gets no goal, because a goal may switch torque on
+    (protocol.md). A servo that still holds keeps its torque without a write: if it rebooted a moment ago, the
+    write would give it torque that no policy permits.
+
+    Args:
+        one: The servo.
+        found: Collects the problems.
+        mode: Desired mode.
+        registers: Desired registers, in the order of writing.
+        torque: True: switch torque on.
+
+    Returns:
+        True if torque enable was read as 1 and no problem was found.
     """
-    seen = Findings()  # its events are those of a start; settings may have changed since
+    seen = Findings()  # Drop the events, which a start has logged; but report settings that changed since.
     if (present := (yield from inspect(one, seen, take_over=True))) is not None:
         yield from inspect_states([(one, present)], seen)
     if seen.problems:

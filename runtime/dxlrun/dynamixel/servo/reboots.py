@@ -1,4 +1,4 @@
-"""Reboots: found by a servo's clock, or by an LED that was lit, reported, and counted."""
+"""Reboots: detected by a servo's Realtime Tick or by a lit LED, reported, and counted."""
 
 from __future__ import annotations
 
@@ -14,30 +14,34 @@ from dxlwire.transaction import Program, Reply, Transaction
 TICK_MODULUS_MS = 32_768
 """Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""
 BLIND_NS = 16_000_000_000
-"""After half a turn of the counter nothing shows whether it was less or more (protocol.md)."""
-DRIFT = 0.02  # The servo's clock may go so much faster or slower than the host's [i] (protocol.md)
+"""Longest time between two readings. After half a turn of the counter the direction of a difference is
+ambiguous (protocol.md)."""
+DRIFT = 0.02  # largest relative drift between the clocks of servo and host [i] (protocol.md)
 SLACK_MS = 20.0
-"""And a reading may be so far off, beside the time from request to reply [i] (protocol.md)."""
+"""Error of a reading in addition to the time between request and reply [i] (protocol.md)."""
 WITHIN_NS = 60_000_000_000
 TOO_MANY_REBOOTS = 2
-"""So many within a minute, and a servo gets no torque back in this run (failures.md)."""
+"""After this many reboots within a minute a servo gets no torque back in this run (failures.md)."""
 
 
 class TickReading(NamedTuple):
-    """A servo's millisecond counter, which a reboot sets back to 0."""
+    """A reading of a servo's millisecond counter, which a reboot resets to 0."""
 
     tick: int
     middle_ns: int
-    half_ms: float  # The tick was read within this time around the middle
+    half_ms: float  # the servo sampled the tick within this time around the middle
 
     @classmethod
     def of(cls, reply: Reply) -> TickReading:
-        """Return the reading that a reply is."""
+        """Return the reading in a reply."""
         half_ns = (reply.last_ns - reply.asked_ns) // 2
         return cls(reply.word(), reply.asked_ns + half_ns, half_ns * 1e-6)
 
     def rebooted(self, before: TickReading | None) -> bool | None:
-        """Return whether the servo rebooted since a reading; None: that is too long ago to know, or none."""
+        """Return True if the servo rebooted since a reading.
+
+        None: the earlier reading is missing or too old to decide.
+        """
         if before is None or self.middle_ns - before.middle_ns > BLIND_NS:
             return None
         elapsed_ms = (self.middle_ns - before.middle_ns) * 1e-6
@@ -64,29 +68,30 @@ class RebootCount:
 
 
 class Reboots:
-    """The reboots of the servos of one bus; of Protocol 1.0 none has a clock that shows them.
+    """Detects the reboots of the servos of one bus.
 
-    There a lit LED shows them, which a reboot puts out, from `watch` to `unwatch`.
+    Servos of Protocol 1.0 have no Realtime Tick. Between `watch` and `unwatch` their LED is lit instead: a
+    reboot switches it off.
     """
 
     def __init__(self, life: Life) -> None:
         count = len(life.plan.servos)
         self._life = life
         self._lit: list[int | None] = [None] * count
-        """What the LED was before it was lit for `watch`; None: it is not watched."""
+        """State of the LED before `watch` lit it; None: not watched."""
         self._ticks: list[TickReading | None] = [None] * count
         self._counts = [RebootCount() for _ in range(count)]
 
     def read(self, index: int) -> Transaction | None:
-        """Return the read of a servo's Realtime Tick; None where it has none."""
+        """Return the read of a servo's Realtime Tick; None if it does not have one."""
         one = self._life.reach(index)
         item = one.items.get("realtime_tick")
         return None if item is None else one.reading(item.address, item.size)
 
     def tick(self, index: int) -> Program[bool]:
-        """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted.
+        """Read a servo's Realtime Tick; return True if it shows a reboot, which is counted.
 
-        Of a servo without one that is watched: whether its LED is out.
+        For a watched servo without Realtime Tick: return True if its LED is off.
         """
         read = self.read(index)
         if read is not None:
@@ -98,7 +103,7 @@ class Reboots:
         return True
 
     def watch(self, index: int) -> Program[bool]:
-        """Let `tick` show each reboot from now on; return whether there was one before."""
+        """Make sure that `tick` detects every reboot from now on; return True if there was one before."""
         lamp = self._lamp(index)
         if lamp is not None and self._lit[index] is None:
             self._lit[index] = yield from self._lamp_is(index)
@@ -109,20 +114,20 @@ class Reboots:
         return (yield from self.tick(index))
 
     def unwatch(self, index: int) -> Program[None]:
-        """Put out the LED that `watch` lit."""
+        """Switch off the LED that `watch` lit."""
         before, lamp = self._lit[index], self._lamp(index)
         self._lit[index] = None
         if before == 0 and lamp is not None:
             yield from self._life.reach(index).write_bytes(lamp, b"\0")
 
     def _lamp(self, index: int) -> int | None:
-        """Return the address of an LED of a servo without a clock; None: there is none."""
+        """Return the address of the LED of a servo without Realtime Tick; None if it has no LED."""
         one = self._life.reach(index)
         item = None if "realtime_tick" in one.items else one.items.get("led", one.items.get("led_red"))
         return None if item is None else item.address
 
     def _lamp_is(self, index: int) -> Program[int | None]:
-        """Read an LED; None when it was not read."""
+        """Read the LED; None if the read failed."""
         lamp = self._lamp(index)
         if lamp is None:
             return None
@@ -130,7 +135,7 @@ class Reboots:
         return reply.parameters[0] if reply.answered else None
 
     def judge(self, index: int, reply: Reply) -> bool | None:
-        """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""
+        """Return True if a reply with Realtime Tick shows a reboot; None if it cannot be decided."""
         if self.read(index) is None or not reply.answered:
             return None
         before, now = self._ticks[index], TickReading.of(reply)
@@ -155,5 +160,5 @@ class Reboots:
         life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
 
     def exhausted(self, index: int) -> bool:
-        """Return whether a servo rebooted so often that no policy gives it torque any more."""
+        """Return True if a servo rebooted so often that no policy gives it torque any more."""
         return self._counts[index].exhausted

@@ -1,7 +1,7 @@
-"""Registers of a servo as declared: compared, only differences written, each read back.
+"""Declared registers of a servo: compared, written only if they differ, and read back.
 
-EEPROM wears, and a servo of Protocol 2.0 refuses to write it while it holds torque (e-Manual XM430-W350,
-Control Table of EEPROM Area), so then it is never written.
+EEPROM wears. A servo of Protocol 2.0 refuses to write it while it holds torque (e-Manual XM430-W350, Control
+Table of EEPROM Area), so it is never written then.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ _RELEASE = "switch its torque off and start again, without --take-over"
 
 
 class RegisterDifference(msgspec.Struct, frozen=True):
-    """A declared register and what the servo has there."""
+    """A declared register and its present value in the servo."""
 
     register: RegisterValue
     found: int | None
-    """The integer on the wire, signed where the item is; None: it could not be read."""
+    """Integer on the wire, signed if the item is; None: it could not be read."""
 
     @property
     def differs(self) -> bool:
-        """True when it has to be written."""
+        """True if it must be written."""
         return self.found is not None and self.found != self.register.value
 
 
 def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tuple[RegisterDifference, ...]]:
-    """Read registers of one servo; writes nothing."""
+    """Read registers of one servo without writing any."""
     found = []
     for register in registers:
         found.append(RegisterDifference(register, (yield from _integer(one, register))))
@@ -43,9 +43,9 @@ def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tupl
 
 
 def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
-    """Write the registers that a servo has otherwise, and read them back; return what it had, by item.
+    """Write the registers that differ and read them back; return the previous values by item.
 
-    Nothing is written when one cannot be read, or when the EEPROM is closed to one of them.
+    Nothing is written if one of them cannot be read, or if a closed EEPROM prevents one of the writes.
     """
     differences = yield from compare(one, registers)
     before = {each.register.name: each.found for each in differences if each.found is not None}
@@ -68,23 +68,23 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
 
 
 def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
-    """Write the settings of the servos of a bus, each whatever became of the one before."""
+    """Write the settings of all servos of a bus; a failure does not prevent the next servo."""
     for servo in plan.servos:
         yield from settle(first_reach(plan, servo), servo.settings, found)
 
 
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
-    """Return registers with one of them changed, or one more behind the others."""
+    """Return registers with one of them replaced, or with a new one at the end."""
     return tuple({**{one.name: one for one in registers}, newer.name: newer}.values())
 
 
 def tripped(item: ControlItem, raw: int) -> bool:
-    """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
+    """Return True if a value is that of a Bus Watchdog that timed out and stopped its servo."""
     return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
 
 
 def shown(item: ControlItem, raw: int) -> str:
-    """Return a value of an item as messages show it: that of a tripped Bus Watchdog is `255 (tripped)`.
+    """Return a value of an item for messages; the value of a tripped Bus Watchdog is `255 (tripped)`.
 
     e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
     """
@@ -92,7 +92,7 @@ def shown(item: ControlItem, raw: int) -> str:
 
 
 def meaning(item: ControlItem, value: int, errors: HardwareErrors) -> str:
-    """Return a value of an item with its unit, or the hardware errors that it means; empty without either."""
+    """Return a value of an item with its unit, or its hardware errors in words; empty if it has neither."""
     if tripped(item, value):
         return "tripped"
     if item.name == errors.item:

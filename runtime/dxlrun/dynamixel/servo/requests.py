@@ -1,8 +1,8 @@
-"""Requests of clients for single servos of one bus: torque on or off, reboot; carried out in idle time.
+"""Requests of clients for single servos of one bus: torque on or off and reboot, executed in idle time.
 
-Torque is switched on as for a servo that returns: check, registers, mode, goal := measured position, torque,
-read back, Bus Watchdog. The loop's goal becomes the measured position, too. A servo without torque on request
-stays so whatever happens to it, until it is requested.
+Torque is switched on as for a returning servo: check, registers, mode, goal := measured position, torque,
+read back, Bus Watchdog. The loop's goal also becomes the measured position. A servo whose torque a client
+switched off stays limp until a client requests torque again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dxlwire.wire import protocol2
 
 
 class Requests:
-    """Torque and reboots of the servos of one bus, as clients request them; each is answered once."""
+    """Torque switches and reboots that clients request for the servos of one bus; each is answered once."""
 
     def __init__(self, offline: Offline) -> None:
         self._offline = offline
@@ -35,14 +35,14 @@ class Requests:
         self._desired = offline.desired
 
     def torque_off(self, index: int, done: Done) -> None:
-        """Switch a servo's torque off, and keep it off; of an offline one when it is back."""
+        """Switch a servo's torque off and keep it off; an offline servo follows when it is back."""
         if self._life.on(index, ServoEvent.RELEASE) is ServoState.RELEASED:
             self._offline.switch_off(index, done)
         else:
             done(f"{self._life.name(index)} does not answer: its torque stays off when it is back")
 
     def torque_on(self, index: int, done: Done) -> None:
-        """Switch a servo's torque on where it stands, if it has none."""
+        """Switch a limp servo's torque on at its present position."""
         state = self._life.states[index]
         if state is ServoState.OFFLINE:
             done(f"{self._life.name(index)} does not answer")
@@ -52,7 +52,7 @@ class Requests:
         self._life.do(index, self._torque_on(index, done), "torque on")
 
     def reboot(self, index: int, done: Done) -> None:
-        """Reboot a servo of Protocol 2.0; it comes back with the torque that it has now."""
+        """Reboot a servo of Protocol 2.0; it returns with torque if it has torque now."""
         one = self._life.reach(index)
         if "reboot" not in one.table.capabilities:
             done(f"{one} knows no reboot instruction: switch its power off and on")
@@ -95,7 +95,7 @@ class Requests:
         return f"{name} did not confirm its torque; ask again when it answers"
 
     def _hold(self, index: int) -> Program[tuple[str, Mode]]:
-        """Bring a limp servo in order, and hold it; return what went wrong, behind its name, and its mode."""
+        """Check, set up and hold a limp servo; return the problem, without the servo's name, and its mode."""
         one, name, found = self._life.reach(index), f"{self._life.name(index)} ", Findings()
         yield from self._reboots.tick(index)
         yield from watchdog.disarm(one)
@@ -115,13 +115,13 @@ class Requests:
             done(f"{one} was lost before it was rebooted")
             return
         had_torque = life.states[index] not in POWERLESS
-        yield from self._reboots.tick(index)  # so that the next reading shows the reboot, however long ago
+        yield from self._reboots.tick(index)  # Read the tick now, so the next reading can show the reboot.
         servo_id = one.servo.servo_id
         reply = yield from retry(one.line.instruct(servo_id, protocol2.reboot(servo_id)))
         if reply.outcome is Outcome.REFUSED:
             done(f"{one} refuses to reboot{one.reason(reply)}")
         elif not life.offline(index):
-            # an acknowledgement may be lost: its clock will tell whether it started anew
+            # The acknowledgement may be lost: the servo's clock will show whether it rebooted.
             request = RequestedReboot(had_torque, life.now_ns() + REBOOT_NS, done)
             loss = life.reboot(index, request, FIRST_PROBE_NS)
             loss.rebooted = self._reboots.read(index) is None

@@ -1,6 +1,7 @@
-"""Servos of one bus from cycle to cycle: lost replies, errors, alerts, and what is read in idle time.
+"""Servos of one bus from cycle to cycle: lost replies, errors, alerts, and reads in idle time.
 
-Each becomes an event of the state machine in `life.py`, and an event of the log where a person should know.
+Each of them becomes an event of the state machine in `life.py`, and an event of the log if a person should
+know.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from dxlwire.exchange.samples import BusSamples
 from dxlwire.transaction import Program, Reply, Transaction
 from dxlwire.wire.dialect import dialect_of
 
-NOISE_EVENT_NS = 1_000_000_000  # A noisy line has at most one event in this time
+NOISE_EVENT_NS = 1_000_000_000  # shortest time between two events about a noisy line
 UNREQUESTED_EVENT_NS = 10_000_000_000
 LEAST_UNREQUESTED = 2
-"""Packets that no request explains, for one event: an instruction of another host, and the reply to it. One
-alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a byte [i]."""
+"""Unexplained packets that cause an event: an instruction of another host, and the reply to that. A single
+one can be noise that looks like a packet: the checksum of Protocol 1.0 is one byte [i]."""
 ALERT_AGAIN = 50
-"""Cycles after which a standing alert is read again: a second error does not change the alert bit."""
+"""Cycles between two reads of a persistent alert: a second error does not change the alert bit."""
 _RESTING = frozenset((ServoState.TORQUED, ServoState.LIMP, ServoState.RELEASED))
-CAUGHT_UP = 0.05  # rad of the servo from its goal: a returning one has caught up
+CAUGHT_UP = 0.05  # rad; a returning servo this close to its goal has caught up
 
 
 class Servos:
@@ -54,37 +55,38 @@ class Servos:
         parts: FeatureParts,
         events: EventSink,
     ) -> None:
-        """`parts`: the features that are on the bus, too."""
+        """Create the parts; `parts` are the features, which also get a part on the bus."""
         plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
         self._bus = idle.bus
         self._events = events
         self._samples = samples
-        self._shown = states.hardware_error  # of the robot: the model's error item, or the error byte of 1.0
+        # Hardware errors of the robot: the model's error item, or the error byte of Protocol 1.0.
+        self._shown = states.hardware_error
         self._hardware_errors = [find_table(servo.model, plan.protocol).errors for servo in plan.servos]
         self._rows = [servo.row for servo in plan.servos]
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count
-        self.goals = GoalArrays(plan)  # Builds the sync write
+        self.goals = GoalArrays(plan)  # builds the sync write
         self.reads = CyclicReads(plan, samples, idle.bus.owed)
         """The job that reads every servo and every device once."""
         self._parts = parts.attach(idle, self.reads, samples, events)
-        """The share of features on this bus, in their order."""
+        """Parts of features on this bus, in the order of the features."""
         self.life = Life(idle, self.reads, events, self._parts)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
-        """Modes and registers that the servos shall have."""
+        """Desired modes and registers of the servos."""
         self.watchdogs = WatchdogMonitor(self.life, self.desired)
-        """Whether the Bus Watchdogs receive enough instructions."""
+        """Monitor of the Bus Watchdogs."""
         self._offline = Offline(self.life, self._reboots, self.desired)
-        self.requests = Requests(self._offline)  # Torque and reboots that clients request
+        self.requests = Requests(self._offline)  # clients' requests: torque and reboots
         self._slow = SlowReads(self.life, self._reboots, states)
         self._reported_errors = [0] * count  # error byte of each servo
         self._read_errors = [0] * count  # value of each servo's error item as last read
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
-        self._strained: list[int] = []  # of Protocol 1.0, servos that may have shut down
-        self._reading = False  # one of these waits for idle time
+        self._strained: list[int] = []  # servos of Protocol 1.0 that may have shut down
+        self._reading = False  # a read of `_due` waits for idle time
         self._read_last = 0
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
@@ -96,60 +98,60 @@ class Servos:
     @property
     def silent(self) -> list[str]:
         """Names of the servos whose newest reply did not arrive."""
-        servos = zip(self._plan.servos, self.reads.missed, strict=False)  # devices come behind them
+        servos = zip(self._plan.servos, self.reads.missed, strict=False)  # the devices follow the servos
         return [self._plan.label(servo) for servo, missed in servos if missed]
 
     # Start and end
 
     @property
     def limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each servo, by row of its joint."""
+        """Registers that limit the goals of each servo, by row of its joint."""
         return {
             row: servo_limits(self.life.reach(index), self.goals.own_limits[index])
             for index, row in enumerate(self._rows)
         }
 
     def engaged(self) -> None:
-        """Take every servo for one that holds where it stands, or is limp, as the start-up has read back."""
+        """Mark each servo as holding or limp, according to the torque state read back at start-up."""
         for index, servo in enumerate(self._plan.servos):
             self.life.on(index, ServoEvent.ENGAGED if servo.torque_at_start else ServoEvent.RELEASE)
 
     def confirmed(self) -> None:
-        """Let every servo with torque get goals: it was read again behind the first states."""
+        """Start sending goals to every servo with torque, which was read again after the first states."""
         for index, servo in enumerate(self._plan.servos):
             if servo.torque_at_start:
                 self.life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
     def watch(self, found: Findings) -> Program[None]:
-        """Read every servo's clock for the first time, and arm the Bus Watchdogs.
+        """Read every servo's Realtime Tick for the first time, and arm the Bus Watchdogs.
 
-        The last step of the start: from now on the exchange must not stop.
+        This is the last step of start-up: from now on the exchange must not stop.
         """
         for index in range(len(self._rows)):
             yield from self._reboots.tick(index)
         yield from self.watchdogs.arm(found)
 
     def withhold_goals(self) -> None:
-        """Send no goals any more: torque is being switched off."""
+        """Stop sending goals, because torque is being switched off."""
         for index in range(len(self._rows)):
             self.life.on(index, ServoEvent.DOUBT)
 
     def show_torque(self, torque: NDArray[np.uint8]) -> None:
-        """Fill the rows of these servos with whether they have torque, shape (joints,), a Torque each."""
+        """Write a Torque per servo into the rows of these servos, shape (joints,)."""
         torque[self._rows] = self.life.torque
         self.life.torque_changed = False
 
     # The line
 
     def lost(self, text: str) -> None:
-        """Report once that the line is gone."""
+        """Report once that the line is lost."""
         if not self._line_lost:
             self._line_lost = True
             self._events.emit(EventCode.PORT_LOST, Severity.ERROR, self._plan.name, text)
 
     def found(self) -> None:
-        """Report that the line is back: its servos were without a host, and maybe without power."""
+        """Report that the line is back. Its servos had no host, and may have had no power."""
         self._line_lost = False
         for index in range(len(self._rows)):
             self.life.lose(index).kept_goal = False
@@ -169,7 +171,8 @@ class Servos:
         if count < LEAST_UNREQUESTED:
             if self._lone != self._bus.unrequested:
                 self._lone, self._lone_ns = self._bus.unrequested, now_ns
-            elif now_ns - self._lone_ns >= UNREQUESTED_EVENT_NS:  # a very late reply
+            # A single packet for so long was a very late reply, not another host.
+            elif now_ns - self._lone_ns >= UNREQUESTED_EVENT_NS:
                 self._unrequested_seen = self._lone
         elif now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
             self._unrequested_seen, self._unrequested_at_ns = self._bus.unrequested, now_ns
@@ -182,7 +185,7 @@ class Servos:
     # A cycle
 
     def settle(self, now_ns: int) -> None:
-        """Report what changed with this cycle's replies."""
+        """Report changes that this cycle's replies show."""
         if self._samples.fresh.tobytes() != self._every_fresh or any(self.reads.missed):
             self._count_losses(now_ns)
         for part in self._parts:
@@ -191,9 +194,9 @@ class Servos:
             self._report_errors()
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
-        """Let the returning servos that have caught up follow their goals as fast as these say.
+        """Lift the speed limit of returning servos that are close to their goals again.
 
-        A servo that follows no position has nothing to catch up with.
+        A servo that follows no position has no goal to catch up with.
         """
         if ServoState.RETURNING not in self.life.states:
             return
@@ -203,7 +206,7 @@ class Servos:
                 self.life.on(index, ServoEvent.CAUGHT_UP)
 
     def follow_goals(self, index: int) -> None:
-        """Let a servo that was given torque get goals, as soon as its torque was read once more."""
+        """Start sending goals to a servo that was given torque, once its torque has been read again."""
         if self.life.states[index] is ServoState.GIVEN:
             self.life.on(index, ServoEvent.ANCHORED)
 
@@ -237,13 +240,14 @@ class Servos:
             if self._dialect.ALERT:
                 if error & ~before & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
-                    self.life.on(index, ServoEvent.DOUBT)  # it may have shut down
+                    self.life.on(index, ServoEvent.DOUBT)  # the servo may have shut down
                 elif not error & self._dialect.ALERT:
                     self._shown[self._rows[index]] = self._read_errors[index] = 0
             else:
                 self._shown[self._rows[index]] = error & self._hardware_errors[index].mask
                 if error & ~before and index not in self._strained:
-                    # Shutdown (18) may list any error, and a goal that is a torque limit would revive it
+                    # Any error can be in Shutdown (18), and a goal that is a torque limit would revive the
+                    # servo.
                     self._strained.append(index)
                     self.life.on(index, ServoEvent.DOUBT)
             self._reported_errors[index] = error
@@ -255,9 +259,9 @@ class Servos:
 
     @property
     def at_rest(self) -> bool:
-        """True when nothing is to be looked at here before `due_ns`, as long as replies are as planned.
+        """True if nothing needs attention before `due_ns`, as long as replies come as planned.
 
-        A part of a feature is asked in each cycle, for its commands.
+        A feature's part is called in each cycle, because it may have commands.
         """
         return not (
             self._bus.failure is not None
@@ -274,7 +278,7 @@ class Servos:
 
     @property
     def due_ns(self) -> int:
-        """When idle time has something to do that waits for its time."""
+        """Time at which the next periodic work in idle time is due."""
         return self._slow.due_ns
 
     @property
@@ -283,17 +287,19 @@ class Servos:
         return bus.noise_bytes > self._noise_seen or bus.unrequested > self._unrequested_seen
 
     def abandon(self) -> None:
-        """Answer what clients requested and waits for too long, while the line is gone."""
+        """Answer clients' requests that have timed out, while the line is lost."""
         if not self.life.calm:
             self._offline.expire()
 
     def look(self, time_ns: int) -> None:
-        """Let the coming idle time read what is due beside the cyclic reads, one servo at a time.
+        """Schedule the reads that are due in addition to the cyclic reads, one servo at a time.
 
-        That is the hardware error of a servo that raised an alert, the torque limit of one that may have shut
-        down, and torque enable of one that waits for its goals. Only a servo that answers is read.
+        These are the hardware error of a servo that raised an alert, the torque limit of a servo that may
+        have shut down, and torque enable of a servo that waits for its goals. Only a servo that answers is
+        read.
 
-        `time_ns`: the controllers' time of the coming cycle, for the parts of features.
+        Args:
+            time_ns: Controllers' time of the coming cycle, for the parts of features.
         """
         self._report_noise(self.life.now_ns())
         if not self.life.calm:
@@ -307,7 +313,7 @@ class Servos:
             self.life.do(index, program, what)
 
     def _due(self) -> tuple[int, str, Program[None]] | None:
-        """Return the servo that is read next, what of it, and the program; None: nothing is due."""
+        """Return the next servo to read, the name of the item, and the program; None: nothing is due."""
         if any(self._reported_errors) or self._alert_cycles:
             self._repeat_alerts()
         servos, fresh = self._plan.servos, self._samples.fresh
@@ -329,7 +335,7 @@ class Servos:
         return None
 
     def _repeat_alerts(self) -> None:
-        """Read the hardware error of each servo whose alert stands again now and then."""
+        """Schedule another read of the hardware error for persistent alerts, every `ALERT_AGAIN` cycles."""
         bit = self._dialect.ALERT
         standing = [index for index, error in enumerate(self._reported_errors) if error & bit]
         self._alert_cycles = self._alert_cycles + 1 if standing else 0
@@ -343,11 +349,11 @@ class Servos:
         return reply
 
     def _read_torque(self, index: int) -> Program[None]:
-        """Give goals again to a servo with torque, and none to one without."""
+        """Read torque enable: a servo with torque gets goals again, one without gets none."""
         read = self.life.reach(index).reading(self._plan.servos[index].torque_address, 1)
         reply = yield from self._read(read)
         if not reply.answered or index in self._strained or self.life.states[index] not in IN_DOUBT:
-            return  # shut down, lost or released meanwhile: its torque limit or its return decides
+            return  # It shut down, was lost or was released since: its torque limit or its return decides.
         enabled = reply.parameters[0]
         if enabled == 1:
             self.life.on(index, ServoEvent.TORQUE_ON)
@@ -356,11 +362,12 @@ class Servos:
         if alert and (self._shown[self._rows[index]] or self._reported_errors[index] & alert):
             self.life.on(index, ServoEvent.TORQUE_OFF)  # a shutdown, whose reason was reported
         else:
-            self.life.lose(index).limp_reported = True  # it may have started anew
+            self.life.lose(index).limp_reported = True  # it may have rebooted
         self.life.report_limp(index, enabled)
 
     def _read_torque_limit(self, index: int, read: Transaction, name: str) -> Program[None]:
-        """Give no more goals to a servo of Protocol 1.0 that shut down: its torque enable stays 1."""
+        """Read the torque limit of a servo of Protocol 1.0: 0 means a shutdown, although torque enable stays
+        1."""
         reply = yield from self._read(read)
         if not reply.answered:
             return
@@ -372,7 +379,7 @@ class Servos:
             self.life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
 
     def _read_hardware_error(self, index: int, read: Transaction) -> Program[None]:
-        """Report a hardware error that is new; its shutdown may have cut the torque."""
+        """Read and report a new hardware error; its shutdown may have cut the torque."""
         reply = yield from self._read(read)
         if not reply.answered:
             return
@@ -383,7 +390,8 @@ class Servos:
         self._read_errors[index] = value
         title = self.life.reach(index).items[errors.item].title
         text = f"has {title} = {value}: {errors.describe(value)}"
-        if errors.is_warning(value):  # the states have none: a joint with an error gets no torque
+        # A warning is not in the states: a joint with an error there gets no torque.
+        if errors.is_warning(value):
             self._shown[self._rows[index]] = 0
             self.life.report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
             return

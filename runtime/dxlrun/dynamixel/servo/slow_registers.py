@@ -1,4 +1,4 @@
-"""Slow registers: what changes slowly in the servos of one bus, read in turn in idle time."""
+"""Slow registers: registers that change slowly, read in turn in idle time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0  # degrees C below the servo's own limit (failures.md)
 COOLED = 5.0  # degrees C below the warning: the servo counts as cooled down
 
-_Block = tuple[ControlItem, ...]  # Items side by side, read by one instruction; none: Realtime Tick
+_Block = tuple[ControlItem, ...]  # adjacent items, read by one instruction; empty: Realtime Tick
 
 
 class SlowReads:
-    """Reads one block of one servo at a time, so that each servo's registers come once in the plan's period.
+    """Reads one block of one servo at a time; each servo's registers are read once per period of the plan.
 
     Temperature and voltage go into the states; other items are logged when they change. Realtime Tick is read
-    along with them: it shows a reboot between two cycles.
+    as well, because it shows a reboot between two cycles.
     """
 
     def __init__(self, life: Life, reboots: Reboots, states: States) -> None:
@@ -36,15 +36,15 @@ class SlowReads:
         self._interval_ns = life.plan.slow_period_ns // max(len(self._round), 1)
         self._due_ns = 0
         self._known: dict[tuple[int, str], int] = {}
-        self._hot: set[int] = set()  # Servos near their temperature limit
+        self._hot: set[int] = set()  # servos near their temperature limit
 
     @property
     def due_ns(self) -> int:
-        """When there is something to read; NEVER while something is being read."""
+        """Time of the next read; NEVER while a read is waiting."""
         return NEVER if self._reading or not self._round else self._due_ns
 
     def look(self) -> None:
-        """Let the coming idle time read the next block when its time has come; called once a cycle."""
+        """Schedule the read of the next block if it is due; called once a cycle."""
         if self._life.now_ns() < self.due_ns:
             return
         for _ in self._round:
@@ -111,7 +111,7 @@ class SlowReads:
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block]]:
-    """Return what is read in turn: the first block of every servo, then the second, then the ticks."""
+    """Return the reads in turn: the first block of every servo, then the second blocks, then the ticks."""
     if not plan.slow_period_ns:
         return []
     found: list[tuple[int, int, _Block]] = []

@@ -1,8 +1,9 @@
-"""Start-up: the stages from silence to torque, on all lines of a robot side by side.
+"""Start-up: the stages from the first packet to torque on, on all lines of a robot in parallel.
 
-Check everything first (`checks.py`), set registers and modes, learn how each servo answers; then torque on in
-groups, first states, torque confirmed, Bus Watchdogs armed. No stage begins before the one before succeeded
-on every line. The order and its reasons are in failures.md.
+Everything is checked first (`checks.py`). Then registers and modes are set, and the return delays are read.
+Then torque is switched on in groups, the first states are read, torque is confirmed, and the Bus Watchdogs
+are armed. A stage begins only after the previous one succeeded on every line. The order and its reasons are
+in failures.md.
 """
 
 from __future__ import annotations
@@ -44,29 +45,29 @@ from dxlwire.plan.retry import (
 from dxlwire.transaction import Program, Result
 
 GROUP = 3
-"""Servos that get torque before the next ones do: eight at once could pull the supply down."""
+"""Servos that get torque between two pauses: eight at once could pull the supply down."""
 GROUP_PAUSE_NS = 20_000_000
-RETURN_DELAY_STEP_NS = 2_000  # Unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))
+RETURN_DELAY_STEP_NS = 2_000  # unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))
 _SOME = 8
-"""Replies, from which on it is known how late they usually come: three pings a servo, and its model."""
+"""Fewest replies for a judgement of their usual lateness: three pings per servo, and its model."""
 
 
 Stage: TypeAlias = Callable[[BusPlan, Findings], Program[Result]]
-"""Makes the program of a stage for one bus, which adds what it finds."""
+"""Creates the program of a stage for one bus; the program adds its findings."""
 
 
 class Probed(msgspec.Struct):
-    """What was found out about the cyclic reads of one bus."""
+    """Measured properties of the cyclic reads of one bus."""
 
-    return_delays: dict[int, int] = {}  # What each servo waits before it answers, by ID, ns
+    return_delays: dict[int, int] = {}  # return delay of each servo, by ID, ns
     refused: dict[int, str] = {}
-    """Groups that do not answer the fast form, and why, in a sentence without its subject."""
+    """Groups that do not answer the fast form, with the reason, a sentence without its subject."""
 
 
 class StartUp:
     """Runs each stage on all lines.
 
-    Each raises StartUpError with all problems of its stage, PortError when a line is gone.
+    A stage raises StartUpError with all of its problems, or PortError if a line is gone.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class StartUp:
         """Lateness of the replies on each bus."""
 
     def look(self, take_over: bool) -> None:
-        """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
+        """Check every servo, bring registers and modes to the plan, and learn the servos' return delays."""
         found = [Findings() for _ in self._plans]
         self._run(lambda plan, found: survey(plan, take_over, found), found)
         for _, stage in stages(BusStage, self._features):
@@ -97,13 +98,13 @@ class StartUp:
         self.stage(watchdog.disarm_all)
 
     def engage(self, goals: Commands) -> None:
-        """Hold every servo where it stands, and let the goals be that."""
+        """Hold every servo at its present position, and set the goals to these positions."""
         engaged = self.stage(_engage)
         for plan, servos, ticks in zip(self._plans, self._servos, engaged, strict=True):
             servos.engaged()
             for servo, raw in zip(plan.servos, ticks, strict=True):
                 _first_goals(goals, servo, raw)
-            # servos of one joint are next to one another, and it is named once
+            # Servos of one joint are adjacent; name the joint once.
             names = ", ".join(dict.fromkeys(servo.joint for servo in plan.servos if servo.torque_at_start))
             if names:
                 self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
@@ -112,27 +113,27 @@ class StartUp:
                 self._events.emit(EventCode.TORQUE_OFF, Severity.INFO, plan.name, text)
 
     def confirm(self) -> None:
-        """Read torque enable of every servo again, and let them get goals.
+        """Read torque enable of every servo again, and start sending goals.
 
-        Torque on draws current: a servo that browned out meanwhile answers again, limp, and may get no goal.
+        Torque on draws current. A servo that browned out answers again, but limp, and must not get a goal.
         """
         self.stage(_confirm)
         for servos in self._servos:
             servos.confirmed()
 
     def watch(self) -> None:
-        """Arm the Bus Watchdogs, which stop the servos where a reply is awaited for too long."""
+        """Arm the Bus Watchdogs, which stop the servos if a reply is awaited for too long."""
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
         self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found), any_age=True), longer_ns)
 
     def raise_failures(self) -> None:
-        """Raise PortError when a line is gone: there is no start without it."""
+        """Raise PortError if a line is gone: a start needs every line."""
         if error := report_failures(self._lines, self._servos):
             raise error
 
     def _probe_reads(self) -> None:
-        """Find out when replies are due, and read each group plainly that does not answer the fast form."""
+        """Learn the return delays, and use plain reads for each group that does not answer the fast form."""
         probes = self.stage(_probe_reads)
         for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
             servos.reads.learn(probed.return_delays)
@@ -149,9 +150,11 @@ class StartUp:
                 self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
 
     def stage(self, stage: Stage[Result], most_ns: Sequence[int] = ()) -> list[Result]:
-        """Run a stage on all lines, log what it found, and raise its problems; return what came of it.
+        """Run a stage on all lines, log its findings and raise its problems; return the result of each line.
 
-        `most_ns`: how much longer than usual a reply is awaited on each line.
+        Args:
+            stage: The stage.
+            most_ns: Additional timeout of a reply on each line; empty: `LONGER_NS`.
         """
         found = [Findings() for _ in self._plans]
         for times in self._times:
@@ -163,7 +166,7 @@ class StartUp:
     def _run(
         self, stage: Stage[Result], found: Sequence[Findings], most_ns: Sequence[int] = ()
     ) -> list[Result]:
-        """Run one program a bus with longer timeouts, as nothing else waits."""
+        """Run one program per bus with longer timeouts: at start-up no cycle waits for it."""
         most_ns = most_ns or [LONGER_NS] * len(found)
         slow = [
             extend_timeouts(stage(plan, one), most, times)
@@ -180,7 +183,7 @@ class StartUp:
         _refuse((problem for one in found for problem in one.problems), for_replies=missing)
 
     def _late_replies(self) -> Iterable[str]:
-        """Name the buses whose replies usually come when the cyclic reads have given them up."""
+        """Yield a sentence for each bus whose replies usually come after the timeout of the cyclic reads."""
         for plan, times in zip(self._plans, self._times, strict=True):
             late_ns = times.late_ns
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
@@ -190,7 +193,7 @@ class StartUp:
 
 
 def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
-    """Report each line that is gone, once; return the first of them."""
+    """Report each lost line once; return the first failure."""
     first: PortError | None = None
     for plan, bus, mine in zip(lines.plans, lines.buses, servos, strict=True):
         if bus.failure is not None:
@@ -201,11 +204,14 @@ def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
 
 
 def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
-    """Hold every servo where it stands: goal := present, torque on, both read back, group by group.
+    """Hold every servo at its present position: goal := present, torque on, both read back, group by group.
 
-    Those that the robot file wants limp get none, and lose what they have. Ends at the first problem; the
-    caller takes back the torque. Returns the goal positions as they were written, in ticks, in the order of
-    the plan's servos; None: there is none.
+    A servo that the robot file declares limp gets no torque, and loses torque that it has. The program ends
+    at the first problem; the caller then switches torque off again.
+
+    Returns:
+        Goal positions as written, in ticks, in the order of the plan's servos; None: the servo has no goal
+            position.
     """
     goals: list[int | None] = []
     given = 0
@@ -251,7 +257,7 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
 
 
 def _probe_reads(plan: BusPlan, _: Findings) -> Program[Probed]:
-    """Read the return delay of every servo, and try the fast form on every group that is to be read by it."""
+    """Read the return delay of every servo, and try the fast form on every group that is planned for it."""
     found = Probed()
     for servo in plan.servos:
         raw = yield from first_reach(plan, servo).read_one("return_delay_time")
@@ -283,7 +289,7 @@ def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
 
 
 def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
-    """Return how much longer a cycle takes when these groups are read by the form that every servo knows."""
+    """Return the additional time of a cycle if these groups are read in the plain form."""
     line, extra_ns = plan_line(plan), 0
     for number in refused:
         members = [plan.members[index] for index in plan.groups[number]]
@@ -297,7 +303,7 @@ def _refuse(problems: Iterable[str], *, for_replies: bool) -> None:
 
 
 def _first_goals(goals: Commands, servo: ServoPlan, raw: int | None) -> None:
-    """Let the goals be what the servo was given: where it stands, without a speed, or 0."""
+    """Set the goals of a servo to its present position without a speed, or to 0."""
     row, mode = servo.row, servo.start_mode
     goals.position[row] = float("nan") if raw is None else servo.joint_position(raw)
     goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")

@@ -1,8 +1,8 @@
-"""Torque limits of servos: reduced by policies, restored at the start, on return and in another mode.
+"""Torque limits of servos: reduced by policies; restored at start-up, on return and after a mode change.
 
-Protocol 1.0: Torque Limit (34), which begins as Max Torque (14) (e-Manual AX-12A). 2.0: Goal PWM (100), which
-in position control limits the PWM, up to PWM Limit (36) (e-Manual XM430-W350); XL-320 has Torque Limit (35).
-All of them are RAM: a lower value stays until power-off, unless the register is written again.
+Protocol 1.0: Torque Limit (34), whose initial value is Max Torque (14) (e-Manual AX-12A). 2.0: Goal PWM
+(100), which in position control limits the PWM, up to PWM Limit (36) (e-Manual XM430-W350); XL-320 has Torque
+Limit (35). All of them are RAM: a lower value stays until power-off, unless the register is written again.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ SILENT = "did not answer when its torque limit was read"
 
 
 def restore_torque_limits(plan: BusPlan, found: Findings) -> Program[list[int]]:
-    """Restore the torque limit of every servo of a bus at the start, after torque is on.
+    """Restore the torque limit of every servo of a bus at start-up, after torque on.
 
-    Returns the servos' own limits in ticks, in the order of the plan's; 0: it has none that is known.
+    Returns:
+        The servos' own limits in ticks, in the order of the plan; 0: not known.
     """
     own: list[int] = []
     for servo in plan.servos:
@@ -32,11 +33,14 @@ def restore_torque_limits(plan: BusPlan, found: Findings) -> Program[list[int]]:
 
 
 def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[int]:
-    """Restore the torque limit of a servo that holds where it is: with an old goal it would spring back.
+    """Restore the torque limit of a servo that holds its present position.
 
-    A policy, a mode with an effort limit or another program may have lowered it. A mode in which the register
-    is a goal keeps it. So does a servo of Protocol 1.0 with 0, which shut itself down: the write would revive
-    it. Returns the servo's own limit in ticks; 0: it is not known.
+    Before that, an old goal would make it spring back. A policy, a mode with an effort limit or another
+    program may have lowered the limit. It is not changed in a mode that uses the register as its goal, nor in
+    a servo of Protocol 1.0 whose limit is 0: that servo shut itself down, and the write would revive it.
+
+    Returns:
+        The servo's own limit in ticks; 0: not known.
     """
     place = one.servo.torque_limit
     if place is None:
@@ -50,7 +54,7 @@ def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[in
     shut_down = present == 0 and one.plan.protocol == 1.0
     if present != own and not shut_down and _limits(one.servo, mode):
         item = next(each for each in one.items.values() if each.address == place.address)
-        value = min(own, item.maximum)  # the servo's answer may be anything
+        value = min(own, item.maximum)  # the servo's reply may contain any value
         if problem := (yield from one.write(item.name, value)):
             found.problems.append(f"{one} {problem}")
         else:
@@ -62,9 +66,13 @@ def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[in
 def reduced_torque_limits(
     plan: BusPlan, full: Sequence[int], fraction: float, modes: Sequence[Mode]
 ) -> list[bytes]:
-    """Return the packets that leave each servo a fraction of its own limit, one tick at least.
+    """Return the packets that reduce each servo to a fraction of its own limit, at least one tick.
 
-    `modes`: in which the servos are; one whose mode is changing is left alone.
+    Args:
+        plan: The bus.
+        full: The servos' own limits in ticks; 0: not known.
+        fraction: Fraction of the own limit, 0 to 1.
+        modes: Present modes of the servos; UNKNOWN (the mode is changing) omits a servo.
     """
     writes = [
         (servo.servo_id, place.address, max(1, round(own * fraction)).to_bytes(place.size, "little"))
@@ -75,7 +83,8 @@ def reduced_torque_limits(
 
 
 def limits_positions(servo: ServoPlan, mode: ModePlan) -> bool:
-    """Return whether the effort of positions is limited by what policies reduce, too: Torque Limit (34)."""
+    """Return True if the effort limit of a position mode is the register that policies reduce: Torque Limit
+    (34)."""
     place = servo.torque_limit
     return (
         mode.mode is Mode.EFFORT_POSITION
@@ -85,7 +94,8 @@ def limits_positions(servo: ServoPlan, mode: ModePlan) -> bool:
 
 
 def _limits(servo: ServoPlan, mode: Mode) -> bool:
-    """Return whether the torque limit limits in a mode; where Goal PWM is the goal, it would drive."""
+    """Return True if the torque limit is a limit in a mode. Where Goal PWM is the goal, a write would move
+    the servo."""
     place = servo.torque_limit
     if place is None or mode is Mode.UNKNOWN:
         return False

@@ -1,7 +1,7 @@
-"""Torque off on every servo, acknowledged and read back: the last that is sent on every way out of a run.
+"""Torque off on every servo, acknowledged and read back: the last packets at every end of a run.
 
-Where a robot is left with its torque on instead, `stand` stops the joints that follow no position. Needs
-neither numpy nor the loop: the guardian does both after the loop died.
+If a robot keeps its torque at the end, `stand` stops the joints that follow no position. This module needs
+neither numpy nor the loop, because the guardian uses it after the loop process died.
 """
 
 from __future__ import annotations
@@ -21,37 +21,41 @@ from dxlwire.plan.retry import limit_patience
 from dxlwire.transaction import Outcome, Program, Reply
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
-"""A write and its read-back are tried so often, and the read-back is awaited so much longer each time.
+"""Additional timeout of the read-back in each attempt.
 
-Noise rarely hits three times, and hosts and adapters rarely stall for so long; a cut cable always does.
+Noise rarely hits three times, and hosts and adapters rarely stall for so long; a cut cable always fails.
 """
 LIMIT_NS = 1_000_000_000
 LATE_NS = 20_000_000
-"""After silence: what was requested twice is answered twice, and the log is to have all of it."""
+"""Listening time after a missing reply: a request that was sent twice is answered twice, and the log should
+have both replies."""
 SETTLE_NS = 500_000
-"""Time that a half-sent reply may still take: it would collide with the broadcast."""
+"""Listening time for a reply that is still being sent: it would collide with the broadcast."""
 _HOLD = (Mode.POSITION, Mode.EFFORT_POSITION)
-"""Modes in which a servo holds its last goal by itself; in the others it keeps moving."""
+"""Modes in which a servo holds its last goal without a host; in the other modes it keeps moving."""
 
 
 class LimpOutcome(msgspec.Struct, frozen=True):
-    """What came of torque off for one servo."""
+    """Result of torque off for one servo."""
 
     bus: str
     joint: str
     servo_id: int
-    confirmed: bool  # True when torque enable was read back as 0
-    detail: str  # Why it was not confirmed
+    confirmed: bool  # torque enable was read back as 0
+    detail: str  # reason why it was not confirmed
 
     def __str__(self) -> str:
         return f"{self.joint} (ID {self.servo_id} on bus {self.bus}): {self.detail}"
 
 
 def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...]:
-    """Drain the lines, and switch torque off on every servo at once; return what came of it, per servo.
+    """Drain the lines and switch torque off on every servo at once; return the result for each servo.
 
-    None is tried again after the deadline; None: in a second. Raises nothing: a line that is gone is in the
-    outcome.
+    Does not raise: a lost line is part of the result.
+
+    Args:
+        lines: The robot's lines.
+        deadline_ns: No servo is tried again after this time; None: one second from now.
     """
     end_ns = lines.clock.now_ns() + LIMIT_NS if deadline_ns is None else deadline_ns
     results = lines.run([limit_patience(_limp(plan, lines.clock.now_ns, end_ns)) for plan in lines.plans])
@@ -63,19 +67,22 @@ def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...
 
 
 def stand(lines: Lines) -> tuple[str, ...]:
-    """Stop every joint that has torque and follows a velocity, an effort or a PWM; return a sentence each.
+    """Stop every joint that has torque and follows a velocity, an effort or a PWM.
 
-    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
+    A servo that does not accept a goal of 0, or whose mode cannot be read, loses its torque. Does not raise.
+
+    Returns:
+        A sentence for each such servo.
     """
     found = lines.run([limit_patience(_stand(plan)) for plan in lines.plans])
     return tuple(sentence for one in found for sentence in one or ())
 
 
 def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program[tuple[LimpOutcome, ...]]:
-    """Switch torque off everywhere on one bus: all at once first, then servo by servo with read-back.
+    """Switch torque off on one bus: first with a broadcast, then servo by servo with read-back.
 
-    Each servo that did not confirm is tried again when the others had their turn. After `deadline_ns` none is
-    tried again, but each at least once.
+    A servo that did not confirm is tried again after the other servos. Each servo is tried at least once, but
+    none again after `deadline_ns`.
     """
     yield listen(SETTLE_NS)
     for broadcast in plan.limp:
@@ -110,7 +117,8 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
             sentences.append(f"{one} is limp, as {problem}")
         else:
             left.append((one, problem))
-    for longer_ns in LONGER_NS[1:]:  # only now: a servo that still moves does not wait for a silent one
+    # Retry only now: a servo that still moves must not wait for a silent one.
+    for longer_ns in LONGER_NS[1:]:
         for one, problem in tuple(left):
             if (yield from _is_off(one, longer_ns)):
                 left.remove((one, problem))
@@ -121,7 +129,7 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
 
 
 def _stop(one: Access) -> Program[str | None]:
-    """Stop a servo; return why it does not stand, empty when it does, None where nothing was to be done."""
+    """Stop a servo; return the reason for a failure, empty on success, None if it needs no stop."""
     mode = yield from modes.mode_now(one)
     if mode in _HOLD:
         return None

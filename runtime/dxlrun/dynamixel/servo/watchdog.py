@@ -1,8 +1,9 @@
-"""Bus Watchdog: a servo of Protocol 2.0 stops by itself when no instruction comes any more.
+"""Bus Watchdog: stops a servo of Protocol 2.0 when it receives no more instructions.
 
-Armed last at the start, so that nothing but a cyclic exchange keeps it from tripping, and disarmed at the
+It is armed last at start-up, because only the cyclic exchange keeps it from tripping, and disarmed at the
 end. After it has stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-Manual
-XM430-W350, Bus Watchdog (98)). Protocol 1.0 has none: there the guardian cuts the torque when the loop dies.
+XM430-W350, Bus Watchdog (98)). Protocol 1.0 has no watchdog: there the guardian cuts the torque when the loop
+process dies.
 """
 
 from __future__ import annotations
@@ -17,33 +18,36 @@ from dxlwire.control_table import ControlItem, find_table
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import dialect_of, sync_writes
 
-UNIT_NS = 20_000_000  # One step of the register (e-Manual XM430-W350, Bus Watchdog (98))
-MOST_TICKS = 127  # The longest time; beyond it stand the values that say that it has stopped
+UNIT_NS = 20_000_000  # one step of the register (e-Manual XM430-W350, Bus Watchdog (98))
+MOST_TICKS = 127  # longest timeout; higher values mean that it has tripped
 RAMP = "profile_acceleration"
-"""It is 0 after a servo was stopped, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98), step 4
-of the example)."""
+"""Register that is 0 after a watchdog stop, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98),
+step 4 of the example)."""
 RETURN_SPEED = 1.5
-"""rad/s, no faster does a returning servo go to its goal, which may have moved on: a step that no gate saw
-has to be a slow one."""
+"""rad/s. Highest speed of a returning servo toward its goal. The goal may have moved far, in a step that no
+limit has checked."""
 _FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
-"""What a servo follows that is led to no position, by Operating Mode (e-Manual XM430-W350, (11))."""
-LEAST_PERIODS = 3  # It must outlast two lost cycles (failures.md)
+"""Goal register that a servo follows, by Operating Mode without a position goal (e-Manual XM430-W350, (11)).
+"""
+LEAST_PERIODS = 3  # the timeout must be longer than two lost cycles (failures.md)
 
 
 def arm(one: Access) -> Program[str]:
-    """Arm a servo's watchdog, where the plan wants it and the model has one; return what went wrong."""
+    """Arm a servo's watchdog if the plan requires it and the model has one; return the problem or an empty
+    string."""
     if not has_one(one.plan, one.servo):
         return ""
     return (yield from _write(one, one.plan.watchdog_ticks))
 
 
 def disarm(one: Access) -> Program[str]:
-    """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong.
+    """Clear a servo's watchdog if it is armed or has tripped; return the problem or an empty string.
 
-    Also where the plan wants none: an earlier run that was killed may have left it armed. A servo that it
-    stopped with torque moves to its old goal [i], at full speed as its profile was reset: it gets a slow
-    one before. One that is led to no position would go on with its old velocity or effort: that becomes 0
-    right behind, or its torque is switched off.
+    This is done even if the plan requires no watchdog: an earlier run that was killed may have left it armed.
+    After the clear a servo that was stopped with torque moves to its old goal [i], at full speed because its
+    profile was reset. It therefore gets a slow profile velocity first. A servo without a position goal would
+    continue with its old velocity or effort: its goal becomes 0 right after the clear, or else its torque is
+    switched off.
     """
     if (item := item_of(one.plan, one.servo)) is None:
         return ""
@@ -68,28 +72,29 @@ def disarm(one: Access) -> Program[str]:
 
 
 def revive(one: Access) -> Program[str]:
-    """Clear and arm a servo's watchdog again after no instruction came for too long."""
+    """Clear and arm a servo's watchdog again after a pause in the instructions."""
     return (yield from disarm(one)) or (yield from arm(one))
 
 
 def longer_ns(plan: BusPlan) -> int:
-    """Return how much longer than usual a reply may be awaited while servos are armed."""
+    """Return the additional timeout of a reply that armed servos tolerate."""
     return plan.watchdog_ticks * UNIT_NS // 3
 
 
 def disarm_all(plan: BusPlan, found: Findings) -> Program[None]:
-    """Clear every servo of a bus, before torque is switched on."""
+    """Clear the watchdog of every servo of a bus, before torque on."""
     for servo in plan.servos:
         if problem := (yield from disarm(reach(plan, servo))):
             found.problems.append(problem)
 
 
 def release_all(plan: BusPlan) -> Program[list[str]]:
-    """Disarm the servos of a bus that keep holding; return which were not disarmed, and why.
+    """Disarm the servos of a bus that keep holding; return a sentence for each servo that was not disarmed.
 
-    One that its watchdog has stopped stays stopped: cleared, it would go on to its old goal [i], at full
-    speed as its profile was reset, with no loop that could stop it. One that does not answer stops by itself.
-    While all answer, a read of all that are left keeps them from tripping before their turn.
+    A servo that its watchdog has stopped stays stopped: after a clear it would move to its old goal [i], at
+    full speed because its profile was reset, without a loop that could stop it. A servo that does not answer
+    stops when its watchdog trips. While all servos answer, one read of all remaining servos keeps their
+    watchdogs from tripping.
     """
     problems, all_answer = [], True
     armed = [
@@ -114,7 +119,7 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
 
 
 def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
-    """Return the packets that write the same to these servos; none where the plan wants no watchdog."""
+    """Return the packets that write the same timeout to servos; empty if the plan requires no watchdog."""
     if not plan.watchdog_ticks:
         return []
     items = [(servo.servo_id, item) for servo in servos if (item := item_of(plan, servo))]
@@ -123,12 +128,12 @@ def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes
 
 
 def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
-    """Return whether a servo's watchdog is armed by the plan."""
+    """Return True if the plan arms a servo's watchdog."""
     return bool(plan.watchdog_ticks) and item_of(plan, servo) is not None
 
 
 def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
-    """Return the item of a servo's watchdog, None where the model has none."""
+    """Return the watchdog item of a servo; None if the model has none."""
     return find_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 

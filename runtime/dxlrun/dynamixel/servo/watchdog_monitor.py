@@ -1,4 +1,5 @@
-"""Watchdog monitor: notices that a bus received no instruction for too long, and revives its servos."""
+"""Watchdog monitor: detects pauses in the instructions on a bus that trip the Bus Watchdogs, and revives the
+servos."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from dxlwire.transaction import Program
 
 
 class WatchdogMonitor:
-    """Knows when the servos of one bus were last sent anything; the exchange kernel looks at that, too."""
+    """Keeps the time of the last packet to the servos of one bus, which the exchange kernel checks, too."""
 
     def __init__(self, life: Life, desired: DesiredState) -> None:
         self._life = life
@@ -21,13 +22,14 @@ class WatchdogMonitor:
         self._words = life.idle.bus.words
         self._words[SILENCE_NS] = life.plan.watchdog_ticks * watchdog.UNIT_NS
         self._reviving: set[int] = set()
-        """Their revival waits for idle time already: a loop that is late again requests no second one."""
+        """Servos whose revival already waits for idle time; a second late cycle must not schedule it again.
+        """
 
     def arm(self, found: Findings) -> Program[None]:
-        """Arm every servo and read it back, at the end of the start-up.
+        """Arm every servo and read it back, at the end of start-up.
 
-        All of them at once, and once more before each is read: none is stopped because the others take long.
-        A servo that is revived is sent instructions all the time, so it is not stopped by that itself.
+        All servos are armed at once, and again before each read-back, so none trips while the other servos
+        are read. A servo that is being revived receives instructions all the time.
         """
         life, plan = self._life, self._life.plan
         self._words[ASKED_NS] = life.now_ns()
@@ -49,7 +51,7 @@ class WatchdogMonitor:
                 self._words[ASKED_NS] = life.now_ns()
 
     def sent(self, now_ns: int) -> None:
-        """Record that the servos are sent something now; revive them if they were silent for too long."""
+        """Record that the servos are sent a packet now, and revive them if the pause before was too long."""
         words = self._words
         if not (words[SILENCE_NS] and words[ASKED_NS]):
             return
@@ -77,7 +79,7 @@ class WatchdogMonitor:
             life.events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, f"{text}; they are revived")
 
     def _revive(self, index: int) -> Program[None]:
-        """Write again what the watchdog reset of the desired registers, then clear and arm it."""
+        """Restore the desired registers that the watchdog stop reset, then clear and arm the watchdog."""
         life, one, found = self._life, self._life.reach(index), Findings()
         ramp = [each for each in self._desired.settings(index) if each.name == watchdog.RAMP]
         yield from settle(one, ramp, found)

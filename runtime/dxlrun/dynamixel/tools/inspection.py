@@ -1,4 +1,4 @@
-"""Inspection before a run: which models answer, and what a start would find; nothing is written."""
+"""Inspection before a run: connected models and the problems that a start would find; nothing is written."""
 
 from __future__ import annotations
 
@@ -30,65 +30,74 @@ from dxlwire.plan.retry import extend_timeouts, retry, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
 from dxlwire.transaction import Outcome, Program, Reply, Result
 
-NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken
+NOWHERE: Mapping[str, PacketSink] = {}  # no bus logs its packets
 NO_JOINTS: Mapping[int, JointPlan] = {}
 
 
 class Identity(msgspec.Struct, frozen=True):
-    """What answered for one joint; either `model` or `problem` is empty."""
+    """Result of the identification of one joint's servo; either `model` or `problem` is empty."""
 
     joint: str
-    model: str  # Name of the control table
-    problem: str  # Why there is no model, one sentence
+    model: str  # name of the control table
+    problem: str  # reason for the missing model, one sentence
 
 
 class RegisterRow(msgspec.Struct, frozen=True):
-    """One declared register and what the servo holds there."""
+    """One declared register and its value in the servo."""
 
     joint: str
     item: str
     address: int
     area: str  # `EEPROM` or `RAM`
-    declared: int  # The integer on the wire, as `found`
-    found: int | None  # None: it did not answer
-    action: str  # What a run would do: `nothing`, `write`, or empty where it would not start
+    declared: int  # integer on the wire, like `found`
+    found: int | None  # None: no answer
+    action: str  # action of a run: `nothing`, `write`, or empty if it would not start
 
 
 class DeviationRow(msgspec.Struct, frozen=True):
-    """One setting of a servo that is not the factory's and that a start reports."""
+    """One setting of a servo that differs from the factory's and that a start reports."""
 
     joint: str
     servo: str  # `ID 4 on bus main`
     item: str
     address: int
     area: str  # `EEPROM` or `RAM`
-    found: int  # The integer on the wire, as `factory`
+    found: int  # integer on the wire, like `factory`
     factory: int
-    effect: str  # What the value does: a verb with its object
+    effect: str  # effect of the value: a verb with its object
 
 
 class Found(msgspec.Struct):
-    """What was read of the servos, in the order of the plans."""
+    """Values read from the servos, in the order of the plans."""
 
-    compared: int = 0  # How many servos were read and compared with the file
+    compared: int = 0  # number of servos that were compared with the file
     registers: list[RegisterRow] = []
     deviations: list[DeviationRow] = []
-    problems: list[str] = []  # Why a run would not start, one sentence each
-    remarks: list[str] = []  # What else differs from what the robot file assumes
+    problems: list[str] = []  # reasons why a run would not start, one sentence each
+    remarks: list[str] = []  # other differences from the robot file
 
     @property
     def as_declared(self) -> bool:
-        """True when a run would start, and would write no register."""
+        """True if a run would start and would not write a register."""
         return not self.problems and all(row.found == row.declared for row in self.registers)
 
 
 def read_models(
     buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] = NOWHERE
 ) -> Mapping[str, str]:
-    """Return the models of the servos of `joints` (`model: auto`), by joint; opens their ports, closes them.
+    """Read the models of servos with `model: auto`; open their ports and close them again.
 
-    `packets`: by bus, what takes its packets. Raises StartUpError with a sentence for every servo that cannot
-    be identified, PortError when a port cannot be opened or is gone.
+    Args:
+        buses: Plans of the lines.
+        joints: Joints with `model: auto`.
+        packets: Log of each bus's packets, by its name.
+
+    Returns:
+        The model of each of the joints.
+
+    Raises:
+        StartUpError: Servos cannot be identified; a sentence for each.
+        PortError: A port cannot be opened or is gone.
     """
     concerned = [bus for bus in buses if any(servo.joint in joints for servo in bus.servos)]
     with _lines(concerned) as ports:
@@ -104,15 +113,16 @@ def look(
     packets: Mapping[str, PacketSink] = NOWHERE,
     joints: Mapping[int, JointPlan] = NO_JOINTS,
 ) -> Found:
-    """Check every servo as a start does, and every declared register; opens the ports, closes them.
+    """Check every servo and every declared register as a start does; open the ports and close them again.
 
     Args:
-        buses: the plans of the lines.
-        packets: by bus, what takes its packets.
-        joints: by row of a servo, the joint that it moves alone; registers are compared with its limits.
+        buses: Plans of the lines.
+        packets: Log of each bus's packets, by its name.
+        joints: Joint of each servo that moves one alone, by row; registers are compared with the joint's
+            limits.
 
     Raises:
-        PortError: a port cannot be opened or is gone.
+        PortError: A port cannot be opened or is gone.
     """
     with _lines(buses) as ports:
         found = _run([_look(plan, joints) for plan in buses], buses, ports, MonotonicClock(), packets)
@@ -129,12 +139,12 @@ def look(
 
 
 def compare_servos(tool: ToolLine, plan: BusPlan, servos: Sequence[ServoPlan]) -> Findings:
-    """Compare servos with the robot file: as a start does, and with `stored_registers`. Writes nothing.
+    """Compare servos with the robot file, as a start does, and with `stored_registers`. Writes nothing.
 
     Args:
         tool: The line of their bus.
         plan: The bus.
-        servos: Those servos of the bus that are connected.
+        servos: The connected servos of the bus.
 
     Returns:
         Findings whose `problems` name each servo that does not answer or differs.
@@ -165,9 +175,10 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
 
 
 def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
-    """Return what the EEPROM of a servo shall hold: its registers, and the return delay time of its bus.
+    """Return the registers that belong in the EEPROM of a servo: its own, and the return delay time of its
+    bus.
 
-    Registers in the RAM are written by each run.
+    Every run writes the RAM registers.
     """
     declared = [one for one in servo.settings if one.eeprom]
     item = table.items.get("return_delay_time")
@@ -187,8 +198,10 @@ def identify(
 ) -> Mapping[str, Identity]:
     """Read the model numbers of the servos of some joints; return their models, by joint.
 
-    `plans` are made with any model of the bus' protocol: only ports, IDs and times count. Raises PortError
-    when a line is gone.
+    The plans can have any model of the bus' protocol: only ports, IDs and times are used.
+
+    Raises:
+        PortError: A line is gone.
     """
     found = _run([_identify(plan, joints) for plan in plans], plans, ports, clock, packets)
     return {one.joint: one for identities in found for one in identities}
@@ -201,7 +214,7 @@ def _run(
     clock: Clock,
     packets: Mapping[str, PacketSink],
 ) -> list[Result]:
-    """Run one program a bus with longer timeouts; raises PortError when a line is gone."""
+    """Run one program per bus with longer timeouts; raise PortError if a line is gone."""
     lines = Lines(plans, ports, clock, [packets.get(plan.name) or PacketSink() for plan in plans])
     found = lines.run([extend_timeouts(program) for program in programs])
     if lines.failure is not None:

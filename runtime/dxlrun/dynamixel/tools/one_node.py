@@ -1,7 +1,6 @@
-"""One servo or device on a tool's line: its items are read, and written with a look at what came of it.
+"""Node of a tool: one servo or device on a tool's line, whose items are read and written.
 
-What every run does is done by the same programs as there: registers are compared, only differences written
-and read back.
+The programs are those of a run: registers are compared, only differences are written, and each is read back.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from dxlwire.plan.retry import extend_timeouts
 from dxlwire.transaction import Outcome, Program, Result
 
 Confirm: TypeAlias = Callable[[str], bool]
-"""Asks whether a change is wanted, before it is made."""
+"""Asks for confirmation of a change before it is made."""
 
 
 def agree(question: str) -> bool:
-    """Answer yes."""
+    """Confirm every change."""
     return True
 
 
 class OneNode:
-    """The servo or device that a tool works on; blocks, and raises ServoFault or PortError."""
+    """The servo or device that a tool works on. Its methods block, and raise ServoFault or PortError."""
 
     NOT_SET: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Why an item is not set like others, and what to do instead, by its name."""
+    """Reason why an item is not set like other items, with the alternative, by its name."""
 
     def __init__(self, tool: ToolLine, found: FoundServo, table: Table) -> None:
         self.tool = tool
@@ -46,36 +45,38 @@ class OneNode:
 
     @property
     def called(self) -> str:
-        """How messages call it."""
+        """Name of the node in messages."""
         return f"{self.table.model}, ID {self.servo_id} at {self.baud_rate} bit/s"
 
     @property
     def command(self) -> str:
-        """How a command line to it begins."""
+        """Start of a command line for the node."""
         return f"dxlrun servo {self.tool.port.name} {self.servo_id}"
 
     @property
     def access(self) -> ItemAccess:
-        """Its items, as programs reach them."""
+        """Access to the items of the node."""
         raise NotImplementedError
 
     def fail(self, text: str) -> ServoFault:
-        """Return an error about it."""
+        """Return an error with the node's name."""
         return ServoFault(f"{self.called}: {text}")
 
     def run(self, program: Program[Result]) -> Result:
-        """Run a program with longer timeouts: it has answered before."""
+        """Run a program with longer timeouts: the node has answered before."""
         return self.tool.run(extend_timeouts(program))
 
     def register(self, name: str, value: int) -> RegisterValue:
-        """Return an item with what it shall hold, the integer of the wire."""
+        """Return an item with a value, as the integer on the wire."""
         item = self.table.items[name]
         return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
 
     def read(self, names: Sequence[str], *, refused: bool = False) -> Mapping[str, int]:
-        """Return items by name: integers of the wire, signed where the item is, 0 or 1 of a bit.
+        """Return items by name: integers on the wire, signed if the item is, 0 or 1 for a bit.
 
-        `refused`: what its firmware does not have is left out; without, that is an error.
+        Args:
+            names: The items to read.
+            refused: True: omit items that the firmware does not have. False: they are an error.
         """
         found: dict[str, int] = {}
         for block in side_by_side((self.table.items[name] for name in names), LONGEST_READ):
@@ -83,27 +84,28 @@ class OneNode:
         return {name: found[name] for name in names if name in found}
 
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
-        """Return which of some values are not the factory's and matter to a run."""
+        """Return the values that differ from the factory's and matter to a run."""
         return ()
 
     def writable(self, desired: Sequence[RegisterValue]) -> None:
-        """Make sure that registers can be written; raises ServoFault where the EEPROM is closed."""
+        """Check that registers can be written; raise ServoFault if the EEPROM is closed."""
         stored = [self.table.items[one.name].title for one in desired if one.eeprom]
         release = f"switch the torque off first: {self.command} torque off"
         if stored and (problem := self.run(self.access.closed_eeprom(stored[0], release=release))):
             raise self.fail(problem)
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
-        """Write the registers that differ, in order, and read each back; return what was written."""
+        """Write the registers that differ, in the given order, and read each back; return a text for each
+        write."""
         self.writable(desired)
         return self._settle(desired)
 
     def set_register(self, target: RegisterValue, confirm: Confirm = agree) -> tuple[str, ...]:
-        """Write one item, into the EEPROM if that is confirmed; return what was done."""
+        """Write one item, an EEPROM item only after confirmation; return the actions."""
         item = self.table.items[target.name]
         before = self.read([target.name])[target.name]
         if before == target.value:
-            # a goal that is there already is not pursued while its Bus Watchdog is tripped
+            # A servo ignores the goal that it already has while its Bus Watchdog is tripped: write it again.
             done = () if target.eeprom else self.write([target])
             return (f"{item.title} is {target.value} already", *done)
         if target.eeprom:
@@ -141,7 +143,7 @@ class OneNode:
 
 
 class DeviceAccess(ItemAccess):
-    """A device as programs reach it."""
+    """Access to a device."""
 
     __slots__ = ("_called", "_table")
 
@@ -154,7 +156,7 @@ class DeviceAccess(ItemAccess):
 
     @property
     def table(self) -> Table:
-        """Its control table."""
+        """Control table of the device."""
         return self._table
 
 
@@ -173,5 +175,5 @@ class OneDevice(OneNode):
 
     @property
     def access(self) -> ItemAccess:
-        """Its items, as programs reach them."""
+        """Access to the items of the device."""
         return DeviceAccess(self.tool.line, self)

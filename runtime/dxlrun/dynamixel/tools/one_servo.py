@@ -1,9 +1,8 @@
-"""One servo on a tool's line: its control table, torque, ID, rate, reboot, reset and own backup.
+"""Servo of a tool: its control table, torque, ID, rate, reboot, reset and own backup.
 
-What every run does is done by the same programs as there: registers are compared, only differences written
-and read back; torque comes with a goal where the servo stands. Every change is confirmed by what is found
-afterwards. Sources: e-Manual, Protocol 1.0 and 2.0: Factory Reset (0x06), Reboot (0x08), Control Table Backup
-(0x20).
+The programs are those of a run: registers are compared, only differences are written, and each is read back;
+torque is switched on with a goal at the present position. Every change is confirmed by a read afterwards.
+Sources: e-Manual, Protocol 1.0 and 2.0: Factory Reset (0x06), Reboot (0x08), Control Table Backup (0x20).
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ from dxlwire.transaction import Outcome, Program, Reply, Transaction
 from dxlwire.wire import protocol1, protocol2
 from dxlwire.wire.protocol2 import Reset
 
-BLINK_NS = 300_000_000  # How long the LED is on, and then off
-BOOT_NS = 5_000_000_000  # How long a rebooting servo is awaited
+BLINK_NS = 300_000_000  # time of the LED on, and then off
+BOOT_NS = 5_000_000_000  # timeout for a rebooting servo
 _PINGED_EVERY_NS = 100_000_000
-_STORED_NS = 50_000_000  # What a servo may take to write its EEPROM [i]
+_STORED_NS = 50_000_000  # longest time of an EEPROM write [i]
 _TICK_MODULUS = 32_768
 _TICK_SPARE_MS = 500
 _SET_BY: Mapping[str, str] = {
@@ -50,7 +49,8 @@ _SET_BY: Mapping[str, str] = {
     "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
     "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
 }
-"""What is not set like other items, as more than a write belongs to it."""
+"""Items that are not set like other items, because a change needs more than one write, with the alternative.
+"""
 _KEPT: Mapping[Reset, str] = {
     Reset.ALL: "ID and baud rate too",
     Reset.KEEP_ID: "its baud rate too; its ID stays",
@@ -60,7 +60,7 @@ _LEDS = ("led", "led_red", "led_green", "led_blue")
 
 
 class OneServo(OneNode):
-    """The servo that a tool works on; blocks, and raises ServoFault or PortError."""
+    """The servo that a tool works on. Its methods block, and raise ServoFault or PortError."""
 
     NOT_SET = MappingProxyType({name: f"{name} is not set like others; {_SET_BY[name]}" for name in _SET_BY})
     table: ControlTable
@@ -72,7 +72,7 @@ class OneServo(OneNode):
         self.move_to(found.servo_id, found.baud_rate)
 
     def move_to(self, servo_id: int, baud_rate: int) -> None:
-        """Address it by another ID, at another rate, from now on."""
+        """Address the servo by another ID and at another rate from now on."""
         self.servo_id, self.baud_rate = servo_id, baud_rate
         self.tool.speak(self.table.protocol, baud_rate)
         self.plan = self._plan()
@@ -83,17 +83,17 @@ class OneServo(OneNode):
 
     @property
     def access(self) -> Access:
-        """Its items, as programs reach them."""
+        """Access to the items of the servo."""
         return Access(self.plan, self._servo, self.tool.line)
 
     # Registers
 
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
-        """Return which of some values are not the factory's and matter to a run."""
+        """Return the values that differ from the factory's and matter to a run."""
         return deviations(self.access, values, mode_in(self._servo, values))
 
     def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
-        """Compare registers with what they shall hold; writes nothing."""
+        """Compare registers with their desired values without writing any."""
         found = self.run(compare(self.access, desired))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]
         if silent:
@@ -101,10 +101,11 @@ class OneServo(OneNode):
         return found
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
-        """Write the registers that differ, in order, and read each back; return what was written.
+        """Write the registers that differ, in the given order, and read each back; return a text for each
+        write.
 
-        Before goals, which a servo refuses while its Bus Watchdog is tripped, that is cleared; so is it where
-        the watchdog itself is written.
+        A servo refuses goals while its Bus Watchdog is tripped, so a tripped watchdog is cleared before a
+        goal is written, and before the watchdog itself is written.
         """
         self.writable(desired)
         tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in desired)
@@ -112,11 +113,17 @@ class OneServo(OneNode):
         return (*cleared, *self._settle(desired))
 
     def clear_watchdog(self, *, armed: bool) -> tuple[str, ...]:
-        """Clear a Bus Watchdog that is tripped, `armed`: or would trip; return what was done, if anything.
+        """Clear a tripped Bus Watchdog; return a text for each action.
 
-        A run that was killed leaves it so. A servo that was stopped with torque would go on to its old goal,
-        at full speed, as its profile was reset: its torque is off until it is held where it stands. Raises
-        ServoFault.
+        A run that was killed leaves the watchdog armed or tripped. After the clear a servo that was stopped
+        with torque would move to its old goal, at full speed because its profile was reset. Its torque is
+        therefore off until it is held at its present position.
+
+        Args:
+            armed: True: also clear a watchdog that is armed and has not tripped yet.
+
+        Raises:
+            ServoFault: The servo does not answer or refuses.
         """
         item = self.table.items.get("bus_watchdog")
         if item is None:
@@ -138,13 +145,13 @@ class OneServo(OneNode):
     # Torque and LED
 
     def holds_torque(self) -> bool:
-        """Return whether Torque Enable is on."""
+        """Return True if Torque Enable is on."""
         return bool(self.read(["torque_enable"])["torque_enable"])
 
     def torque(self, on: bool) -> tuple[str, ...]:
-        """Switch the torque on where the servo stands, or off; read back. Return what was done.
+        """Switch torque on at the present position, or off, and read it back; return a text for each action.
 
-        For the torque a Bus Watchdog that is tripped, or would trip, is cleared.
+        Before torque on, a Bus Watchdog that is armed or tripped is cleared.
         """
         if not on:
             written = self.write([self.register("torque_enable", 0)])
@@ -164,7 +171,7 @@ class OneServo(OneNode):
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
     def blink(self, times: int = 5) -> str:
-        """Let the LED blink, and leave it as it was; return what was done."""
+        """Blink the LED and restore its state; return a text."""
         names = [name for name in _LEDS if name in self.table.items]
         if not names:
             raise self.fail("this model has no LED that can be switched")
@@ -182,11 +189,11 @@ class OneServo(OneNode):
     # Inside
 
     def _mode(self) -> Mode:
-        """Find out in which mode it is, and prepare that; raises ServoFault for one that is not known."""
+        """Return the present mode and plan for it; raise ServoFault if the mode is not known."""
         for continuous in (False, True):
             try:
                 self.plan = self._plan(continuous)
-            except ValueError:  # the model has no modes without end
+            except ValueError:  # the model has no continuous mode
                 break
             mode = self.run(modes.mode_now(reach(self.plan, self._servo)))
             if mode is not Mode.UNKNOWN:
@@ -218,11 +225,14 @@ class OneServo(OneNode):
             protocol=table.protocol,
         )
 
-    # Verbs: each returns what was done, nothing where that was not confirmed
+    # Verbs: each returns a text about the change, empty if it was not confirmed by the user.
 
     def change_id(self, new: int, confirm: Confirm = agree) -> str:
-        """Give it another ID. Raises ServoFault, also where the ID is taken, and InputError for one that the
-        protocol does not have.
+        """Change the ID of the servo.
+
+        Raises:
+            ServoFault: The change failed, or another servo has the ID.
+            InputError: The protocol does not have the ID.
         """
         if new > (highest := self.tool.line.dialect.HIGHEST_ID):
             raise InputError(f"{new} is no ID of Protocol {self.table.protocol}; they are 0..{highest}")
@@ -244,10 +254,12 @@ class OneServo(OneNode):
         return f"has ID {new}; it had {old}"
 
     def change_rate(self, new: int, confirm: Confirm = agree) -> str:
-        """Let it talk at another rate, bit/s.
+        """Change the baud rate of the servo, bit/s.
 
-        Raises ServoFault, also where the adapter cannot, or another servo there has its ID; InputError where
-        the model does not have the rate.
+        Raises:
+            ServoFault: The change failed, the adapter does not support the rate, or another servo there has
+                the ID.
+            InputError: The model does not have the rate.
         """
         value = next((value for value, rate in self.table.baud_rates.items() if rate == new), None)
         if value is None:
@@ -283,11 +295,11 @@ class OneServo(OneNode):
         return f"talks at {new} bit/s; it did at {old}"
 
     def rate_item(self) -> str:
-        """Return the name of the item that holds its rate; the Y series has two."""
+        """Return the name of the item with the baud rate; the Y series has two rates."""
         return "baud_rate" if "baud_rate" in self.table.items else "baud_rate_bus"
 
     def reboot(self, confirm: Confirm = agree) -> str:
-        """Reboot it, and wait until it answers; it is asked for torque that goes off."""
+        """Reboot the servo and wait for its answer; ask for confirmation first if it holds torque."""
         if self.holds_torque() and not confirm(
             f"{self.called} holds torque: its torque goes off, and what it holds falls"
         ):
@@ -307,9 +319,10 @@ class OneServo(OneNode):
         return f"started anew, and {'holds torque' if self.holds_torque() else 'is limp'}"
 
     def factory_reset(self, keep: Reset | None = None, confirm: Confirm = agree) -> str:
-        """Set its control table to the factory's values; without `keep` Protocol 2.0 keeps ID and baud rate.
+        """Reset the control table to the factory's values.
 
-        Protocol 1.0 keeps nothing. Where it gets the ID or the rate of the factory, these must be free.
+        Protocol 2.0 keeps ID and baud rate unless `keep` says otherwise; Protocol 1.0 keeps neither. The ID
+        and the rate of the factory must be free if the servo will get them.
         """
         old = self.table.protocol == 1.0
         if old and keep not in (None, Reset.ALL):
@@ -345,7 +358,7 @@ class OneServo(OneNode):
         return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
 
     def back_up(self, confirm: Confirm = agree) -> str:
-        """Let it store its control table in its own backup."""
+        """Store the control table in the servo's own backup."""
         if not confirm(f"{self.called}: the backup that it keeps itself is overwritten"):
             return ""
         self._has_backup()
@@ -355,7 +368,7 @@ class OneServo(OneNode):
         return "stored its control table in its own backup"
 
     def take_back(self, confirm: Confirm = agree) -> str:
-        """Let it take its EEPROM back from its own backup and start anew."""
+        """Restore the EEPROM from the servo's own backup and reboot the servo."""
         if not confirm(f"{self.called}: its EEPROM becomes that of the backup that it keeps itself"):
             return ""
         self._has_backup()
@@ -369,7 +382,7 @@ class OneServo(OneNode):
     def restore(
         self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree
     ) -> tuple[str, ...]:
-        """Write what a file has back."""
+        """Restore the registers of a backup file."""
         if not (differing := [each.register for each in self.differences(desired) if each.differs]):
             return (f"has everything that {path} restores already",)
         self.writable(differing)
@@ -377,7 +390,7 @@ class OneServo(OneNode):
         if not confirm(f"{self.called}: {names} become as in {path}; its ID and its rate stay"):
             return ()
         written = self.write(desired)
-        # a mode that comes back resets registers beside it
+        # A restored mode resets other registers, so compare again.
         if left := [each.register.name for each in self.differences(desired) if each.differs]:
             raise self.fail(f"{', '.join(left)} changed again while others were written; try again")
         return written
@@ -389,7 +402,7 @@ class OneServo(OneNode):
             raise self.fail(f"holds torque; switch it off first: {self.command} torque off")
 
     def _written(self, transaction: Transaction, what: str) -> None:
-        """Send a change; a missing acknowledgement decides nothing, what is found afterwards does."""
+        """Send a change. A missing acknowledgement is not a failure: the read afterwards decides."""
 
         def program() -> Program[Reply]:
             reply = yield transaction

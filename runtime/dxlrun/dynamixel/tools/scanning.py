@@ -1,10 +1,10 @@
-"""Scanning: which servos answer on a line, in which protocol and at which rate; nothing is written.
+"""Scanning: finds the servos on a line, with protocol and rate; nothing is written.
 
-Protocol 2.0 gets one broadcast ping a rate, which each servo answers in a slot of its own; Protocol 1.0 is
-pinged ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping). So is
-Protocol 2.0 at a rate where something answered: boards that are built with the maker's Dynamixel2Arduino take
-no part in a broadcast ping (utility/slave.cpp). Where anything is received that is no whole reply every ID is
-pinged again, with longer timeouts.
+Protocol 2.0 gets one broadcast ping per rate, which each servo answers in its own slot. Protocol 1.0 is
+pinged ID by ID, because all its servos would answer a broadcast at once (e-Manual, Protocol 1.0 and 2.0,
+Ping). Protocol 2.0 is also pinged ID by ID at a rate where a node answered: boards with the maker's
+Dynamixel2Arduino do not answer a broadcast ping (utility/slave.cpp). After bytes that are not a whole reply
+every ID is pinged again, with longer timeouts.
 """
 
 from __future__ import annotations
@@ -25,54 +25,55 @@ from dxlwire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transacti
 from dxlwire.wire.dialect import dialect_of
 
 SHORT_TIMEOUT_NS = 2_000_000
-"""How long a reply that probably does not come is awaited beyond the latest moment by the wire."""
+"""Timeout for an improbable reply, beyond the latest time by the wire."""
 SLOT_NS = 3_000_000
-"""After a broadcast ping: of each ID, beside the bytes of its answer (dynamixel-sdk, broadcastPing)."""
-LATE_NS = 20_000_000  # After the last request at a rate: what still comes was late in the adapter
+"""Slot of each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
+broadcastPing)."""
+LATE_NS = 20_000_000  # listening time after the last request at a rate, for replies that the adapter delays
 LATE_OF_FEW_NS = 100_000_000
-"""The same where few IDs are pinged: there it may be the machine that is late."""
-FEW = 20  # So many IDs are quicker pinged one by one
+"""The same if few IDs are pinged: then the machine may be late, too."""
+FEW = 20  # up to this many IDs, single pings are faster than a broadcast
 _USUAL = (1_000_000, 57_600, 115_200)
 _IDENTITY_LENGTH = 3
 """Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
-_TRIES = 2  # Of a ping at a rate that is one of many
-_TRIES_ALONE = 4  # Where protocol and rate are given: there it is awaited with longer timeouts
+_TRIES = 2  # pings at each of several rates
+_TRIES_ALONE = 4  # pings if protocol and rate are given; their timeouts are longer
 
 
 class FoundServo(msgspec.Struct, frozen=True):
-    """A servo that answered."""
+    """A servo or device that answered."""
 
     protocol: float
     baud_rate: int  # bit/s
     servo_id: int
-    model: str = ""  # Name of its control table; empty where there is none, or it is not known
+    model: str = ""  # name of its control table; empty: unknown
     model_number: int = -1  # -1: not known
     firmware: int = 0
-    position: int | None = None  # Present position, ticks
+    position: int | None = None  # present position, ticks
     return_delay: int | None = None  # ns
-    lowest: int | None = None  # Its own limits of the position, ticks; both 0 in wheel mode
+    lowest: int | None = None  # its own position limits, ticks; both 0 in wheel mode
     highest: int | None = None
-    device: bool = False  # True when it is no servo: an IMU, a power board
-    garbled: bool = False  # True when it answers garbled, as two servos of one ID do
-    remarks: tuple[str, ...] = ()  # What a person should know
+    device: bool = False  # True for a device that is not a servo: an IMU, a power board
+    garbled: bool = False  # True if its answers are garbled, as those of two servos with one ID
+    remarks: tuple[str, ...] = ()  # remarks for the user
 
     @property
     def models(self) -> frozenset[str]:
-        """Models of servos with its model number and firmware; some share a number."""
+        """Models of servos with its model number and firmware; some models share a number."""
         tables = models_by_number(self.model_number, self.protocol, self.firmware)
         return frozenset(table.model for table in tables)
 
 
 class Search(msgspec.Struct, frozen=True):
-    """Protocols, rates and IDs to look at."""
+    """Protocols, rates and IDs of a scan."""
 
     protocols: tuple[float, ...] = (2.0, 1.0)
-    baud_rates: tuple[int, ...] = ()  # bit/s; empty: all that a control table of the protocol knows
-    ids: tuple[int, ...] = ()  # Empty: all that the protocol has
+    baud_rates: tuple[int, ...] = ()  # bit/s; empty: all rates in the protocol's control tables
+    ids: tuple[int, ...] = ()  # empty: all IDs of the protocol
 
     def lines(self) -> tuple[tuple[float, int], ...]:
-        """Return each protocol with each rate."""
+        """Return every combination of protocol and rate."""
         return tuple(
             (protocol, rate)
             for protocol in self.protocols
@@ -93,14 +94,18 @@ def known_rates(protocol: float) -> tuple[int, ...]:
 
 
 class Scanned(msgspec.Struct, frozen=True):
-    """What a scan found."""
+    """Result of a scan."""
 
     servos: tuple[FoundServo, ...]
-    left_out: tuple[int, ...]  # Rates at which the adapter cannot run, bit/s
+    left_out: tuple[int, ...]  # rates that the adapter does not support, bit/s
 
 
 def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
-    """Look for servos; raises PortError when the line is gone, or its adapter echoes."""
+    """Search for servos.
+
+    Raises:
+        PortError: The line is gone, or its adapter echoes.
+    """
     found: list[FoundServo] = []
     left_out: list[int] = []
     lines = search.lines()
@@ -120,7 +125,7 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
 
 
 def find_servo(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
-    """Look for one ID in every protocol and at every rate; raises PortError as `scan` does."""
+    """Search for one ID in every protocol and at every rate; raise PortError as `scan` does."""
     found: list[FoundServo] = []
     lines = search.lines()
     tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
@@ -148,7 +153,7 @@ def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
 
 def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
     line, heard = tool.line, tool.heard
-    yield listen(LATE_NS)  # what still comes of the rate before
+    yield listen(LATE_NS)  # replies that are still to come at the previous rate
     heard.clear()
     if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
@@ -156,7 +161,8 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
         refuse_echo(tool.port.name, (yield structs.replace(ping, due_ns=ping.due_ns + slots_ns)))
         there = heard.ids & set(ids)
-        if there:  # boards of the maker's Slave class, which answer no ping to all, share a line with servos
+        # Boards with the maker's Slave class, which do not answer a broadcast ping, may share the line.
+        if there:
             rest = [servo_id for servo_id in ids if servo_id not in there]
             there |= yield from _one_by_one(tool, rest, SHORT_TIMEOUT_NS, beat)
     else:
@@ -172,7 +178,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
 def _one_by_one(
     tool: ToolLine, ids: Sequence[int], timeout_ns: int | None, beat: Callable[[float], None]
 ) -> Program[set[int]]:
-    """Ping every ID; return those that are there, or seem to be."""
+    """Ping every ID; return the IDs that answered, intact or not."""
     line, heard = tool.line, tool.heard
     there: set[int] = set()
     suspected: list[int] = []
@@ -191,7 +197,7 @@ def _one_by_one(
 
 
 def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
-    """Ping each again: what came may have been the late answer of the one before."""
+    """Ping each suspected ID again: the bytes may have been a late answer of the previous ID."""
     there: set[int] = set()
     for servo_id in suspected:
         reply = yield from retry(line.ping(servo_id))
@@ -205,7 +211,7 @@ def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Trans
 
 
 def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
-    """Ping a servo; return the reply to that, and the one with its model number and firmware version."""
+    """Ping a servo; return the reply to the ping, and the reply with model number and firmware version."""
     ping = yield from retry(line.ping(servo_id))
     if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
         return ping, ping
@@ -213,7 +219,7 @@ def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
 
 
 def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
-    """Read the model and settings of a servo that is there, on a port of this name; writes nothing."""
+    """Read the model and the settings of a servo that answered; `port` is the port's name. Writes nothing."""
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
     ping, reply = yield from identity(line, servo_id)
@@ -241,7 +247,7 @@ def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
 
 
 def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[str]:
-    """Read the item that reports hardware errors; return its meaning, or nothing where it reports none."""
+    """Read the item with hardware errors; return the errors in words, empty if there are none."""
     item = table.items.get(table.errors.item)
     if item is None:
         return ""
@@ -258,7 +264,7 @@ def _look_closer(
     servo: FoundServo,
     port: str,
 ) -> Program[FoundServo]:
-    """Read what a robot file needs, and find two servos of one ID: their positions differ."""
+    """Read the values for a robot file. Two servos with one ID show by different positions."""
     values: dict[str, int] = {}
     names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
     items = [table[name] for name in names if name in table]

@@ -1,4 +1,5 @@
-"""A servo's registers in a file: all that can be written, with model, ID and rate; and what is restored."""
+"""Servo backup: a file with all writable registers of a servo, its model, ID and rate; and the registers to
+restore."""
 
 from __future__ import annotations
 
@@ -19,12 +20,12 @@ _MOMENTARY = frozenset(
     ("torque_enable", "bus_watchdog", "lock", "hybrid_save", "moving_speed", "registered_instruction")
 )
 _MODES = ("operating_mode", "control_mode")
-"""The mode resets gains and profile, so it goes back before them."""
-_LAST = "status_return_level"  # Afterwards a servo may answer no read any more
+"""Mode registers. A mode resets gains and profile, so it is restored before them."""
+_LAST = "status_return_level"  # restored last, because a servo may not answer reads afterwards
 
 
 class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of the file."""
+    """Content of a backup file."""
 
     format: Literal["dxlrun servo backup 1"]
     model: str
@@ -33,11 +34,11 @@ class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     protocol: float
     id: int
     baud_rate: int  # bit/s
-    registers: dict[str, int]  # By name, in the order of addresses; integers of the wire
+    registers: dict[str, int]  # by name, in the order of addresses; integers on the wire
 
 
 def kept_items(table: ControlTable) -> tuple[str, ...]:
-    """Return what a backup keeps of a model: every item that can be written, but for indirect data."""
+    """Return the items in a backup of a model: every writable item except indirect data."""
     return tuple(
         item.name
         for item in table.items.values()
@@ -46,27 +47,28 @@ def kept_items(table: ControlTable) -> tuple[str, ...]:
 
 
 def write_backup(path: Path, backup: ServoBackup) -> None:
-    """Write a file that is not there yet; raises InputError where it is, or cannot be written."""
+    """Write a new file; raise InputError if it exists already or cannot be written."""
     text = msgspec.json.format(msgspec.json.encode(backup), indent=2) + b"\n"
     write_target(path, text)
 
 
 def read_backup(path: Path) -> ServoBackup:
-    """Read a file; raises InputError where it cannot be read, or is no backup."""
+    """Read a file; raise InputError if it cannot be read or is not a backup."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=ServoBackup)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also bytes that are no text
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also bytes that are not UTF-8
         raise InputError(
             f"{path} is no backup of a servo: {error}; `dxlrun servo backup` writes one"
         ) from None
 
 
 def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -> tuple[RegisterValue, ...]:
-    """Return what goes back into a servo, in order: EEPROM first; ID, rate and goals stay.
+    """Return the registers to write, in the order of writing: EEPROM first. ID, rate and goals are omitted.
 
-    Raises InputError with everything that does not fit the model.
+    Raises:
+        InputError: Registers do not fit the model; a sentence for each.
     """
     wrong: list[str] = []
     if (backup.model_number, backup.protocol) != (table.model_number, table.protocol):
@@ -93,7 +95,7 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
 def stamped(
     table: ControlTable, firmware: int, address: tuple[int, int], values: Mapping[str, int]
 ) -> ServoBackup:
-    """Return the backup of a servo at an address: its ID and its rate, bit/s."""
+    """Return the backup of a servo; `address` is its ID and its rate, bit/s."""
     servo_id, rate = address
     number, protocol = table.model_number, table.protocol
     return ServoBackup(FORMAT, table.model, number, firmware, protocol, servo_id, rate, dict(values))

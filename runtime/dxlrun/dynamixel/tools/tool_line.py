@@ -18,29 +18,28 @@ from dxlwire.port.ports import Ports, SerialPort, SerialPorts
 from dxlwire.transaction import Program, Reply, Result
 from dxlwire.wire.dialect import dialect_of
 
-FIRST_RATE = 57_600  # At which a port is opened, bit/s; every adapter has it
+FIRST_RATE = 57_600  # first rate of a port, bit/s; every adapter supports it
 BOOT_NS = 2_000_000_000
 """Time for the boot loader of a board that resets when its port is opened [i: Optiboot of Arduino, 1 s]."""
 LATENCY_NS = 1_000_000
-"""What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
+"""Latency of an adapter whose latency timer is not known: one frame of full-speed USB."""
 MOST_LATENCY_NS = 16_000_000
-"""What it may add then: the latency timer of an FTDI chip as shipped (FTDI AN232B-04)."""
+"""Its highest latency: the default latency timer of an FTDI chip (FTDI AN232B-04)."""
 _NOTHING = Budget(0, 0, 0, 0, 0, 0)
 
 
 class TunablePort:
-    """A serial port whose rate can be changed, opened for this process alone; a context manager, which
-    closes it.
+    """A serial port with a variable rate, opened exclusively; a context manager that closes it.
 
-    Raises PortError when it cannot be opened: it is not there, or another process has it, which
-    is named.
+    Raises:
+        PortError: The port cannot be opened: it does not exist, or another process, which is named, has it.
     """
 
     def __init__(self, path: str) -> None:
         self._serial = open_serial(path, FIRST_RATE, boot_ns=BOOT_NS)
         self._tuned = FIRST_RATE
         self.other_rates: dict[int, int] = {}
-        """Rates that the driver did not set as asked, and what it set; bit/s."""
+        """Rates that the driver did not set as requested, with the rates that it set; bit/s."""
         self.name = path
         self.clock: Clock = MonotonicClock()
         self.ports: Ports = SerialPorts([SerialPort(self._serial.fileno(), path)])
@@ -48,9 +47,9 @@ class TunablePort:
         timer = latency_timer(path)
         found_ns = 0 if timer is None else timer.found_ms * 1_000_000
         self.latency_ns = max(LATENCY_NS, found_ns)
-        """What the adapter adds to each request, as far as that is known."""
+        """Known latency of the adapter."""
         self.most_latency_ns = found_ns or MOST_LATENCY_NS
-        """What it may add; a servo that is known to be there is awaited for so long."""
+        """Highest latency of the adapter: timeout for a servo that has already answered once."""
 
     def __enter__(self) -> TunablePort:
         return self
@@ -59,9 +58,10 @@ class TunablePort:
         self._serial.close()
 
     def tune(self, baud_rate: int) -> bool:
-        """Change to a rate, bit/s; return whether the adapter can. Raises PortError when it is gone.
+        """Change to a rate, bit/s, and discard unread bytes; return False if the adapter does not support it.
 
-        What came at the old one and was not read is thrown away.
+        Raises:
+            PortError: The port is gone.
         """
         try:
             if self._tuned != baud_rate:
@@ -77,22 +77,22 @@ class TunablePort:
 
 
 class Heard(PacketSink):
-    """Keeps which servos answered on a line, whether awaited or not."""
+    """Records the IDs that answered on a line, expected or not."""
 
     def __init__(self, log: PacketSink | None = None) -> None:
         self._log = log
-        self.ids: set[int] = set()  # IDs of the intact status packets that came
-        self.noise = 0  # Bytes that belonged to no intact packet
+        self.ids: set[int] = set()  # IDs in the intact status packets
+        self.noise = 0  # bytes outside of intact packets
 
     def clear(self) -> None:
-        """Forget all that."""
+        """Clear the records."""
         self.ids.clear()
         self.noise = 0
 
     def packet(  # noqa: PLR0917  the contract of PacketSink
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Take what was sent or received."""
+        """Record a sent or received packet."""
         if self._log is not None:
             self._log.packet(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
         if kind in (PacketKind.STATUS, PacketKind.LATE):
@@ -102,7 +102,7 @@ class Heard(PacketSink):
 
 
 class OnBus(PacketSink):
-    """Hands packets on as those of one bus of a log."""
+    """Forwards packets as those of one bus of a log."""
 
     def __init__(self, log: PacketSink, index: int) -> None:
         self._log = log
@@ -111,14 +111,14 @@ class OnBus(PacketSink):
     def packet(  # noqa: PLR0917  the contract of PacketSink
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Take what was sent or received."""
+        """Forward a sent or received packet."""
         self._log.packet(self._index, PacketKind(kind), servo_id, first_ns, last_ns, data)
 
 
 class ToolLine:
-    """Runs programs on one line; `speak` comes first, and again for every other protocol or rate.
+    """Runs programs on one line; call `speak` first, and again for another protocol or rate.
 
-    `log` takes every packet.
+    `log` receives every packet.
     """
 
     def __init__(self, port: TunablePort, log: PacketSink | None = None) -> None:
@@ -127,13 +127,14 @@ class ToolLine:
         self.protocol = 0.0
         self.baud_rate = 0
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
-        """Makes transactions for the protocol and the rate that are spoken."""
+        """Makes transactions for the present protocol and rate."""
         self._lines: Lines | None = None
         self._spoken: dict[tuple[float, int], Lines] = {}
-        """Lines by protocol and rate: a late reply is owed also after another rate was spoken."""
+        """Lines by protocol and rate: they are kept, because a late reply may come after another rate was
+        used."""
 
     def speak(self, protocol: float, baud_rate: int) -> bool:
-        """Change to a protocol and a rate; return whether the adapter can, and stay as it was where not."""
+        """Change to a protocol and a rate; return False, unchanged, if the adapter does not support it."""
         if not self.port.tune(baud_rate):
             return False
         port, latency_ns = self.port, self.port.most_latency_ns
@@ -150,13 +151,17 @@ class ToolLine:
         return True
 
     def can_run_at(self, baud_rate: int) -> bool:
-        """Try a rate, and go back to the one that is spoken."""
+        """Try a rate and return to the present one."""
         can = self.port.tune(baud_rate)
         self.port.tune(self.baud_rate)
         return can
 
     def run(self, program: Program[Result]) -> Result:
-        """Run a program to its end; raises PortError when the line is gone, or is none for servos."""
+        """Run a program to its end and return its result.
+
+        Raises:
+            PortError: The line is gone or not suitable for servos.
+        """
         if self._lines is None:
             raise LookupError("speak a protocol first")
         (result,) = self._lines.run([program])
@@ -165,12 +170,12 @@ class ToolLine:
         return result
 
     def wait(self, duration_ns: int) -> None:
-        """Let time pass, and take what comes."""
+        """Wait, and record the packets that arrive."""
         self.run(_wait(duration_ns))
 
 
 def refuse_echo(name: str, reply: Reply) -> None:
-    """Raise PortError where the adapter gives back what it was sent: an echo looks like a servo's answer."""
+    """Raise PortError if the adapter echoes: an echo looks like a servo's answer."""
     if reply.echoed:
         raise PortError(
             f"the adapter at {name} echoes what it sends; use one that switches its receiver off while it "
