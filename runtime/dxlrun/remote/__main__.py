@@ -6,7 +6,7 @@ import os
 from contextlib import suppress
 
 NICENESS = 10
-"""A busy gateway gets the processor time that loop, guardian and recorder leave."""
+"""nice(2) value. Loop, guardian and recorder take precedence over a busy gateway."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Asked: a request as the gateway gets it, its body and numbers checked, and how many a process may make."""
+"""Asked: a received request with its validated body and query, and the rate limit of each client process."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 MOST_PEERS = 256
-"""Processes whose allowance is kept."""
+"""Upper limit of clients whose token bucket is stored; the least recently used bucket is dropped."""
 CHARGED_BYTES = 16_384
-"""So many bytes of a body count as one request more."""
+"""Body size that costs one additional token of the rate limit."""
 BODY_S = 10.0
-"""How long a body may take to arrive."""
+"""Timeout for receiving a body."""
 LONGEST_WAIT_S = 5.0
-"""For the end of a goal; a client that waits longer asks again."""
+"""Longest wait for the end of a goal in one request; a client that waits longer repeats the request."""
 LONGEST_ORIGIN = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Asked(Generic[Body]):
-    """A request that a client made."""
+    """A client's HTTP request with its decoded body."""
 
     http: starlette.requests.Request
     body: Body
 
     def part(self, name: str = "name") -> str:
-        """Return a name in its path."""
+        """Return a path parameter."""
         return str(self.http.path_params[name])
 
     def number(self, name: str, default: float) -> float:
-        """Return a number of the query; raises RefusedRequest."""
+        """Return a finite number of the query; raises RefusedRequest."""
         text = self.http.query_params.get(name)
         try:
             value = default if text is None else float(text)
@@ -53,7 +53,7 @@ class Asked(Generic[Body]):
 
     @property
     def wait_s(self) -> float:
-        """How long the client waits; raises RefusedRequest."""
+        """Time that the client waits, s; raises RefusedRequest outside 0 to LONGEST_WAIT_S."""
         wait = self.number("wait", 0.0)
         if not 0 <= wait <= LONGEST_WAIT_S:
             raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wait:g}")
@@ -61,7 +61,7 @@ class Asked(Generic[Body]):
 
     @property
     def goal(self) -> int:
-        """The number of a goal in its path; raises RefusedRequest."""
+        """Goal number in the path; raises RefusedRequest."""
         text = self.part("number")
         if not (text.isdecimal() and text.isascii() and len(text) < 16):
             raise invalid(f"{text[:40]!r} is no number of a goal")
@@ -69,40 +69,41 @@ class Asked(Generic[Body]):
 
     @property
     def origin(self) -> str:
-        """The client's name for the log: printable, at most 64 characters; the process if it has none."""
+        """Client name for the log: printable, at most 64 characters; the process for a client without a name."""
         given = self.http.headers.get("x-dxlrun-client", "").encode("latin-1", "replace")
         name = "".join(filter(str.isprintable, given.decode(errors="replace")))[:LONGEST_ORIGIN]
         client = client_of(self.http)
-        if client.commands_as != HERE:  # a name that it chose does not hide the certificate's
+        # The self-chosen name is appended, so it cannot hide the certificate's name.
+        if client.commands_as != HERE:
             return f"{client.name}: {name}"[:LONGEST_ORIGIN] if name.strip() else client.name
         return name.strip() or client.name
 
 
 def client_of(http: starlette.requests.Request) -> Client:
-    """Return the client that sent a request, as its connection has it."""
+    """Return the client of a request's connection."""
     return Client(http.client.host, Role(http.client.port)) if http.client else Client("", Role.OBSERVE)
 
 
 def peer(http: starlette.requests.Request) -> str:
-    """Return the process that sent a request, as Linux reports it, or the name in its certificate."""
+    """Return the client's process, as reported by Linux, or the name in its certificate."""
     return client_of(http).name
 
 
 @dataclass(slots=True)
 class Allowance:
-    """So many requests a second of each process, and no more (token bucket of a tenth of a second).
+    """Rate limit of each client process (token bucket with a capacity of 0.1 s).
 
-    Long bodies count as many short ones: what they cost to read and to check keeps other clients waiting.
+    A long body costs additional tokens, because reading and checking it delays other clients.
     """
 
     rate: float
     now: Callable[[], float]
-    """Returns the time, s."""
+    """Clock, s."""
     _left: dict[str, tuple[float, float]] = field(default_factory=dict, init=False)
-    """Peer -> what it has left, and since when."""
+    """Peer -> (remaining tokens, time of the last update)."""
 
     def spend(self, peer: str, count: int = 1, least: int = 1) -> None:
-        """Take so many; raises RefusedRequest when there are fewer than `least` left."""
+        """Spend `count` tokens. Raises RefusedRequest when fewer than `least` tokens remain."""
         now, most = self.now(), self.rate / 10
         left, since = self._left.pop(peer, (most, now))
         left = min(most, left + (now - since) * self.rate)
@@ -116,7 +117,7 @@ class Allowance:
 async def received(
     request: Request[Body, Answer], http: starlette.requests.Request, allowance: Allowance | None
 ) -> Asked[Body]:
-    """Return a request with its body, which is charged for; raises RefusedRequest."""
+    """Read, charge and decode the body of a request; raises RefusedRequest."""
     if request.body is NoneType:
         return Asked(http, cast("Body", None))
     content = await _content(http, allowance)
@@ -129,7 +130,7 @@ async def received(
 
 
 async def _content(http: starlette.requests.Request, allowance: Allowance | None) -> bytes:
-    """Return a body, as long as it may be; raises RefusedRequest before more than that is in memory."""
+    """Read a body; raises RefusedRequest before more than MOST_BYTES are in memory."""
     announced = http.headers.get("content-length", "0")
     if not announced.isdecimal() or len(announced) > 18 or int(announced) > MOST_BYTES:
         raise refused(Code.TOO_LONG, {"size": announced[:20], "most": MOST_BYTES})

@@ -43,45 +43,55 @@ LEASE_S = 0.2
 _STOP_S = 30.0
 _POLL_S = 2.0
 _FEEDBACK_S = 0.1
-"""How long one request waits for the end of a goal, without and with progress to report."""
+"""Longest wait of one request for the end of a goal, without and with progress to report."""
 _WRONG_INPUT = (404, 413, 422)
-"""Statuses of requests that would be refused at any time: no such thing, too long, not as they must be."""
+"""HTTP statuses of requests that are wrong at any time: unknown name, body too long, invalid body."""
 
 
 @dataclass(frozen=True, slots=True)
 class RemoteGoal:
-    """A goal of a running robot, by its number."""
+    """Handle of a goal of a running robot."""
 
     robot: RemoteRobot
     number: int
 
     def state(self) -> GoalState:
-        """Return how far it is, or how it ended."""
+        """Return the goal's progress or its result."""
         return self.robot.goal_state(self.number)
 
     def wait(
         self, timeout: float | None = None, feedback: Callable[[GoalState], object] | None = None
     ) -> GoalState:
-        """Return the result when it has ended; `feedback` gets its state some ten times a second meanwhile.
+        """Wait for the end of the goal and return its result.
 
-        Raises GoalTimeout after `timeout` s; the goal goes on.
+        Args:
+            timeout: Longest wait, s; None waits without limit. The goal continues after a timeout.
+            feedback: Called with the goal's state about ten times a second until the goal ends.
+
+        Raises:
+            GoalTimeout: The goal has not ended within `timeout`.
         """
         return self.robot.wait(self.number, timeout, feedback)
 
     def cancel(self) -> Executed:
-        """Let its controller bring the joints to rest; the goal ends when they are."""
+        """Cancel the goal. Its controller brings the joints to rest; the goal ends when they are at rest."""
         return self.robot.cancel(self.number)
 
 
 Executed: TypeAlias = replies.Executed[RemoteGoal]
-"""The reply to a command that the robot executed."""
+"""Reply to a command that the robot executed."""
 
 
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
-    """Return a running robot, by its name; without one, the only one that runs here.
+    """Connect to a running robot.
 
-    `NAME@HOST:PORT` is a robot of another computer, and so is a name of the settings' `robots.yaml`. `client`
-    names you in the robot's log. Raises DxlrunError when no such robot runs, or several do.
+    Args:
+        robot: Name of the robot; None: the only robot that runs on this computer. `NAME@HOST:PORT`, or a name
+            in `robots.yaml` of the settings, is a robot of another computer.
+        client: Name of this client in the robot's log.
+
+    Raises:
+        DxlrunError: The robot does not run, or several robots run and none was named.
     """
     found, client = sockets(), client or f"python {os.getpid()}"
     if robot is not None and robot not in found:
@@ -110,11 +120,11 @@ class RemoteRobot:
             print(dict(zip(states.joints, states.position)))
             robot.send("head", "posvel", {"positions": [0.1, 0.0], "velocities": [1.0, 1.0]})
 
-    Everything raises Refused with the reason, and DxlrunError when the robot is gone.
+    All methods raise Refused with the reason of a refusal, and DxlrunError when the robot is gone.
     """
 
     def __init__(self, name: str, link: RobotLink) -> None:
-        """`link`: how it is reached, see RobotLink."""
+        """`link`: the connection to the robot, see RobotLink."""
         self.name, self.link = name, link
         self._frames: FrameTree | None = None
 
@@ -131,22 +141,24 @@ class RemoteRobot:
     # Looking
 
     def info(self) -> dict[str, object]:
-        """Return rate, cycles, log, and the controllers with the commands that they take."""
+        """Return rate, cycles, log, and the controllers with the commands that they accept."""
         return self._decoded(self._asked(requests.ROBOT), Row)
 
     def states(self) -> RobotStates:
-        """Return the newest cycle: arrays with a row for each joint, device state, controller; SI units."""
-        from dxlrun.remote.live.states import RobotStates, array  # numpy: most commands ask for none
+        """Return the newest cycle: arrays with a row for each joint, device state or controller; SI units."""
+        # Imported here because it imports NumPy, which most commands do not need.
+        from dxlrun.remote.live.states import RobotStates, array
 
         return self._decoded(self._asked(requests.STATES), RobotStates, array)
 
     def frames(self) -> FrameTree:
-        """Return the robot's frames after its URDF: `pose` computes where one lies at any positions.
+        """Return the frames of the robot's URDF; `pose` computes a frame's pose at given positions.
 
         Raises DxlrunError when the robot has no URDF.
         """
         if self._frames is None:
-            from dxlrun.description.frames.tree import FramesPlan, FrameTree  # most clients ask for none
+            # Imported here because most clients do not use frames.
+            from dxlrun.description.frames.tree import FramesPlan, FrameTree
             from dxlsim.geometry.urdf import read_urdf
 
             found = self._ask(requests.FRAMES)
@@ -159,14 +171,21 @@ class RemoteRobot:
         return self._frames
 
     def urdf(self) -> str:
-        """Return the text of the robot's URDF; empty: it has none."""
+        """Return the text of the robot's URDF; empty without a URDF."""
         return self._ask(requests.FRAMES).urdf or ""
 
     def pose(self, of: str, relative_to: str = "") -> Transform:
-        """Return where a frame lies now in another one, by default in the root: m, and a unit quaternion.
+        """Return the current pose of a frame in another frame: position, m, and unit quaternion.
 
-        By the newest cycle, and the newest orientation of the IMU that turns the body. Raises LookupError for
-        an unknown frame, ValueError when a joint between the two was never read.
+        The pose is computed from the newest cycle, including the orientation of the IMU that turns the body.
+
+        Args:
+            of: Name of the frame.
+            relative_to: Name of the reference frame; empty: the root.
+
+        Raises:
+            LookupError: A frame is unknown.
+            ValueError: A joint between the two frames was never read.
         """
         tree, states = self.frames(), self.states()
         positions = dict(zip(states.joints, states.position.tolist(), strict=True))
@@ -175,36 +194,44 @@ class RemoteRobot:
         return tree.pose(of, relative_to, moved, tree.orientation(sources))
 
     def log_header(self) -> LogHeader:
-        """Return what the messages of the log are made with, see `log.run_messages`."""
-        from dxlrun.log.schemas import LogHeader  # numpy: most clients make none
+        """Return the header from which the log's messages are made, see `log.run_messages`."""
+        # Imported here because it imports NumPy, which most clients do not need.
+        from dxlrun.log.schemas import LogHeader
 
         return self._decoded(self._asked(requests.LOG_HEADER), LogHeader)
 
     def events(self, after: int = 0) -> dict[str, object]:
-        """Return what happened since event number `after`, as far as it is kept, and the last number."""
+        """Return the stored events after event number `after`, and the newest number."""
         return self._decoded(self._asked(requests.EVENTS, query={"after": after}), Row)
 
     # Topics
 
     def topics(self) -> list[TopicState]:
-        """Return what there is to listen to."""
+        """Return the topics that a client can listen to."""
         return list(self._ask(requests.TOPICS).topics)
 
     def newest(self, topic: str) -> TopicMessage | None:
-        """Return the newest message of a topic; None when it had none yet."""
+        """Return the newest message of a topic; None before the first message."""
         with self._listen((topic,), "&once=true") as found:
             return next(iter(found), None)
 
     def listen(self, *topics: str, newest: bool | None = None, rate: float | None = None) -> Listening:
-        """Listen to topics: their messages as they come, from the newest on, until the run ends.
+        """Listen to topics: receive the newest message and all later ones until the run ends.
 
             for message in robot.listen("/joint_states"):
                 print(message.number, message.lost, message.message["position"])
 
-        Every message comes, where this end is no more than some ten seconds behind: `lost` counts those
-        that do not. With `newest` what is older is left out when this end is slower, with `rate` (Hz) at most
-        so many looks a second are taken, of the newest only unless `newest` is False. `async for` does the
-        same. Raises Refused for an unknown topic.
+        A client that is up to about ten seconds behind receives every message; `lost` counts the messages
+        that were missed. `async for` works as well.
+
+        Args:
+            topics: Names of the topics.
+            newest: Skip old messages when this client is slower than the robot. The default is True with
+                `rate`, and False without.
+            rate: Upper limit of deliveries per second, Hz.
+
+        Raises:
+            Refused: A topic is unknown.
         """
         only_newest = rate is not None if newest is None else newest
         query = "&newest=true" * only_newest + ("" if rate is None else f"&rate={rate:g}")
@@ -224,12 +251,12 @@ class RemoteRobot:
     # Goals
 
     def goals(self) -> list[GoalState]:
-        """Return the goals that run, and the last 100 that ended."""
+        """Return the running goals and the last 100 ended goals."""
         found = self._ask(requests.GOALS)
         return sorted((*found.running, *found.ended), key=lambda goal: goal.number)
 
     def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
-        """Return one goal; with `wait`, at most 5 s, when it has ended or after that time."""
+        """Return one goal; with `wait` (s, at most 5), after its end or after that time."""
         return self._ask(requests.GOAL, number, query={"wait": f"{wait:g}"} if wait else {})
 
     def wait(
@@ -238,9 +265,9 @@ class RemoteRobot:
         timeout: float | None = None,
         feedback: Callable[[GoalState], object] | None = None,
     ) -> GoalState:
-        """Return the result of a goal when it has ended, see RemoteGoal.wait.
+        """Wait for the end of a goal and return its result, see RemoteGoal.wait.
 
-        Raises GoalTimeout, and DxlrunError when the robot is gone before.
+        Raises GoalTimeout, or DxlrunError when the robot is gone before the end.
         """
         number = goal.number if isinstance(goal, RemoteGoal) else goal
         until = None if timeout is None else time.monotonic() + timeout
@@ -256,9 +283,9 @@ class RemoteRobot:
                 raise GoalTimeout(f"goal {number} of {state.controller} has not ended within {timeout:g} s")
 
     def cancel(self, goal: RemoteGoal | int | str) -> Executed:
-        """Cancel a goal, by its number or by the name of its controller; it ends when the joints rest.
+        """Cancel a goal, given by its number or by its controller; the goal ends when the joints are at rest.
 
-        Raises Refused when it has ended already, and when it is being cancelled already.
+        Raises Refused when the goal has ended or is already being cancelled.
         """
         if isinstance(goal, str):
             return self._execute(requests.CANCEL_OF, goal)
@@ -278,7 +305,7 @@ class RemoteRobot:
     def set_parameters(
         self, controller: str, values: Mapping[str, bool | float | str]
     ) -> dict[str, tuple[object, object]]:
-        """Change live parameters of a controller in one cycle, or none; return the old and the new values.
+        """Change live parameters of a controller in one cycle, all or none; return the old and new values.
 
         Values are written as in the robot file: `{"gains.p": 4.0, "speed": "20 deg/s"}`.
         """
@@ -297,88 +324,109 @@ class RemoteRobot:
         seconds: float | None = None,
         goal: bool = False,
     ) -> Executed:
-        """Send a controller a typed command; returns when the loop has taken it. Raises Refused for values
-        beyond their joints' limits too. Where the command is a goal, the answer has it, to wait for its end;
-        with `goal` the positions of a group controller are one, too.
+        """Send a typed command to a controller; returns when the loop has accepted the command.
 
-        Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
+        Some joints by name: `send("arm", "position", {"elbow": 0.35})`, or `velocity`, `effort`, `pwm`. The
+        other joints keep their newest goals. Commands of a device: `send("board", "device_commands", {"led":
+        1})`; they go to the controller that commands the device.
 
-        Some joints by name: `send("arm", "position", {"elbow": 0.35})`, or `velocity`, `effort`, `pwm`; the
-        others keep their newest goals. A trajectory controller leads them there in `seconds`. Commands of a
-        device: `send("board", "device_commands", {"led": 1})`, which the controller gets that has them.
+        Args:
+            controller: Name of the controller or the device.
+            kind: Name of the command.
+            command: Fields of the command, in SI units.
+            units: Quantities are texts with units as in a motion file, such as `"30 deg"`.
+            seconds: Time in which a trajectory controller moves the named joints, s.
+            goal: Make the positions of a group controller a goal. A command that is a goal anyway needs
+                no `goal`.
+
+        Returns:
+            The reply. Its `goal` can be waited for when the command is a goal.
+
+        Raises:
+            Refused: The command is refused, for example because a value is beyond the limits of its joint.
         """
         query = ({"units": "true"} if units else {}) | ({} if seconds is None else {"in": repr(seconds)})
         query |= {"goal": "true"} if goal else {}
         return self._execute(requests.COMMAND, controller, kind, body=_json(command), query=query)
 
     def play(self, motion: Path | str, speed: float = 1.0) -> Executed:
-        """Play a motion file, `speed` times as fast; returns when its controllers have begun, all in one
-        cycle, with a goal for each. They lead the joints to their first poses slowly.
+        """Play a motion file at `speed` times its speed; returns when its controllers have begun.
 
-        Raises Refused with all that is wrong with the file, or with the robot for it.
+        All controllers begin in one cycle, each with a goal, and first move the joints slowly to their first
+        poses. Raises Refused with all problems of the file, and all reasons why the robot cannot play it.
         """
         text = Path(motion).read_text(encoding="utf-8")
         return self._execute(requests.PLAY, body=NewMotion(text, str(motion), speed))
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
-        """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
+        """Return a stream of set-points for a controller; the newest set-point is valid for `lease` s."""
         return Stream(self, controller, kind, lease)
 
     def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Executed:
-        """Activate and deactivate controllers in one cycle, or not at all; returns when they are.
+        """Activate and deactivate controllers in one cycle, all or none; returns when the switch is complete.
 
-        Where servos must change their mode first, that takes longer; raises Refused when one does not.
+        A switch takes longer when servos must change their operating mode first. Raises Refused when a servo
+        does not change its mode.
         """
         return self._execute(requests.SWITCH, body=Switch(tuple(activate), tuple(deactivate)))
 
     def get(self, joint: str, item: str = "") -> dict[str, object]:
-        """Return a joint's newest state, SI units, or an item of its servo's memory, read in idle time.
+        """Return a joint's newest state, SI units, or an item of its servo's control table, read in idle
+        time.
 
-        `joint` may be a device, a sensor, or a state or command of it, `imu/orientation.x`, `board/led`:
-        `states`, `valid`, `age`, and `commands`, what controllers command of it now.
+        Args:
+            joint: Name of a joint; of a device or sensor; or of a state or command, such as
+                `imu/orientation.x` or `board/led`.
+            item: Control table item; empty returns the state.
 
-        Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
+        Returns:
+            The state of a joint; or `states`, `valid`, `age` and the current `commands` of a device or
+            sensor; or `value` (integer of the e-Manual) and `is` (the same with its unit) of an item.
         """
         return self._ask(requests.READ_REGISTER, joint, item) if item else self._ask(requests.JOINT, joint)
 
     def torque(self, joints: str | Sequence[str], on: bool, *, release: bool = False) -> Executed:
-        """Switch the torque of joints on or off; returns when it was read back.
+        """Switch the torque of joints on or off; returns when the new state was read back.
 
-        `joints`: names of joints, of controllers (their joints), or "all". On: each is checked as at the
-        start, and holds where it stands. Off: it is limp until its torque is switched on, whatever policies
-        say. Refused while a controller commands one of them, unless `release` deactivates that.
+        On: each joint is checked as at start-up, and holds its present position. Off: the joint is limp until
+        its torque is switched on again, whatever the policies are.
+
+        Args:
+            joints: Names of joints, of controllers (their joints), or "all".
+            on: True switches torque on.
+            release: Deactivate the controllers that command these joints. Without it, the request is refused.
         """
         return self._execute(requests.TORQUE, body=TorqueRequest(_listed(joints), on, release))
 
     def reboot(self, joints: str | Sequence[str], *, release: bool = False) -> Executed:
-        """Reboot the servos of joints (Protocol 2.0); returns when they are in order again.
+        """Reboot the servos of joints (Protocol 2.0); returns when the servos are operational again.
 
-        That clears a hardware error. They have torque afterwards if they had it before.
+        A reboot clears a hardware error. A servo that had torque has torque afterwards.
         """
         return self._execute(requests.REBOOT, body=RebootRequest(_listed(joints), release))
 
     def set_register(self, joint: str, item: str, value: int | str) -> Executed:
-        """Write a RAM item of a joint's servo, such as a gain; returns when it was read back.
+        """Write a RAM item of a joint's servo, such as a gain; returns when the value was read back.
 
-        `value` is the integer of the e-Manual, or a quantity with its unit: `10 rad/s^2`. A servo that is
-        reset in the run gets it again.
+        `value` is the integer of the e-Manual, or a quantity with its unit: `10 rad/s^2`. The value is
+        written again when the servo is reset during the run.
         """
         return self._execute(requests.REGISTER, joint, item, body=Value(value))
 
     def rate(self, rate: float) -> Executed:
-        """Let the loop run at another rate, Hz."""
+        """Change the loop's rate, Hz."""
         return self._execute(requests.RATE, body=Rate(rate))
 
     def halt(self) -> Executed:
-        """Deactivate all controllers that command joints; returns when every joint stands still and holds.
+        """Deactivate all controllers that command joints; returns when every joint is at rest and holds.
 
-        `halted` of the answer has how long that took, and the fastest joint. Raises Refused with the code
-        `still_moving` when one does not after five seconds.
+        `halted` of the reply has the duration and the fastest joint. Raises Refused with the code
+        `still_moving` when a joint still moves after five seconds.
         """
         return self._execute(requests.HALT)
 
     def take_over(self) -> Executed:
-        """Command the robot although a client of another computer does; its next command is refused."""
+        """Take command of the robot from a client of another computer, whose next command is refused."""
         return self._execute(requests.TAKE_OVER)
 
     def pause(self) -> Executed:
@@ -386,7 +434,7 @@ class RemoteRobot:
         return self._execute(requests.PAUSE)
 
     def resume(self) -> Executed:
-        """Let the controllers' time run again, from where it was."""
+        """Resume the controllers' time from the instant of the pause."""
         return self._execute(requests.RESUME)
 
     def load(self, name: str, entry: Mapping[str, object]) -> Executed:
@@ -394,14 +442,14 @@ class RemoteRobot:
         return self._execute(requests.LOAD, body={**entry, "name": name})
 
     def unload(self, name: str) -> Executed:
-        """Take a controller that is not active out of the paused loop."""
+        """Unload an inactive controller from the paused loop."""
         return self._execute(requests.UNLOAD, name)
 
     def stop(self, wait: bool = True) -> None:
-        """End the run in order; with `wait`, return when it has ended and its log is closed.
+        """Stop the run normally; with `wait`, return when the run has ended and its log is closed.
 
-        A connection that is closed before the answer is opened again: to stop twice does what once does.
-        Raises DxlrunError when it has not ended after 30 s.
+        The request is repeated when the gateway closes the connection before its reply: a second stop has no
+        further effect. Raises DxlrunError when the run has not ended after 30 s.
         """
         until = time.monotonic() + _STOP_S
         while not self._stopping():
@@ -417,7 +465,7 @@ class RemoteRobot:
     # Inside
 
     def _stopping(self) -> bool:
-        """Ask once to stop; False when the connection was closed by a gateway that is alive."""
+        """Send one stop request; return False when a gateway that is alive closed the connection."""
         try:
             self._execute(requests.STOP)
         except Refused:
@@ -447,7 +495,7 @@ class RemoteRobot:
         body: Body | None = None,
         query: Mapping[str, object] = {},
     ) -> Answer:
-        """Ask, and return the answer; `names`: of its path. Raises Refused."""
+        """Send a request and return the decoded reply; `names` fill the path. Raises Refused."""
         return self._decoded(self._asked(request, *names, body=body, query=query), request.answer)
 
     def _asked(
@@ -457,7 +505,7 @@ class RemoteRobot:
         body: Body | None = None,
         query: Mapping[str, object] = {},
     ) -> bytes:
-        """Ask, and return the answer as it came; raises Refused."""
+        """Send a request and return the bytes of the reply; raises Refused."""
         path = request.target(*names)
         content = body if body is None or isinstance(body, bytes) else _json(body)
         try:
@@ -472,14 +520,13 @@ class RemoteRobot:
     def _decoded(
         self, answer: bytes, kind: type[Answer], hook: Callable[[type, object], object] | None = None
     ) -> Answer:
-        """Return an answer as what it is."""
         try:
             return msgspec.json.decode(answer, type=kind, dec_hook=hook)
         except msgspec.MsgspecError as error:
             raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
 
     def _refused(self, status: int, answer: bytes) -> DxlrunError:
-        """Return the exception for an answer that is a refusal."""
+        """Return the exception for a reply that is a refusal."""
         try:
             refused = msgspec.json.decode(answer, type=NotDone)
         except msgspec.MsgspecError:
@@ -488,7 +535,7 @@ class RemoteRobot:
         return Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
     def _gone(self, error: Exception) -> DxlrunError:
-        """Return the exception for a link without an answer."""
+        """Return the exception for a link that does not respond."""
         return DxlrunError(f"{self.name} no longer answers: {str(error) or type(error).__name__}")
 
 
@@ -497,7 +544,7 @@ def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _json(content: object) -> bytes:
-    """Return the body of a request; arrays of numpy are lists there. Raises Refused for what is none."""
+    """Return a request's body, with NumPy arrays as lists. Raises Refused for content that is not JSON."""
     try:
         content = asdict(content) if isinstance(content, msgspec.Struct) else content
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
@@ -518,7 +565,7 @@ def _json(content: object) -> bytes:
 
 
 def _not_finite(content: object, where: str = "") -> tuple[str, float] | None:
-    """Return where the first infinite number or NaN of a body is, and the number: `positions[1]`."""
+    """Return the path (`positions[1]`) and the value of the first infinite number or NaN of a body."""
     if isinstance(content, float):
         return None if math.isfinite(content) else (where or "a value", content)
     if isinstance(content, Mapping):
@@ -539,10 +586,10 @@ def _plain(value: object) -> object:
 
 
 class Stream:
-    """Set-points for one controller; when they cease for longer than the lease, its joints are held.
+    """A stream of set-points for one controller. Its joints hold when no set-point arrives within the lease.
 
-    `clamped` counts the values beyond their joints' limits, which the robot clamped; `clamped_joints` are the
-    joints of those in the newest set-point.
+    `clamped` counts the values beyond their joints' limits, which the robot clamped. `clamped_joints` are the
+    joints of those values in the newest set-point.
     """
 
     def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
@@ -551,8 +598,10 @@ class Stream:
         self.clamped_joints: tuple[str, ...] = ()
 
     def send(self, command: Mapping[str, object]) -> int:
-        """Leave the newest set-point, before the loop has taken it; return how many of its values are
-        beyond their joints' limits."""
+        """Send a set-point and return the number of its values that are beyond their joints' limits.
+
+        The reply arrives before the loop has read the set-point.
+        """
         body = _json(command)
         found = self._robot._ask(requests.SET_POINT, *self._names, body=body, query=self._query)
         self.clamped_joints = found.clamped_joints
@@ -563,4 +612,4 @@ class Stream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Send nothing: the lease runs out, and the joints are held."""
+        """Send nothing: the lease expires, and the joints hold."""

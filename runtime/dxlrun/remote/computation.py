@@ -1,7 +1,7 @@
-"""Computation: what may take seconds, in a copy of the gateway's process, so that other clients are served.
+"""Computation: long work in a forked copy of the gateway's process, so that other clients are still served.
 
-A copy costs a few milliseconds and needs nothing sent to it. It is killed when its time is over, also in
-the middle of a call into C, and by Linux when the gateway dies (prctl(2), PR_SET_PDEATHSIG).
+A fork costs a few milliseconds, and no data needs to be sent to it. The copy is killed at its timeout, even
+in the middle of a call into C, and by Linux when the gateway dies (prctl(2), PR_SET_PDEATHSIG).
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ _CHUNK = 1 << 16
 
 
 async def computed(work: Callable[[], bytes], seconds: float) -> bytes | None:
-    """Return what `work` returns, computed elsewhere; None when it takes longer than that, or raises."""
+    """Return the result of `work`, computed in a forked process.
+
+    Args:
+        work: Function without side effects on this process.
+        seconds: Timeout, s.
+
+    Returns:
+        None when `work` takes longer than the timeout, or raises.
+    """
     reading, writing = os.pipe()
     try:
         child = os.fork()
@@ -55,11 +63,12 @@ async def computed(work: Callable[[], bytes], seconds: float) -> bytes | None:
 
 
 def _compute(work: Callable[[], bytes], writing: int) -> None:
-    """Do the work in the copy, and end it: it never returns to the gateway's own code."""
+    """Run `work` in the copy, write its result and exit; this never returns to the gateway's own code."""
     code = 1
     with suppress(BaseException):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        # the connections of clients, and the socket by which the run is found, are the gateway's alone
+        # Close the inherited sockets: otherwise the connections of clients and the run's socket stay open
+        # after the gateway has closed them.
         for descriptor in map(int, os.listdir("/proc/self/fd")):
             with suppress(OSError):
                 if stat.S_ISSOCK(os.fstat(descriptor).st_mode):

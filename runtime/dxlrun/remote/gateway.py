@@ -1,10 +1,10 @@
-"""Gateway: what can be asked of a running robot, over HTTP on a Unix socket; JSON in, JSON out.
+"""Gateway: the HTTP interface of a running robot on a Unix socket, with JSON requests and replies.
 
-`requests.py` has all of it, docs/reference/steering.md what each means. The answer is
-`{"done": true, "cycle": N}`, of a goal with its number in `"goals"`, of a set-point instead `"clamped"`, the
-number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
-"fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the
-reason with its data.
+`requests/table.py` lists the requests; docs/reference/steering.md explains them. The reply to a command is
+`{"done": true, "cycle": N}`, with the goal's number in `"goals"` when the command is a goal. The reply to a
+set-point has `"clamped"`, the number of values beyond their joints' limits, and `"clamped_joints"` instead. A
+refusal is `{"refused": "...", "code": "...", "fields": {...}}` with a status of 4xx or 5xx: a sentence for a
+person, and the code of the reason with its data for a program.
 """
 
 from __future__ import annotations
@@ -96,20 +96,20 @@ from dxlrun.remote.requests.replies import (
 from dxlrun.remote.requests.table import REQUESTS, Answer, Body, NewMotion, NewValues, Request, Row, Value
 
 LEASE_S = (0.01, 0.2, 60.0)
-"""Shortest, default and longest time that a set-point of a stream counts."""
+"""Shortest, default and longest lease of a stream's set-point."""
 _SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.0005, 0.02
-"""Between two looks of a stream into the rings: half a period of the loop, within these."""
+"""Limits of a stream's polling interval, which is half a period of the loop."""
 BEAT_S = 2.0
-"""After so long without a message a stream shows that the gateway is alive."""
+"""Interval at which a stream without messages sends an empty frame, which shows that the gateway is alive."""
 _ENDING_S = 0.5
-"""How long the results of goals may take when the run ends."""
+"""Timeout for the results of goals when the run ends."""
 LONGEST_WAY_S = 3600.0
-"""To a point that is named by its joints."""
+"""Longest duration of a trajectory to a point given by joint names."""
 MOTION_S = 8.0
-"""How long the check of a motion may take, while other clients are served; a client waits 10 s."""
+"""Timeout for the check of a motion, during which other clients are served; shorter than a client's 10 s."""
 LONGEST_FILE = 200
 MOST_MISTAKES = 20
-"""Of a motion, in an answer."""
+"""Upper limit of the reported mistakes of a motion."""
 LONGEST_SENTENCE = 2000
 _STATUS = {
     Code.UNKNOWN_CONTROLLER: 404,
@@ -141,7 +141,7 @@ _STATUS = {
     Code.RUN_ENDING: 503,
 }
 _CONFLICT = 409
-"""Status of all other refusals: what the loop or a controller cannot do now."""
+"""HTTP status of all other refusals: the loop or a controller cannot do this in its present state."""
 
 _Handler: TypeAlias = Callable[["GatewayApp", Asked[Body]], Awaitable[Answer | Response]]
 _HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
@@ -150,7 +150,7 @@ _HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
 def _answers(
     request: Request[Body, Answer],
 ) -> Callable[[_Handler[Body, Answer]], _Handler[Body, Answer]]:
-    """Mark what answers a request."""
+    """Register the decorated method as the handler of a request."""
 
     def note(handler: _Handler[Body, Answer]) -> _Handler[Body, Answer]:
         _HANDLERS[request] = handler
@@ -160,7 +160,7 @@ def _answers(
 
 
 class GatewayApp:
-    """The routes; every request is checked and prepared here, so that the loop only has to execute it."""
+    """HTTP routes. Every request is checked and prepared here, so the loop only has to execute it."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class GatewayApp:
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
         self._released: dict[str, None] = {}
-        """Controllers that torque and reboots took the joints from, until they are active again."""
+        """Controllers that were deactivated by torque or reboot requests and are not active again."""
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
@@ -191,7 +191,7 @@ class GatewayApp:
     def _answered(
         self, request: Request[Body, Answer]
     ) -> Callable[[starlette.requests.Request], Awaitable[Response]]:
-        """Return what answers a request: its body is read, and what a client may ask a second is kept."""
+        """Return the endpoint of a request, which checks rate limit, role, body and commander."""
         allowance, handler = self._allowances.get(request.rate), _HANDLERS[request]
 
         async def answer(http: starlette.requests.Request) -> Response:
@@ -205,10 +205,13 @@ class GatewayApp:
             except RefusedRequest as error:
                 return _refused(error.refusal)
             except ClientDisconnect:
-                return Response(status_code=400)  # no client reads it
-            except RecursionError:  # only a body can be so deep
+                # No client reads this response.
+                return Response(status_code=400)
+            # Only a deeply nested body causes this.
+            except RecursionError:
                 return _refused(Refusal(Code.INVALID, {"problem": "the body is nested too deeply"}))
-            except Exception as error:  # the last resort: one request fails, and the gateway serves the next
+            # Last resort: one request fails, and the gateway serves the next one.
+            except Exception as error:
                 traceback.print_exc()
                 return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
 
@@ -218,7 +221,7 @@ class GatewayApp:
 
     @_answers(requests.ROBOT)
     async def robot(self, asked: Asked[None]) -> RobotInfo:
-        """Return the run, its controllers and the commands that they take."""
+        """Return the run, its controllers and the commands that they accept."""
         link, plan = self._link, self._link.plan
         joints, began_ns = plan.loop.joints, link.began_ns
         return RobotInfo(
@@ -258,7 +261,7 @@ class GatewayApp:
 
     @_answers(requests.STATES)
     async def states(self, asked: Asked[None]) -> Response:
-        """Return the newest cycle; numbers that are not known are null."""
+        """Return the newest cycle; unknown numbers are null."""
         return Response(encoded(self._states()), media_type="application/json")
 
     def _states(self) -> RobotStates:
@@ -274,19 +277,19 @@ class GatewayApp:
 
     @_answers(requests.FRAMES)
     async def frames(self, asked: Asked[None]) -> Frames:
-        """Return the URDF and what moves it: a client computes where frames lie by itself."""
+        """Return the URDF and its moved joints, from which a client computes the poses of frames."""
         plan = self._link.plan
         return Frames(plan.urdf, plan.frames)
 
     @_answers(requests.LOG_HEADER)
     async def log_header(self, asked: Asked[None]) -> Response:
-        """Return what the log's messages are made with: joints, controllers, what a cycle's record has."""
+        """Return the header from which log messages are made: joints, controllers, cycle layout."""
         header = LogHeader.of(self._link.plan, self._link.topics.epoch_offset_ns)
         return Response(msgspec.json.encode(header), media_type="application/json")
 
     @_answers(requests.EVENTS)
     async def events(self, asked: Asked[None]) -> Events:
-        """Return the events after number `after` that are kept; `last` is the newest's number."""
+        """Return the stored events after number `after`; `last` is the newest number."""
         after, kept = asked.number("after", 0.0), self._link.events
         rows = (
             EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text)
@@ -333,13 +336,13 @@ class GatewayApp:
 
     @_answers(requests.GOALS)
     async def goals(self, asked: Asked[None]) -> Goals:
-        """Return the goals that run, and the last that ended."""
+        """Return the running goals and the last ended goals."""
         book = self._link.goals
         return Goals((*book.running.values(),), (*book.ended.values(),))
 
     @_answers(requests.GOAL)
     async def goal(self, asked: Asked[None]) -> GoalState:
-        """Return one goal; with `wait`, s, when it has ended or after that time."""
+        """Return one goal; with `wait`, s, after its end or after that time."""
         wait_s, chosen, goals = asked.wait_s, asked.goal, self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
         if goals.status(chosen).ended is None and not running:
@@ -354,7 +357,7 @@ class GatewayApp:
     @_answers(requests.CANCEL)
     @_answers(requests.CANCEL_OF)
     async def cancel(self, asked: Asked[None]) -> Executed[int]:
-        """Cancel a goal by its number, or the one that a controller has; answer with its number."""
+        """Cancel a goal by its number, or the goal of a controller; reply with its number."""
         if "number" in asked.http.path_params:
             wanted = Cancel(goal=asked.goal)
             goals = [wanted.goal]
@@ -370,7 +373,7 @@ class GatewayApp:
         return Executed(done.cycle, (*goals,))
 
     def _note_ended(self, goals: Sequence[int], refusal: Refusal) -> None:
-        """Note what a refused cancel shows of goals whose reports were lost on their way here."""
+        """Record the end of goals whose reports were lost, which a refused cancel reveals."""
         record = self._link.newest()
         if record is not None and refusal.code in (Code.GOAL_ENDED, Code.NO_GOAL):
             outcome = refusal.fields.get("outcome", Outcome.ABORTED)
@@ -380,13 +383,14 @@ class GatewayApp:
 
     @_answers(requests.PLAY)
     async def play(self, asked: Asked[NewMotion]) -> Executed[int]:
-        """Play a motion file: all its controllers begin in one cycle; answer with their goals."""
+        """Play a motion file: all its controllers begin in one cycle; reply with their goals."""
         given = asked.body
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
             raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
         self._newest()
         file = given.file[:LONGEST_FILE]
-        async with self._playing:  # one at a time: each may need a core and some 100 MB
+        # One at a time, because a check may need a core and about 100 MB.
+        async with self._playing:
             if await asked.http.is_disconnected():
                 raise ClientDisconnect
             found = await computed(partial(self._played, given, file), MOTION_S)
@@ -395,20 +399,23 @@ class GatewayApp:
         played = msgspec.msgpack.decode(found, type=Played | Refusal)
         if isinstance(played, Refusal):
             raise RefusedRequest(played)
-        if await asked.http.is_disconnected():  # it could not be cancelled by its number
+        # A client that is gone could not cancel the motion by its number.
+        if await asked.http.is_disconnected():
             raise ClientDisconnect
-        await self._admit(asked, requests.PLAY)  # the check took its time
+        # Another client may have taken command during the check.
+        await self._admit(asked, requests.PLAY)
         done = await self._link.command(
             LOOP, "play", played.data, f"{asked.origin}: {file}", request=played.request
         )
         return Executed(done.cycle, done.goals, seconds=played.seconds)
 
     def _played(self, given: NewMotion, file: str) -> bytes:
-        """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
+        """Return a Played for the loop, or the Refusal, as MessagePack; runs in a forked process."""
         answer: Played | Refusal
         try:
             motion = parse_motion(given.text, Path(file), self._link.plan.groups)
-            record = self._newest()  # after the reading of the file, which may have taken long
+            # Read after parsing, which may have taken long: the motion begins where the joints are now.
+            record = self._newest()
             controllers = {
                 name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
                 for name, one in self._link.controllers.items()
@@ -418,7 +425,8 @@ class GatewayApp:
             answer = Refusal(Code.WRONG_MOTION, _mistaken(error))
         except RefusedRequest as error:
             answer = error.refusal
-        except Exception as error:  # as of each request
+        # As for each request: a bug fails this request only.
+        except Exception as error:
             traceback.print_exc()
             answer = Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"})
         return msgspec.msgpack.encode(answer)
@@ -431,8 +439,9 @@ class GatewayApp:
 
     @_answers(requests.CHANGE)
     async def change(self, asked: Asked[NewValues]) -> Changed:
-        """Change live parameters of a controller, all of them in one cycle."""
-        async with self._changing:  # what is checked against the values of now must meet them in the loop
+        """Change live parameters of a controller, all in one cycle."""
+        # One change at a time: values that were checked against the present ones must meet these in the loop.
+        async with self._changing:
             loaded = self._known(asked)
             now = self._preparation.parameters(loaded.plan)
             change = changed(loaded.plan, now, asked.body.values)
@@ -445,7 +454,7 @@ class GatewayApp:
 
     @_answers(requests.COMMAND)
     async def command(self, asked: Asked[bytes]) -> Executed[int]:
-        """Check and prepare a typed command, within the limits, and let the loop hand it over."""
+        """Check and prepare a typed command, within the limits, and send it to the loop."""
         kind, content = asked.part("kind"), asked.body
         query, source = asked.http.query_params, self._commanded.get(asked.part())
         if source is not None and kind == SOURCE_COMMANDS:
@@ -483,9 +492,9 @@ class GatewayApp:
 
     @_answers(requests.SET_POINT)
     async def set_point(self, asked: Asked[bytes]) -> Clamped:
-        """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
+        """Pass the newest set-point of a stream to the loop; a refusal by the loop is an event, not a reply.
 
-        The last gate clamps values beyond their joints' limits; the answer counts them.
+        The last gate clamps values beyond their joints' limits; the reply counts them.
         """
         shortest, usual, longest = LEASE_S
         lease = asked.number("lease", usual)
@@ -504,20 +513,22 @@ class GatewayApp:
 
     @_answers(requests.SWITCH)
     async def switch(self, asked: Asked[Switch]) -> Executed[int]:
-        """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
+        """Activate and deactivate controllers in one cycle; reply when those that wait for modes are in."""
         switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
-        for names in (switch.activate, switch.deactivate):  # here: the loop must not go through thousands
+        # Checked here, because the loop must not iterate over thousands of names.
+        for names in (switch.activate, switch.deactivate):
             if twice := tuple(name for name, count in Counter(names).items() if count > 1):
                 raise refused(Code.NAMED_TWICE, {"controller": twice})
         below = self._below(switch.activate)
         done = await self._link.for_loop("switch", switch, asked.origin)
-        await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
+        # The next set-point of the client must find the controllers active.
+        await self._link.recorded(done.cycle)
         return Executed(done.cycle, below=(*below,))
 
     def _below(self, names: Sequence[str]) -> list[str]:
-        """Return the inactive controllers that those named command, which are activated with them."""
+        """Return the inactive controllers below the named ones, which are activated together with them."""
         found: list[str] = []
         left, seen = list(names), set(names)
         while left:
@@ -533,7 +544,7 @@ class GatewayApp:
 
     @_answers(requests.REGISTER)
     async def register(self, asked: Asked[Value]) -> Executed[int]:
-        """Have a RAM item of a joint's servo written, and answer when it was read back."""
+        """Write a RAM item of a joint's servo, and reply when the value was read back."""
         joint, item = asked.part(), asked.part("item")
         register = prepared_register(self._link.plan, joint, item, asked.body.value)
         done = await self._link.for_loop("register", register, asked.origin)
@@ -541,7 +552,7 @@ class GatewayApp:
 
     @_answers(requests.READ_REGISTER)
     async def read_register(self, asked: Asked[None]) -> Row:
-        """Have an item of a joint's servo read, and return what it has."""
+        """Read a control table item of a joint's servo."""
         plan, joint, item = self._link.plan, asked.part(), asked.part("item")
         reading = prepared_reading(plan, joint, item)
         done = await self._link.for_loop("get", reading, asked.origin)
@@ -549,7 +560,7 @@ class GatewayApp:
 
     @_answers(requests.JOINT)
     async def joint(self, asked: Asked[None]) -> Row:
-        """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
+        """Return the newest state of a joint, a device, a sensor, or a controller that provides states."""
         plan, joint, states = self._link.plan, asked.part(), self._states()
         if (source := states.source(joint)) is not None:
             return {"source": joint, "cycle": states.cycle, **source}
@@ -559,13 +570,13 @@ class GatewayApp:
 
     @_answers(requests.TORQUE)
     async def torque(self, asked: Asked[TorqueRequest]) -> Executed[int]:
-        """Switch the torque of joints on or off, and answer when it was read back."""
+        """Switch the torque of joints on or off, and reply when the new state was read back."""
         joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
         return await self._joints_done("torque", replace(asked.body, joints=joints), asked.origin)
 
     @_answers(requests.REBOOT)
     async def reboot(self, asked: Asked[RebootRequest]) -> Executed[int]:
-        """Reboot the servos of joints, and answer when they are in order again."""
+        """Reboot the servos of joints, and reply when they are operational again."""
         joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
         require_reboots(self._link.plan, joints)
         return await self._joints_done("reboot", replace(asked.body, joints=joints), asked.origin)
@@ -574,13 +585,14 @@ class GatewayApp:
         self, kind: str, wanted: TorqueRequest | RebootRequest, origin: str
     ) -> Executed[int]:
         done = await self._link.for_loop(kind, wanted, origin)
-        await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
+        # The next states that the client reads must show the change.
+        await self._link.recorded(done.cycle + 1)
         self._released |= dict.fromkeys(done.deactivated)
         offered = self._offered() if isinstance(wanted, TorqueRequest) and wanted.on else ()
         return Executed(done.cycle, joints=wanted.joints, deactivated=done.deactivated, offered=offered)
 
     def _offered(self) -> tuple[str, ...]:
-        """Return the released controllers that could be activated again: their joints have torque."""
+        """Return the released controllers that can be activated again because their joints have torque."""
         record, known = self._link.newest(), self._link.controllers
         for name in [one for one in self._released if one not in known or self._link.active(known[one])]:
             del self._released[name]
@@ -592,14 +604,14 @@ class GatewayApp:
 
     @_answers(requests.RATE)
     async def rate(self, asked: Asked[Rate]) -> Executed[int]:
-        """Run the loop at another rate."""
+        """Change the loop's rate."""
         return await self._for_loop(
             "rate", asked.body, asked.origin, partial(self._link.note_rate, asked.body.rate)
         )
 
     @_answers(requests.HALT)
     async def halt(self, asked: Asked[None]) -> Executed[int]:
-        """Let every joint come to a stop and hold; answered when they stand still."""
+        """Stop every joint and hold; reply when all joints are at rest."""
         return await self._for_loop("halt", None, asked.origin)
 
     @_answers(requests.PAUSE)
@@ -609,37 +621,38 @@ class GatewayApp:
 
     @_answers(requests.RESUME)
     async def resume(self, asked: Asked[None]) -> Executed[int]:
-        """Let the controllers' time run again."""
+        """Resume the controllers' time."""
         return await self._for_loop("resume", None, asked.origin, partial(self._link.note_paused, False))
 
     @_answers(requests.STOP)
     async def stop(self, asked: Asked[None]) -> Executed[int]:
-        """End the run in order."""
+        """Stop the run normally."""
         return await self._for_loop("stop", None, asked.origin)
 
     async def _for_loop(
         self, kind: str, data: object, origin: str, noted: Callable[[Done], object] | None = None
     ) -> Executed[int]:
-        """Have the loop do something; `noted` is called when it is done."""
+        """Send the loop a command of its own; `noted` is called when the loop has executed it."""
         done = await self._link.for_loop(kind, data, origin, noted)
         return Executed(done.cycle, halted=done.halted)
 
     @_answers(requests.TAKE_OVER)
     async def take_over(self, asked: Asked[None]) -> Executed[int]:
-        """Let this client command the robot although another one does."""
+        """Make this client the commander, in place of another one."""
         before = self._commander.become(client_of(asked.http))
         return await self._note_commander(before or self._commander.name, asked.origin)
 
     async def _admit(self, asked: Asked[Body], request: Request[Body, Answer]) -> None:
-        """Let a client command with a request, and log when it begins to; raises RefusedRequest."""
+        """Require that a client may command, and log a change of the commander; raises RefusedRequest."""
         client = client_of(asked.http)
         before = self._commander.admit(client, request)
         if before is not None:
             await self._note_commander(before, asked.origin)
-            self._commander.admit(client, request)  # another one may have taken over meanwhile
+            # Another client may have taken over while the change was logged.
+            self._commander.admit(client, request)
 
     async def _note_commander(self, before: str, origin: str) -> Executed[int]:
-        """Log that a client commands instead of another."""
+        """Log the change of the commander."""
         return await self._for_loop("commander", NewCommander(self._commander.name, before), origin)
 
     @_answers(requests.LOAD)
@@ -651,13 +664,13 @@ class GatewayApp:
 
     @_answers(requests.UNLOAD)
     async def unload(self, asked: Asked[None]) -> Executed[int]:
-        """Take a controller out of a paused loop."""
+        """Unload a controller from a paused loop."""
         name = self._known(asked).plan.name
         return await self._for_loop("unload", Unload(name), asked.origin, partial(self._link.unloaded, name))
 
     @_answers(requests.DESCRIPTION)
     async def description(self, asked: Asked[None]) -> Row:
-        """Return what can be asked, as OpenAPI has it."""
+        """Return the OpenAPI description of all requests."""
         return openapi({request: (handler.__doc__ or "").strip() for request, handler in _HANDLERS.items()})
 
     def _plans(self) -> list[ControllerPlan]:
@@ -675,7 +688,7 @@ class GatewayApp:
 
 
 def _response(reply: object, status: int = 200) -> Response:
-    """Return the response for what a handler returned."""
+    """Return the HTTP response for a handler's reply."""
     if isinstance(reply, Response):
         return reply
     if isinstance(reply, Executed | Changed | Clamped):
@@ -685,7 +698,7 @@ def _response(reply: object, status: int = 200) -> Response:
 
 
 def _mistaken(error: InputError) -> dict[str, Field]:
-    """Return the mistakes of a motion: what, where and how to fix it, each a tuple; and all as one text."""
+    """Return the mistakes of a motion: one text with all, and a tuple each of places, problems and fixes."""
     found = error.problems[:MOST_MISTAKES]
     if not found:
         return {"problem": str(error)}
@@ -702,7 +715,8 @@ def _refused(refusal: Refusal) -> Response:
     sentence = " ".join(refusal.text.split())[:LONGEST_SENTENCE]
     response = _response(NotDone(sentence, refusal.code, refusal.fields), status)
     if status in (408, 413):
-        response.headers["connection"] = "close"  # what still comes of the body is not read
+        # The rest of the body is not read, so the connection cannot be used again.
+        response.headers["connection"] = "close"
     return response
 
 

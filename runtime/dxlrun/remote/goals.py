@@ -1,4 +1,4 @@
-"""Goals as the gateway knows them: those that run, and the last that ended, from the loop's reports."""
+"""Goals: the gateway's list of running goals and the last ended goals, built from the loop's reports."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from dxlrun.remote.preparation import refused
 from dxlrun.remote.requests.replies import GoalState
 
 KEPT_GOALS = 100
-"""So many of those that ended are kept for clients."""
+"""Number of ended goals that are stored for clients."""
 LOST = "its result did not reach the gateway; the log has it"
-"""Text of a goal that is known to have ended by what came after it."""
+"""Text of a goal whose end is inferred from later reports."""
 
 
 @dataclass(slots=True)
 class GoalBook:
-    """All goals that clients can ask for; one asyncio loop."""
+    """Running and ended goals that clients can query. Used from one asyncio loop only."""
 
     last: int = 0
-    """Number of the newest one."""
+    """Number of the newest goal."""
     running: dict[int, GoalState] = field(default_factory=dict)
     ended: dict[int, GoalState] = field(default_factory=dict)
     _waiting: dict[int, asyncio.Event] = field(default_factory=dict)
 
     def take(self, event: Event) -> None:
-        """Note what an event reports of a goal; raises ValueError when its data are none."""
+        """Record an event about a goal; raises ValueError for invalid data."""
         if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
             return
         self._take(msgspec.json.decode(event.data, type=GoalState), event.t_ns * 1e-9)
 
     def take_message(self, message: object, time_s: float) -> None:
-        """Note a message of the topic /goals: progress, or what a lost event had."""
+        """Record a message of the topic /goals: progress, or the end of a goal whose event was lost."""
         with suppress(msgspec.ValidationError):
             found = msgspec.convert(message, GoalState)
             found = found if found.error is None or math.isfinite(found.error) else replace(found, error=None)
@@ -50,18 +50,20 @@ class GoalBook:
                 self.running[found.number] = replace(known, progress=found.progress, error=found.error)
 
     def end(self, number: int, outcome: str, text: str, time_s: float) -> None:
-        """Note the end of a goal whose report was lost; nothing where it has one."""
+        """Record the end of a running goal whose report was lost; does nothing for any other goal."""
         if (known := self.running.get(number)) is not None:
             self._take(GoalState(number, known.controller, status=outcome, text=text), time_s)
 
     def _take(self, report: GoalState, time_s: float) -> None:
         number = report.number
-        if number > self.last:  # else its beginning, or all of it, is known already
+        # A lower number belongs to a goal that is already recorded.
+        if number > self.last:
             self.last = number
             for before in [
                 one.number for one in self.running.values() if one.controller == report.controller
             ]:
-                self.end(before, Outcome.PREEMPTED, LOST, time_s)  # a controller has one at a time
+                # A controller has one goal at a time, so the earlier goal has ended.
+                self.end(before, Outcome.PREEMPTED, LOST, time_s)
             begun = GoalState(number, report.controller, report.kind, report.origin, accepted=time_s)
             self.running[number] = begun
         if number not in self.running or report.status == "accepted":
@@ -81,7 +83,7 @@ class GoalBook:
             waiting.set()
 
     def status(self, number: int) -> GoalState:
-        """Return a goal; raises RefusedRequest where there is none of this number."""
+        """Return a goal; raises RefusedRequest for an unknown number, or a goal that is no longer stored."""
         found = self.running.get(number) or self.ended.get(number)
         if found is not None:
             return found
@@ -90,7 +92,7 @@ class GoalBook:
         raise refused(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
 
     async def wait(self, number: int, timeout_s: float) -> None:
-        """Return when a goal that runs has ended, or after so long."""
+        """Wait until a running goal has ended, or until the timeout."""
         if number in self.running:
             ended = self._waiting.setdefault(number, asyncio.Event())
             try:

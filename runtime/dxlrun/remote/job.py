@@ -1,4 +1,4 @@
-"""What the gateway's process is given; light, because the process in the terminal imports it."""
+"""Job of the gateway's process. It imports little, because the process in the terminal imports it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Descriptors:
-    """The memory that the gateway shares with the loop's process."""
+    """File descriptors of the memory that the gateway shares with the loop's process."""
 
     heartbeat: int
     cycles: int
@@ -20,14 +20,14 @@ class Descriptors:
 
 @dataclass(frozen=True, slots=True)
 class GatewayJob:
-    """A run, for its gateway."""
+    """Parameters of the gateway's process for one run."""
 
     plan: int
     """Descriptor of the plan's JSON."""
     memory: Descriptors
     log: str | None
-    """Where the log is written, from the root; None: there is none."""
+    """Absolute path of the log; None without a log."""
     epoch_offset_ns: int = 0
     """Wall time minus the run's clock."""
     listen: str = ""
-    """Where clients of other computers are served, as `[NAME@]HOST:PORT`; empty: nowhere."""
+    """Address for clients of other computers, `[NAME@]HOST:PORT`; empty: no network access."""

@@ -1,4 +1,4 @@
-"""Link: the gateway's end of the loop: its mailbox, its answers, its newest cycle, its events."""
+"""Link: the gateway's connection to the loop: mailbox, answers, newest cycle and events."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.requests.replies import TopicState
 
 ANSWER_S = 2.0
-"""A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
+"""Timeout for an answer of the loop, in addition to two of the loop's periods."""
 MOST_WAITING = 64
 MOST_WAITING_BYTES = 2 * LONGEST_COMMAND
-"""What may wait for the loop's answer; the rest of the mailbox is kept for `stop`."""
+"""Upper limits of the commands that wait for an answer; the rest of the mailbox is reserved for `stop`."""
 KEPT_EVENTS = 1000
 KEPT_TEXT = 1 << 20
-"""So many of the newest events are kept for clients, and so many characters of their texts."""
+"""Upper limits of the stored events: number, and characters of their texts."""
 LONGEST_DATA = LONGEST_COMMAND - 1024
-"""Bytes; what an operation of the mailbox has beside names."""
+"""Bytes; the mailbox's longest operation minus room for names."""
 ENTER_S = 6.0
-"""The loop gives joints five seconds to come into their modes."""
+"""Timeout for a mode change; the loop's own timeout is five seconds."""
 _LOOK_S = 0.002
 _HELD = {
     EventCode.STALE_COMMAND: True,
@@ -51,7 +51,7 @@ _HELD = {
     EventCode.CONTROLLER_ACTIVATED: False,
     EventCode.CONTROLLER_DEACTIVATED: False,
 }
-"""Events of a controller -> whether its joints are held afterwards because its stream ended."""
+"""Events of a controller -> True when its joints are held afterwards because its stream ended."""
 
 
 _codec = lru_cache(Codec)
@@ -59,7 +59,7 @@ _codec = lru_cache(Codec)
 
 @dataclass(slots=True)
 class Loaded:
-    """A controller and its place: the bit by which the cycles show that it is active."""
+    """A loaded controller and the index of its bit in the cycle record's `active` mask."""
 
     plan: ControllerPlan
     place: int
@@ -68,19 +68,19 @@ class Loaded:
 
 @dataclass(slots=True)
 class _Pending:
-    """A command whose answer is awaited."""
+    """A command that waits for the loop's answer."""
 
     size: int
     answer: asyncio.Future[Answer]
     done: Callable[[Done], object] | None
-    """What the gateway notes when the loop has done it; also when the client waits no more."""
+    """Called when the loop has executed the command, even after the client stopped waiting."""
 
 
 class Link:
-    """What the gateway knows of the loop, and how it sends commands; one asyncio loop, no threads."""
+    """State of the loop as seen by the gateway, and the sender of commands; one asyncio loop, no threads."""
 
     def __init__(self, plan: Plan, memory: Descriptors, epoch_offset_ns: int = 0) -> None:
-        """`epoch_offset_ns` + time of the run's clock is wall time."""
+        """`epoch_offset_ns`: wall time minus the run's clock."""
         self.plan = plan
         self.rate = 1e9 / plan.loop.period_ns
         self.paused = False
@@ -103,27 +103,28 @@ class Link:
         self._pending: dict[int, _Pending] = {}
         self._pending_bytes = 0
         self.take_servo_limits: Callable[[str, tuple[ServoLimit, ...]], object] = lambda joint, limits: None
-        """Takes the registers that limit a joint's servo, which the loop reports at its start."""
+        """Called with a joint and the registers that limit its servo, which the loop reports at its start."""
 
     def let_begin(self) -> None:
-        """Let controllers begin where the supervisor has paused the loop until a client can stop it."""
+        """Resume the loop that the supervisor paused until a client could stop it."""
         if self._mailbox.used:
             self._mailbox.post(Command(0, LOOP, "resume", b"", "loop"))
 
     # Looking
 
     def newest(self) -> CycleRecord | None:
-        """Return the newest cycle, None before the first; the memory is used again."""
+        """Return the newest cycle; None before the first. The next call overwrites the returned record."""
         found = self._cycles.newest()
         if found is not None and len(found.payload) == len(self._record.raw):
             self._record.raw[:] = found.payload
-            if self._began_ns is None:  # no client has changed the rate yet
+            # No client can have changed the rate yet, so the period is that of the plan.
+            if self._began_ns is None:
                 self._began_ns = self._record.woken_ns - self._record.cycle * self.plan.loop.period_ns
         return self._record if self._record.woken_ns else None
 
     @property
     def began_ns(self) -> int | None:
-        """Time of the first cycle; None: there was none yet."""
+        """Time of the first cycle, ns of the run's clock; None before it."""
         self.newest()
         return self._began_ns
 
@@ -134,11 +135,11 @@ class Link:
 
     @property
     def ended(self) -> bool:
-        """True when the loop has ended in order."""
+        """True when the loop has ended normally."""
         return self.heartbeat.phase is Phase.DONE
 
     def topic_states(self) -> list[TopicState]:
-        """Return what there is to listen to: the loop's topics, its events, and what each cycle has."""
+        """Return the topics: those of the loop, its events, and those made from each cycle."""
         self.newest()
         return self.topics.states(max(0, self._cycles.passed - 1))
 
@@ -164,11 +165,20 @@ class Link:
         *,
         request: bytes = b"",
     ) -> Done:
-        """Hand a command to the loop and wait until it is done; raises RefusedRequest.
+        """Send a command to the loop and wait until the loop has executed it.
 
-        `request` is what its data were prepared from, for the log.
-        `done` is called when the loop has done it, also when that is after the wait was given up. `stop` is
-        taken however much waits already.
+        `stop` is accepted however many commands wait.
+
+        Args:
+            controller: Name of the controller, or LOOP.
+            kind: Name of the command.
+            data: Prepared payload.
+            origin: Name of the client, for the log.
+            done: Called when the loop has executed the command, even after the timeout of this wait.
+            request: JSON from which `data` was prepared, for the log.
+
+        Raises:
+            RefusedRequest: The loop refused the command, did not answer, or the queue is full.
         """
         self._require_running()
         if len(data) > LONGEST_DATA:
@@ -192,7 +202,7 @@ class Link:
     async def for_loop(
         self, kind: str, data: object, origin: str, done: Callable[[Done], object] | None = None
     ) -> Done:
-        """Hand a command to the loop itself and wait until it is done; raises RefusedRequest."""
+        """Send a command to the loop itself and wait until it is executed; raises RefusedRequest."""
         return await self.command(
             LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done
         )
@@ -200,7 +210,7 @@ class Link:
     def set_point(  # noqa: PLR0917  a command's parts, as they come
         self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int, request: bytes = b""
     ) -> None:
-        """Leave the newest set-point of a stream for the loop; raises RefusedRequest."""
+        """Replace the set-point that waits for the loop; raises RefusedRequest."""
         self._require_running()
         number = next(self._numbers)
         command = Command(number, loaded.plan.name, kind, data, origin, lease_ns, request)
@@ -211,7 +221,7 @@ class Link:
             )
 
     async def recorded(self, cycle: int) -> None:
-        """Wait until the record of a cycle is there, which shows the controllers that are active in it."""
+        """Wait for the record of a cycle, which shows the controllers that are active in that cycle."""
         while self.heartbeat.phase is Phase.RUNNING:
             record = self.newest()
             if record is not None and record.cycle >= cycle:
@@ -231,24 +241,24 @@ class Link:
     # What the loop did
 
     def loaded(self, plan: ControllerPlan, done: Done) -> None:
-        """Note a controller that the loop has loaded, in the place that the loop gave it."""
+        """Record a loaded controller with the place that the loop assigned."""
         if done.place is not None:
             self.controllers[plan.name] = Loaded(plan, done.place)
 
     def unloaded(self, name: str, _: Done) -> None:
-        """Note that a controller is gone."""
+        """Record that a controller was unloaded."""
         self.controllers.pop(name, None)
 
     def note_rate(self, rate: float, _: Done) -> None:
-        """Note that the loop runs at another rate, Hz."""
+        """Record the loop's new rate, Hz."""
         self.rate = rate
 
     def note_paused(self, paused: bool, _: Done) -> None:
-        """Note that the loop is paused, or goes on."""
+        """Record whether the loop is paused."""
         self.paused = paused
 
     async def watch(self) -> None:
-        """Collect answers and events for ever."""
+        """Collect answers and events until the task is cancelled."""
         while True:
             if self._began_ns is None:
                 self.newest()
@@ -256,33 +266,37 @@ class Link:
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
     def collect(self) -> None:
-        """Collect the answers and events that have come."""
+        """Collect the answers and events that have arrived."""
         for answered in self._answers.new():
-            if answered.number in self._pending:  # else it answers a set-point of a stream
+            # Other answers belong to set-points of a stream, for which no client waits.
+            if answered.number in self._pending:
                 self._resolve(answered.number, answered.answer)
         reports = [one for one in self.topics.collect() if one[0].name == GOALS_TOPIC]
         idle: frozenset[str] = frozenset()
         idle_s = 0.0
         for ring in self._event_rings:
             while (record := ring.read()) is not None:
-                if isinstance(record, Gap):  # the log reports it
+                # The log reports the gap.
+                if isinstance(record, Gap):
                     if ring is self._event_rings[0]:
-                        # what the loop has reported until now is still in its ring, and read below
+                        # All earlier reports of the loop are still in its ring and are read below.
                         idle_s, idle = self._idle()
-                elif record.kind == RecordKind.TAGGED:  # packets and commands are for the log alone
+                # Packets and commands are for the log only.
+                elif record.kind == RecordKind.TAGGED:
                     with suppress(ValueError):
                         found = decode(record.payload)
                         if isinstance(found, Event):
                             self._keep(found)
         for topic, message in reports:
-            with suppress(ValueError):  # none of ours: the loop encodes them
+            # Only the loop encodes these messages, so a malformed one is not a message of dxlrun.
+            with suppress(ValueError):
                 self.goals.take_message(_codec(topic.type).unpack(message.data), message.t_ns * 1e-9)
         for goal in [one for one in self.goals.running.values() if one.controller in idle]:
             if goal.accepted < idle_s:
                 self.goals.end(goal.number, Outcome.ABORTED, LOST, idle_s)
 
     def _idle(self) -> tuple[float, frozenset[str]]:
-        """Return the controllers that are not active, so have no goal, and when that was, s."""
+        """Return the time of the newest cycle, s, and its inactive controllers, which cannot have a goal."""
         record = self.newest()
         idle = (one.plan.name for one in self.controllers.values() if not self.active(one))
         return (0.0, frozenset()) if record is None else (record.woken_ns * 1e-9, frozenset(idle))
@@ -300,7 +314,7 @@ class Link:
             pending.done(answer)
 
     def _keep(self, event: Event) -> None:
-        """Keep an event for clients, and note whether its controller's joints are held."""
+        """Store an event for clients, and update the state that the event changes."""
         self._text += len(event.text)
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)
